@@ -1,0 +1,1 @@
+"""Train, curate and judge driving planners on recorded traffic, in one JAX program."""

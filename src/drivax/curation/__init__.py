@@ -1,0 +1,1 @@
+"""Criticality scores for recorded scenarios."""

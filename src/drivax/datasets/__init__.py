@@ -1,0 +1,1 @@
+"""One reader per public format, and conversion to scenario sets."""

@@ -1,0 +1,49 @@
+"""Errors that a user can act on: one line that says what is wrong, where, and what to do about it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class DrivaxError(Exception):
+    """A failure that the user can cure; the command line prints it as one line and exits with ``status``.
+
+    Args:
+        problem: What is wrong, without a trailing full stop.
+        file: The file or folder that is at fault.
+        record: The record inside the file (number or id).
+        cure: What to do about it, without a trailing full stop.
+    """
+
+    status = 1
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: str | Path | None = None,
+        record: int | str | None = None,
+        cure: str | None = None,
+    ) -> None:
+        self.problem = problem
+        self.file = None if file is None else Path(file)
+        self.record = record
+        self.cure = cure
+        super().__init__(problem, file, record, cure)
+
+    def __str__(self) -> str:
+        place = "" if self.file is None else f"{self.file}: "
+        if self.record is not None:
+            place += f"record {self.record}: "
+        cure = "" if self.cure is None else f"; {self.cure}"
+        return " ".join(f"{place}{self.problem}{cure}".split())
+
+
+class DataError(DrivaxError):
+    """A file, shard or record is damaged, missing, of the wrong kind, or of an unknown version."""
+
+
+class UsageError(DrivaxError):
+    """The command, an option or a configuration value cannot be what the user meant."""
+
+    status = 2

@@ -1,0 +1,1 @@
+"""Closed-loop runner, statistics, tables and the audit."""

@@ -1,0 +1,86 @@
+"""Oriented rectangles: corners, overlap, and the time until two of them meet.
+
+A box is an array ``[..., 6]`` of (x, y, cos heading, sin heading, length, width) in metres. Functions take numpy or
+JAX arrays, broadcast over leading axes and return the same kind.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: Corners in units of half length and half width: front left, front right, rear right, rear left.
+_CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0))
+X, Y, COS, SIN, LENGTH, WIDTH = range(6)
+
+
+def corners(box: Any) -> Any:
+    """Corner points ``[..., 4, 2]``: front left, front right, rear right, rear left."""
+    xp = box.__array_namespace__()
+    cos, sin = box[..., COS], box[..., SIN]
+    half_length, half_width = box[..., LENGTH] / 2, box[..., WIDTH] / 2
+    points = []
+    for ahead, left in _CORNERS:
+        dx, dy = ahead * half_length, left * half_width
+        points.append(
+            xp.stack([box[..., X] + dx * cos - dy * sin, box[..., Y] + dx * sin + dy * cos], axis=-1)
+        )
+    return xp.stack(points, axis=-2)
+
+
+def _axis_terms(a: Any, b: Any) -> tuple[tuple[Any, Any, Any], ...]:
+    """The four separating axes of two boxes: (axis x, axis y, sum of the half extents along it)."""
+    ca, sa, cb, sb = a[..., COS], a[..., SIN], b[..., COS], b[..., SIN]
+    la, wa, lb, wb = a[..., LENGTH] / 2, a[..., WIDTH] / 2, b[..., LENGTH] / 2, b[..., WIDTH] / 2
+    cos = abs(ca * cb + sa * sb)
+    sin = abs(ca * sb - sa * cb)
+    return (
+        (ca, sa, la + lb * cos + wb * sin),
+        (-sa, ca, wa + lb * sin + wb * cos),
+        (cb, sb, lb + la * cos + wa * sin),
+        (-sb, cb, wb + la * sin + wa * cos),
+    )
+
+
+def overlap(a: Any, b: Any) -> Any:
+    """Whether two boxes share interior points (separating axis theorem; touching is not overlap)."""
+    dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
+    result = None
+    for axis_x, axis_y, reach in _axis_terms(a, b):
+        meets = abs(dx * axis_x + dy * axis_y) < reach
+        result = meets if result is None else result & meets
+    return result
+
+
+def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:
+    """First time at which two boxes overlap at constant velocities and fixed headings, in closed form.
+
+    On each separating axis the centre distance is linear in time, so the boxes overlap on that axis during one
+    interval; they overlap in the plane during the intersection of the four (swept separating axis theorem).
+
+    Args:
+        a: Box ``[..., 6]``.
+        velocity_a: Velocity of its centre ``[..., 2]``, m/s.
+        b: Box ``[..., 6]``.
+        velocity_b: Velocity ``[..., 2]``, m/s.
+        horizon_s: Longest time of interest, seconds.
+
+    Returns:
+        Seconds ``[...]``: 0 where they overlap now, ``horizon_s`` where they do not within the horizon.
+    """
+    xp = a.__array_namespace__()
+    dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
+    vx = velocity_b[..., 0] - velocity_a[..., 0]
+    vy = velocity_b[..., 1] - velocity_a[..., 1]
+    begin, end = xp.zeros_like(dx), xp.full_like(dx, horizon_s)
+    for axis_x, axis_y, reach in _axis_terms(a, b):
+        distance = dx * axis_x + dy * axis_y
+        speed = vx * axis_x + vy * axis_y
+        moving = abs(speed) > 1e-9
+        inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
+        one, other = (-reach - distance) * inverse, (reach - distance) * inverse
+        inside = abs(distance) < reach
+        never = xp.full_like(dx, horizon_s)
+        enter = xp.where(moving, xp.minimum(one, other), xp.where(inside, xp.zeros_like(dx), never))
+        leave = xp.where(moving, xp.maximum(one, other), never)
+        begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
+    return xp.where(begin < end, begin, xp.full_like(dx, horizon_s))

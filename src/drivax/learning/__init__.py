@@ -1,0 +1,1 @@
+"""One training loop; per algorithm a configuration and an update."""

@@ -1,0 +1,1 @@
+"""From a situation to step metrics, episode metrics and scores."""

@@ -1,0 +1,1 @@
+"""Encoders, heads and distributions; knows arrays, not driving."""

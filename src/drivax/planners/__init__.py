@@ -1,0 +1,1 @@
+"""Drivers with one interface: expert, constant velocity, IDM, a network."""

@@ -1,0 +1,1 @@
+"""Reinforcement-learning equations: arrays in, arrays out."""

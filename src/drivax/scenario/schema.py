@@ -1,0 +1,393 @@
+"""What a driving scenario is: the recording that readers produce and the padded record that is stored.
+
+Two steps lead from a public log to the simulator. A reader (or the built-in world) fills a :class:`Recording`:
+ragged, float64, in the source's own map frame, nothing invented. ``scenario.assemble`` turns it into a
+:class:`Scenario`: local frame, float32, fixed shapes named by :class:`Capacity`, with segments, grid and routes.
+
+This module needs numpy only, so that worker processes that convert data never import JAX.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int8, Int64
+
+SCHEMA_VERSION = 1
+
+#: Steps of a full scenario: 10 past, the current one, 80 future (semantics, Time).
+STEPS = 91
+CURRENT_STEP = 10
+DT_S = 0.1
+
+
+class AgentKind(enum.IntEnum):
+    """Class of an agent."""
+
+    NONE = 0
+    VEHICLE = 1
+    PEDESTRIAN = 2
+    CYCLIST = 3
+    OTHER = 4
+    STATIC = 5
+
+
+class RoadKind(enum.IntEnum):
+    """Type of a map feature; the numbers are those of WOMD's road graph."""
+
+    LANE_UNDEFINED = 0
+    LANE_FREEWAY = 1
+    LANE_SURFACE = 2
+    LANE_BIKE = 3
+    LINE_UNKNOWN = 5
+    LINE_BROKEN_SINGLE_WHITE = 6
+    LINE_SOLID_SINGLE_WHITE = 7
+    LINE_SOLID_DOUBLE_WHITE = 8
+    LINE_BROKEN_SINGLE_YELLOW = 9
+    LINE_BROKEN_DOUBLE_YELLOW = 10
+    LINE_SOLID_SINGLE_YELLOW = 11
+    LINE_SOLID_DOUBLE_YELLOW = 12
+    LINE_PASSING_DOUBLE_YELLOW = 13
+    EDGE_UNKNOWN = 14
+    EDGE_BOUNDARY = 15
+    EDGE_MEDIAN = 16
+    STOP_SIGN = 17
+    CROSSWALK = 18
+    SPEED_BUMP = 19
+    DRIVEWAY = 20
+
+
+LANE_KINDS = (RoadKind.LANE_UNDEFINED, RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE, RoadKind.LANE_BIKE)
+#: Lanes that answer "which lane is this car on"; bike lanes do not.
+CAR_LANE_KINDS = LANE_KINDS[:3]
+LINE_KINDS = tuple(kind for kind in RoadKind if 5 <= kind <= 13)
+EDGE_KINDS = (RoadKind.EDGE_UNKNOWN, RoadKind.EDGE_BOUNDARY, RoadKind.EDGE_MEDIAN)
+POLYGON_KINDS = (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY)
+
+
+class LightState(enum.IntEnum):
+    """State of a traffic light for one lane; the numbers are WOMD's, -1 where nobody observed it."""
+
+    UNOBSERVED = -1
+    UNKNOWN = 0
+    ARROW_STOP = 1
+    ARROW_CAUTION = 2
+    ARROW_GO = 3
+    STOP = 4
+    CAUTION = 5
+    GO = 6
+    FLASHING_STOP = 7
+    FLASHING_CAUTION = 8
+
+
+class Flag(enum.IntFlag):
+    """Facts about a scenario that decide which metrics are defined and which uses are refused."""
+
+    NONE = 0
+    LIGHTS = 1
+    LANE_GRAPH = 2
+    SPEED_LIMITS = 4
+    NO_FUTURE = 8
+    CHAINED_GRAPH = 16
+    DEFAULT_SIZES = 32
+    DIFFERENTIATED_VELOCITY = 64
+    TRUNCATED_MAP = 128
+    CLOSED_EDGES = 256
+    OVERFLOW = 512
+    JITTERED_TIME = 1024
+    ROUTE = 2048
+    ELEVATION = 4096
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Padded sizes of a stored scenario; what does not fit is counted in ``overflow``, never silently lost."""
+
+    name: str = "default"
+    agents: int = 80
+    parked: int = 256
+    steps: int = STEPS
+    segments: int = 4096
+    features: int = 512
+    lanes: int = 256
+    lights: int = 32
+    stops: int = 16
+    routes: int = 12
+    route_points: int = 400
+    road_rows: int = 1024
+    events: int = 4
+    extension: int = 16
+    grid: int = 64
+    cell_m: float = 10.0
+    #: Longest contiguous run of grid-sorted segments that a query reads per row of three cells.
+    edge_run: int = 96
+    lane_run: int = 160
+
+
+CAPACITIES = {
+    "default": Capacity(),
+    "large": Capacity(
+        name="large", agents=128, parked=384, segments=8192, features=1024, lanes=512, lights=64, stops=32,
+        edge_run=160, lane_run=256,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Everything that moves (or could), one row per track, in the source's map frame.
+
+    Invalid entries hold zeros. ``size`` is per step where the source measures it per step.
+    """
+
+    xy: Float64[np.ndarray, "track time 2"]
+    z: Float64[np.ndarray, "track time"]
+    heading: Float64[np.ndarray, "track time"]
+    velocity: Float64[np.ndarray, "track time 2"]
+    size: Float64[np.ndarray, "track time 3"]
+    valid: Bool[np.ndarray, "track time"]
+    kind: Int8[np.ndarray, " track"]
+    track_id: Int64[np.ndarray, " track"]
+
+
+@dataclass(frozen=True)
+class MapFeature:
+    """One element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
+
+    ``points`` are (x, y, z) in metres; polygons are implicitly closed; a stop sign has one point. Road edges have
+    the drivable side on their left. Links name other features by ``feature_id`` and may dangle.
+    """
+
+    feature_id: int
+    kind: RoadKind
+    points: Float64[np.ndarray, "point 3"]
+    limit_mps: float | None = None
+    width_m: float | None = None
+    successors: tuple[int, ...] = ()
+    predecessors: tuple[int, ...] = ()
+    left_neighbours: tuple[int, ...] = ()
+    right_neighbours: tuple[int, ...] = ()
+    interpolating: bool = False
+    #: For a stop sign: the lanes that it controls.
+    lanes: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Light:
+    """A traffic light as it concerns one lane."""
+
+    lane_id: int
+    stop_point: Float64[np.ndarray, "3"]
+    states: Int8[np.ndarray, " time"]
+
+
+@dataclass(frozen=True)
+class Event:
+    """A labelled rare event of the built-in world. ``actors`` are track ids, steps are inclusive."""
+
+    kind: int
+    start: int
+    end: int
+    actors: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log as its source tells it: ragged arrays, float64, the source's frame; what readers produce.
+
+    Attributes:
+        ego: Row of ``tracks`` that is the ego vehicle.
+        timestamps_s: Seconds, one per step, starting anywhere.
+        current_step: Step at which the future begins (10 in WOMD).
+        to_predict, of_interest: Rows of ``tracks``.
+        route_lanes: Feature ids of the lanes of the intended route, where the source knows it.
+        flags: Facts that only the reader knows (defaulted sizes, truncated map, ...).
+        split_gap_m: Polylines are cut where neighbouring points are further apart (clipping jumps); None: never.
+    """
+
+    scenario_id: str
+    dataset: str
+    segment: str
+    timestamps_s: Float64[np.ndarray, " time"]
+    current_step: int
+    ego: int
+    tracks: Tracks
+    features: tuple[MapFeature, ...]
+    lights: tuple[Light, ...] = ()
+    to_predict: tuple[int, ...] = ()
+    of_interest: tuple[int, ...] = ()
+    route_lanes: tuple[int, ...] = ()
+    events: tuple[Event, ...] = ()
+    flags: Flag = Flag.NONE
+    split_gap_m: float | None = None
+
+
+def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Names, dtypes and shapes of a stored scenario of this capacity, in storage order."""
+    c = capacity
+    t, a, p, s, m, n = c.steps, c.agents, c.parked, c.segments, c.features, c.lanes
+    k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
+    cells = c.grid * c.grid
+    return {
+        "scenario_id": ("S64", ()),
+        "dataset": ("S16", ()),
+        "segment": ("S64", ()),
+        "origin": ("f8", (3,)),
+        "dt_s": ("f4", ()),
+        "current_step": ("i2", ()),
+        "steps": ("i2", ()),
+        "flags": ("u4", ()),
+        # Agents that move (slot 0 is ego), local frame, time-major; zeros where not valid.
+        "agent_xy": ("f4", (t, a, 2)),
+        "agent_z": ("f4", (t, a)),
+        "agent_heading": ("f4", (t, a)),
+        "agent_velocity": ("f4", (t, a, 2)),
+        "agent_valid": ("?", (t, a)),
+        "agent_size": ("f4", (a, 3)),
+        "agent_kind": ("i1", (a,)),
+        "agent_id": ("i4", (a,)),
+        "agent_flags": ("u1", (a,)),  # 1 ego, 2 to predict, 4 of interest
+        "agent_extension": ("f4", (a, c.extension, 2)),  # 4 m apart, beyond the last logged pose, along lanes
+        # Agents that stay where they are: one pose, and when they were seen.
+        "parked_xy": ("f4", (p, 2)),
+        "parked_z": ("f4", (p,)),
+        "parked_heading": ("f4", (p,)),
+        "parked_size": ("f4", (p, 3)),
+        "parked_kind": ("i1", (p,)),
+        "parked_id": ("i4", (p,)),
+        "parked_valid": ("?", (t, p)),
+        # Lights and stop signs.
+        "light_line": ("f4", (lt, 4)),  # stop line from left to right of the lane: x, y, x, y
+        "light_z": ("f4", (lt,)),
+        "light_lane": ("i2", (lt,)),
+        "light_heading": ("f4", (lt,)),
+        "light_exit_heading": ("f4", (lt,)),  # heading where the controlled lane ends
+        "light_state": ("i1", (t, lt)),
+        "stop_xy": ("f4", (st, 2)),
+        "stop_lane": ("i2", (st, 4)),
+        # Map segments of at most 4 m: [edges by cell | car lanes by cell | the rest], -1 where a link is missing.
+        "segment_a": ("f4", (s, 3)),
+        "segment_b": ("f4", (s, 3)),
+        "segment_kind": ("i1", (s,)),
+        "segment_feature": ("i2", (s,)),
+        "segment_lane": ("i2", (s,)),
+        "segment_start_m": ("f4", (s,)),
+        "segment_blocks": ("i4", (4,)),  # 0, end of edges, end of lanes, end of the rest
+        "feature_id": ("i8", (m,)),
+        "feature_kind": ("i1", (m,)),
+        "feature_closed": ("?", (m,)),
+        # Lane graph with dense indices; -1 none or unknown.
+        "lane_id": ("i8", (n,)),
+        "lane_kind": ("i1", (n,)),
+        "lane_length": ("f4", (n,)),
+        "lane_width": ("f4", (n,)),
+        "lane_limit": ("f4", (n,)),
+        "lane_interpolating": ("?", (n,)),
+        "lane_successor": ("i2", (n, 4)),
+        "lane_predecessor": ("i2", (n, 4)),
+        "lane_left": ("i2", (n,)),  # same direction only
+        "lane_right": ("i2", (n,)),
+        "lane_light": ("i2", (n,)),
+        "lane_stop": ("?", (n,)),
+        # Routes at 1 m: row 0 to the goal, row 1 the log's own (privileged), then the other candidates.
+        "route_xy": ("f4", (k, r, 2)),
+        "route_z": ("f4", (k, r)),
+        "route_heading": ("f4", (k, r)),
+        "route_lane": ("i2", (k, r)),
+        "route_limit": ("f4", (k, r)),
+        "route_points": ("i2", (k,)),
+        "goal_xy": ("f4", (2,)),
+        "log_progress": ("f4", (t,)),  # arc length of the logged ego along route 0
+        # Uniform grid over the square [grid_origin, +cell * grid).
+        "grid_origin": ("f4", (2,)),
+        "grid_edge": ("i2", (cells + 1,)),
+        "grid_lane": ("i2", (cells + 1,)),
+        "grid_side": ("i1", (cells,)),  # 1 drivable, -1 not, 0 unknown; for cells without an edge in their 3 x 3 block
+        # Observation polylines: pieces of at most 10 m, in order of rank.
+        "road_xy": ("f4", (o, 2)),
+        "road_direction": ("f4", (o, 2)),
+        "road_length": ("f4", (o,)),
+        "road_kind": ("i1", (o,)),
+        "road_limit": ("f4", (o,)),
+        "road_curvature": ("f4", (o,)),
+        "road_rows": ("i2", ()),
+        # Labels of the built-in world.
+        "event_kind": ("i1", (c.events,)),
+        "event_start": ("i2", (c.events,)),
+        "event_end": ("i2", (c.events,)),
+        "event_actor": ("i4", (c.events, 4)),
+    }  # fmt: skip
+
+
+def record_dtype(capacity: Capacity) -> np.dtype[Any]:
+    """The structured dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
+    names, formats, offsets, end = [], [], [], 0
+    for name, (kind, shape) in scenario_fields(capacity).items():
+        formats.append((kind, shape))
+        names.append(name)
+        offsets.append(-(-end // 64) * 64)
+        end = offsets[-1] + np.dtype((kind, shape)).itemsize
+    return np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": -(-end // 4096) * 4096}
+    )
+
+
+@dataclass(frozen=True)
+class SourceCounts:
+    """What the source held before capping and cropping; printed by ``drivax inspect``."""
+
+    steps: int
+    tracks: int
+    tracks_valid_now: int
+    map_features: dict[str, int]
+    map_points: int
+    lights: int
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One log as fixed-shape numpy arrays in one structured record, plus what was counted on the way.
+
+    Fields are read as attributes (``scenario.agent_xy``); names, dtypes and shapes are :func:`scenario_fields`.
+    Frame: the ego's position at the current step is the origin, axes are the source's. Metres, m/s, radians CCW
+    from +x wrapped to [-pi, pi), time step 0.1 s.
+
+    Attributes:
+        record: A zero-dimensional structured array of ``record_dtype(capacity)``.
+        capacity: The padded sizes.
+        source: Counts of the source before capping.
+        overflow: How many agents, segments, ... did not fit, by name; empty when all did.
+        audit: Findings of the log replay through the metrics, by name (see ``evaluation.audit``).
+        tags: Words for filters and strata (``domain``, ``family``, ``event``, ...).
+    """
+
+    record: np.ndarray[Any, Any]
+    capacity: Capacity
+    source: SourceCounts
+    overflow: dict[str, int] = field(default_factory=dict)
+    audit: dict[str, float | int | bool | None] = field(default_factory=dict)
+    tags: dict[str, str] = field(default_factory=dict)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name in _OWN_FIELDS:
+            raise AttributeError(name)
+        try:
+            return self.record[name]
+        except (ValueError, KeyError, IndexError):
+            raise AttributeError(f"a scenario has no field {name!r}") from None
+
+    @property
+    def id(self) -> str:
+        """The scenario's id as text."""
+        return bytes(self.record["scenario_id"][()]).rstrip(b"\0").decode()
+
+    @property
+    def has(self) -> Flag:
+        """The scenario's flags."""
+        return Flag(int(self.record["flags"]))
+
+
+_OWN_FIELDS = {f.name for f in fields(Scenario)}

@@ -1,0 +1,1 @@
+"""Ego dynamics, traffic, frames, situations, reset and step."""

@@ -1,0 +1,1 @@
+"""What makes it a learning problem: observations, rewards, action spaces, termination."""

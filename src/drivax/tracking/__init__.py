@@ -1,0 +1,1 @@
+"""Run folders, metric sinks and checkpoints."""
