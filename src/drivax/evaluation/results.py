@@ -1,0 +1,118 @@
+"""Results of an evaluation: one row per episode, a summary with intervals, and the run folder that holds both."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.errors import DataError
+from drivax.evaluation.statistics import Interval, bootstrap_mean, rate
+from drivax.metrics.episode import EVENTS, METRICS
+
+#: Columns of ``episodes.csv`` before the metrics.
+KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
+#: Metrics that are shares of episodes: their interval is Wilson's.
+RATES = (
+    "accuracy", "accuracy_at_fault", "success", "success_moving", "collision", "at_fault_collision", "offroad",
+    "left_map", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal",
+)  # fmt: skip
+#: Codes and counts that no mean makes sense of.
+_NOT_SUMMARISED = ("collision_type", "steps")
+
+
+@dataclass(frozen=True)
+class Results:
+    """Episodes of one planner on one set of scenarios.
+
+    Attributes:
+        planner, traffic, seed: What drove, in which traffic, with which seed.
+        scenarios: ``dataset``, ``scenario_id`` and ``segment`` of each episode.
+        metrics: Values by metric name, NaN where undefined.
+        events: First step of each kind of failure, -1 for none.
+        motion: x, y, heading, speed per step from ``start`` on.
+        start: Step of the log at which the episodes began.
+        offroad_steps: Steps off the road.
+    """
+
+    planner: str
+    traffic: str
+    seed: int
+    scenarios: Sequence[Mapping[str, str]]
+    metrics: Mapping[str, np.ndarray[Any, Any]]
+    events: Mapping[str, np.ndarray[Any, Any]]
+    motion: np.ndarray[Any, Any]
+    start: int
+    offroad_steps: np.ndarray[Any, Any]
+
+    def __len__(self) -> int:
+        return len(self.scenarios)
+
+    def summary(self) -> dict[str, Any]:
+        """Mean and 95 % interval of every metric, as ``summary.json`` holds them.
+
+        Rates have Wilson's interval over the effective number of segments; other means a bootstrap over segments. A metric that is defined nowhere has
+        null mean and n 0.
+        """
+        clusters = np.array([row["segment"] for row in self.scenarios])
+        table = {}
+        for name in METRICS:
+            if name in _NOT_SUMMARISED:
+                continue
+            table[name] = interval_of(name, self.metrics[name], clusters).as_dict()
+        return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
+
+    def rows(self) -> list[dict[str, str]]:
+        """Rows of ``episodes.csv``: undefined metrics are empty cells, booleans 0 or 1."""
+        rows = []
+        for number, scenario in enumerate(self.scenarios):
+            row = {
+                "planner": self.planner,
+                **{key: scenario[key] for key in ("dataset", "scenario_id", "segment")},
+                "seed": str(self.seed),
+                "traffic": self.traffic,
+            }
+            row |= {name: _cell(values[number]) for name, values in self.metrics.items()}
+            rows.append(row)
+        return rows
+
+    def write(self, folder: Path) -> None:
+        """Writes ``episodes.csv``, ``summary.json`` and ``trajectories.npz`` into an existing folder."""
+        with (folder / "episodes.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, [*KEYS, *METRICS], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self.rows())
+        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n")
+        np.savez_compressed(
+            folder / "trajectories.npz",
+            scenario_id=np.array([row["scenario_id"] for row in self.scenarios]),
+            ego=self.motion.astype(np.float32),
+            start=np.full(len(self), self.start, np.int32),
+            **{f"{name}_step": self.events[name].astype(np.int16) for name in EVENTS},
+        )
+
+
+def _cell(value: float) -> str:
+    if not np.isfinite(value):
+        return ""
+    return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
+
+
+def interval_of(name: str, values: np.ndarray[Any, Any], clusters: np.ndarray[Any, Any]) -> Interval:
+    """Mean and 95 % interval over the episodes that define the metric."""
+    if name in RATES:
+        return rate(values, clusters)
+    return bootstrap_mean(values, clusters, resamples=2_000, seed=0)
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The summary of an evaluation's run folder."""
+    file = folder / "summary.json"
+    if not file.is_file():
+        raise DataError("is missing: not a finished evaluation", file=file, cure="run `drivax evaluate` again")
+    return json.loads(file.read_text())

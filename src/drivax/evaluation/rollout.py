@@ -1,0 +1,95 @@
+"""Closed loop on the device: a planner drives a batch of scenarios from a start step to the end of the log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from drivax.metrics.episode import episode_metrics, first_steps
+from drivax.metrics.scores import Value
+from drivax.planners.planner import Planner
+from drivax.planners.simple import logged_motion
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.task import Task
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Episodes:
+    """What a batch of episodes came to.
+
+    Attributes:
+        metrics: Every metric by name.
+        events: Step of the first collision, off-road step and red light, -1 for none.
+        motion: x, y, heading, speed of the driven agent from the start step to the end.
+        offroad_steps: Number of steps off the road.
+    """
+
+    metrics: dict[str, Value]
+    events: dict[str, Int[Array, " B"]]
+    motion: Float[Array, "B steps 4"]
+    offroad_steps: Int[Array, " B"]
+
+
+def judging(task: Task) -> Task:
+    """The task as evaluation runs it: failures are recorded and the episode goes on to the end of the log."""
+    return replace(task, ends=())
+
+
+@partial(jax.jit, static_argnames=("simulator", "start_step"))
+def drive(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array,
+    start_step: int = CURRENT_STEP, slot: Any = 0,
+) -> Episodes:  # fmt: skip
+    """Drives scenarios ``index`` with one planner; one compilation per planner kind, batch size and start step.
+
+    Args:
+        simulator: With a task whose episodes do not end early (:func:`judging`).
+        planner: The driver.
+        bank: The scenarios.
+        index: Rows of the bank.
+        keys: A random key each.
+        start_step: Step of the log at which to begin.
+        slot: Which agent is driven.
+    """
+    episode = partial(_episode, simulator, planner, bank, start_step, slot)
+    return jax.vmap(episode)(index, keys)
+
+
+def _episode(
+    simulator: Simulator,
+    planner: Planner,
+    bank: ScenarioBank,
+    start_step: int,
+    slot: Any,
+    index: Array,
+    key: Array,
+) -> Episodes:
+    state = simulator.reset(bank, index, start_step, slot)
+    begin_key, key = jax.random.split(key)
+    carry = planner.init(bank, state, begin_key)
+
+    def one(now: Any, key: Array) -> Any:
+        state, carry = now
+        situation = simulator.situation(bank, state)
+        observation = simulator.observe(bank, state.scene)
+        action, carry = planner.act(carry, bank, state, situation, observation, key)
+        if planner.replays:
+            state, _ = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
+        else:
+            state, _ = simulator.step(bank, state, action)
+        return (state, carry), (state.scene.history[-1], state.facts.offroad)
+
+    keys = jax.random.split(key, bank.steps - 1 - start_step)
+    (final, _), (motion, offroad) = jax.lax.scan(one, (state, carry), keys)
+    motion = jnp.concatenate([state.scene.history[-1][None], motion])
+    return Episodes(
+        episode_metrics(bank, final), first_steps(final.episode), motion, offroad.sum().astype(jnp.int32)
+    )

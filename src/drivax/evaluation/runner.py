@@ -1,0 +1,93 @@
+"""Evaluation of a planner over all scenarios of a set, in batches, none dropped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drivax.errors import DrivaxError, UsageError
+from drivax.evaluation.results import Results
+from drivax.evaluation.rollout import Episodes, drive, judging
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.types import Traffic
+from drivax.tasks.task import Task
+
+#: Scenarios that run side by side; the last batch is filled up and the surplus thrown away.
+BATCH = 64
+
+
+def evaluate(
+    planner: Planner,
+    bank: ScenarioBank,
+    scenarios: Sequence[Mapping[str, str]],
+    *,
+    task: Task | None = None,
+    traffic: Traffic | None = None,
+    start_step: int = CURRENT_STEP,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Results:
+    """Drives every scenario of a bank to the end of its log and measures it.
+
+    Args:
+        planner: The driver.
+        bank: The scenarios.
+        scenarios: ``dataset``, ``scenario_id`` and ``segment`` of every row of the bank.
+        task: Action space and observation that the planner was made for; the default one otherwise.
+        traffic: How the others move; they replay the log by default.
+        start_step: Step of the log at which to begin.
+        seed: Every scenario's key is ``fold_in(key(seed), row)``, so batching never changes a result.
+        progress: Called with (done, total) after every batch.
+
+    Raises:
+        UsageError: If the table and the bank disagree, or the start step leaves no action.
+        DrivaxError: If the planner produced numbers that are not finite.
+    """
+    if len(scenarios) != len(bank):
+        raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
+    if not 0 <= start_step < bank.steps - 1:
+        raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {bank.steps - 2}")
+    simulator = Simulator(judging(task or Task()), traffic or LogTraffic())
+    root = jax.random.key(seed)
+    parts: list[Episodes] = []
+    for first in range(0, len(bank), BATCH):
+        rows = np.arange(first, min(first + BATCH, len(bank)))
+        # A short last batch repeats its last scenario, so that one compilation serves all.
+        size = BATCH if len(bank) > BATCH else len(rows)
+        index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
+        keys = jax.vmap(lambda row: jax.random.fold_in(root, row))(index)
+        episodes = drive(simulator, planner, bank, index, keys, start_step)
+        kept = len(rows)
+        parts.append(jax.tree.map(lambda leaf, kept=kept: np.asarray(leaf)[:kept], episodes))
+        if progress is not None:
+            progress(int(rows[-1]) + 1, len(bank))
+    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    _refuse_nan(planner, whole, scenarios)
+    return Results(
+        planner=planner.name,
+        traffic="log",
+        seed=seed,
+        scenarios=scenarios,
+        metrics={name: np.where(v.defined, v.value, np.nan) for name, v in whole.metrics.items()},
+        events=whole.events,
+        motion=whole.motion,
+        start=start_step,
+        offroad_steps=whole.offroad_steps,
+    )
+
+
+def _refuse_nan(planner: Planner, episodes: Episodes, scenarios: Sequence[Mapping[str, str]]) -> None:
+    broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
+    if broken.size:
+        raise DrivaxError(
+            f"planner {planner.name} produced numbers that are not finite in {broken.size} scenarios",
+            record=scenarios[int(broken[0])]["scenario_id"],
+            cure="check its outputs there",
+        )

@@ -1,0 +1,122 @@
+"""Collecting experience: a batch of environments that reset themselves, unrolled on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drivax.metrics.episode import episode_metrics
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.types import SimState
+
+#: Metrics of finished episodes that training logs.
+ROLLOUT_METRICS = (
+    "success", "accuracy", "accuracy_at_fault", "collision", "at_fault_collision", "offroad", "red_light",
+    "progress_ratio", "comfortable", "ttc_ok", "vmax_score", "nuplan_score", "distance",
+)  # fmt: skip
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Environments:
+    """A batch of environments between two collections.
+
+    Attributes:
+        state: Their states.
+        over: Whether each one's episode has ended; the next step begins a new one.
+        observation: What each one's policy sees now.
+    """
+
+    state: SimState
+    over: Bool[Array, " B"]
+    observation: dict[str, Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Rollout:
+    """Experience ``[time, batch]``. ``alive`` is false for the steps that only reset; mask them out.
+
+    ``choice`` is what the policy chose, before squashing; ``extra`` is what the actor wants to remember.
+    """
+
+    observation: dict[str, Array]
+    choice: Float[Array, "time batch 2"]
+    extra: dict[str, Array]
+    reward: Float[Array, "time batch"]
+    terminated: Bool[Array, "time batch"]
+    truncated: Bool[Array, "time batch"]
+    alive: Bool[Array, "time batch"]
+
+
+#: From observations and a key to (choice before squashing, action in [-1, 1], what to remember).
+Actor = Callable[[Mapping[str, Array], Array], tuple[Array, Array, dict[str, Array]]]
+
+
+def start_environments(simulator: Simulator, bank: ScenarioBank, key: Array, count: int) -> Environments:
+    """Environments at scenarios drawn with replacement, at random steps so that their ends are staggered."""
+    index_key, step_key = jax.random.split(key)
+    index = jax.random.randint(index_key, (count,), 0, len(bank))
+    step = jax.random.randint(step_key, (count,), CURRENT_STEP, bank.steps - 2)
+    state = jax.vmap(simulator.reset, in_axes=(None, 0, 0))(bank, index, step)
+    observation = jax.vmap(simulator.observe, in_axes=(None, 0))(bank, state.scene)
+    return Environments(state, jnp.zeros(count, bool), dict(observation))
+
+
+def collect(
+    simulator: Simulator, bank: ScenarioBank, environments: Environments, actor: Actor, key: Array, steps: int
+) -> tuple[Environments, Rollout, dict[str, Array]]:
+    """Unrolls ``steps`` steps in every environment.
+
+    Returns:
+        The environments afterwards, the experience, and sums of metrics over the episodes that ended, with
+        ``"<name>"`` the sum and ``"<name>/n"`` the number of episodes that define it.
+    """
+    count = environments.over.shape[0]
+    step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
+    observe_all = jax.vmap(simulator.observe, in_axes=(None, 0))
+
+    def one(carry: tuple[Environments, Array], _: None) -> tuple[Any, Any]:
+        now, key = carry
+        key, act_key, index_key = jax.random.split(key, 3)
+        choice, action, extra = actor(now.observation, act_key)
+        index = jax.random.randint(index_key, (count,), 0, len(bank))
+        state, transition = step_all(bank, now.state, action, now.over, index)
+        row = Rollout(
+            observation=now.observation,
+            choice=choice,
+            extra=extra,
+            reward=jnp.where(now.over, 0.0, transition.reward),
+            terminated=transition.terminated,
+            truncated=transition.truncated,
+            alive=~now.over,
+        )
+        done = transition.terminated | transition.truncated
+        tally = _tally(bank, state, transition.reward_terms, done, now.over)
+        following = Environments(state, done, dict(observe_all(bank, state.scene)))
+        return (following, key), (row, tally)
+
+    (environments, _), (rollout, tally) = jax.lax.scan(one, (environments, key), None, steps)
+    return environments, rollout, jax.tree.map(lambda leaf: leaf.sum(axis=0), tally)
+
+
+def _tally(
+    bank: ScenarioBank, state: SimState, terms: dict[str, Array], done: Array, over: Array
+) -> dict[str, Array]:
+    """Sums over the batch: metrics of episodes that end now, reward terms of steps that count."""
+    values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, state)
+    totals = {"episodes": done.sum().astype(jnp.float32), "steps": (~over).sum().astype(jnp.float32)}
+    for name in ROLLOUT_METRICS:
+        counts = done & values[name].defined
+        totals[name] = jnp.sum(jnp.where(counts, values[name].value, 0.0))
+        totals[f"{name}/n"] = counts.sum().astype(jnp.float32)
+    for name, term in terms.items():
+        totals[f"reward/{name}"] = jnp.sum(jnp.where(over, 0.0, term))
+    return totals

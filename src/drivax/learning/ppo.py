@@ -1,0 +1,195 @@
+"""Proximal policy optimisation (Schulman et al. 2017): configuration, state and one iteration on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+from jaxtyping import Array
+
+from drivax.learning.collector import Environments, Rollout, collect, start_environments
+from drivax.networks.actor_critic import ActorCritic, ActorCriticConfig
+from drivax.networks.encoders import group_spec
+from drivax.rl.advantages import generalised_advantages
+from drivax.rl.policy_gradients import clipped_surrogate_loss
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class PpoConfig:
+    """PPO. The defaults train on two CPU cores; the preset ``published`` has the published sizes.
+
+    Attributes:
+        network: Policy and value.
+        environments: Environments in parallel.
+        unroll: Steps per environment and iteration.
+        epochs, minibatches: Passes over the experience, and updates per pass.
+        learning_rate: Of Adam, falling linearly to a tenth over the run.
+        gamma, lambda_: Discount, and mixing of advantages.
+        clip: Of the probability ratio.
+        value_coefficient, entropy_coefficient: Weights in the loss.
+        gradient_norm: Gradients are clipped to this global norm.
+    """
+
+    kind: Literal["ppo"] = "ppo"
+    network: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    environments: int = 256
+    unroll: int = 64
+    epochs: int = 4
+    minibatches: int = 8
+    learning_rate: float = 3e-4
+    gamma: float = 0.99
+    lambda_: float = 0.95
+    clip: float = 0.2
+    value_coefficient: float = 0.5
+    entropy_coefficient: float = 0.01
+    gradient_norm: float = 0.5
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps of one iteration."""
+        return self.environments * self.unroll
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PpoState:
+    """Everything that a run needs to continue: networks, optimiser, environments, key and step."""
+
+    parameters: Any
+    optimiser: Any
+    environments: Environments
+    key: Array
+    iteration: Array
+
+
+class Ppo:
+    """PPO on one simulator. Holds configuration and the network's graph; everything computed is in the state."""
+
+    def __init__(self, config: PpoConfig, simulator: Simulator, bank: ScenarioBank, iterations: int) -> None:
+        self.config, self.simulator = config, simulator
+        scene = jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank)
+        self.spec = group_spec(scene)
+        updates = iterations * config.epochs * config.minibatches
+        schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
+        self.optimiser = optax.chain(
+            optax.clip_by_global_norm(config.gradient_norm), optax.adam(schedule, eps=1e-5)
+        )
+        self.graph = nnx.graphdef(self._network(jax.random.key(0)))
+
+    def _network(self, key: Array) -> ActorCritic:
+        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key))
+
+    def init(self, bank: ScenarioBank, key: Array) -> PpoState:
+        """The state before the first iteration."""
+        network_key, environment_key, key = jax.random.split(key, 3)
+        parameters = nnx.state(self._network(network_key), nnx.Param)
+        environments = start_environments(self.simulator, bank, environment_key, self.config.environments)
+        return PpoState(
+            parameters, self.optimiser.init(parameters), environments, key, jnp.zeros((), jnp.int32)
+        )
+
+    def network(self, parameters: Any) -> ActorCritic:
+        """The network with these parameters."""
+        return nnx.merge(self.graph, parameters)
+
+    def iterate(self, bank: ScenarioBank, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
+        """One iteration: collect, then update. Pure; jit it with the state donated.
+
+        Returns:
+            The next state, and sums (``rollout/*``, see ``collector.collect``) and means (``loss/*``) to log.
+        """
+        collect_key, update_key, key = jax.random.split(state.key, 3)
+        network = self.network(state.parameters)
+
+        def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
+            policy = network.policy(observation)
+            choice = policy.sample(key)
+            extra = {"log_prob": policy.log_prob(choice), "value": network.value(observation)}
+            return choice, jnp.tanh(choice), extra
+
+        environments, rollout, totals = collect(
+            self.simulator, bank, state.environments, actor, collect_key, self.config.unroll
+        )
+        last = network.value(environments.observation)
+        parameters, optimiser, losses = self._update(state, rollout, last, update_key)
+        following = PpoState(parameters, optimiser, environments, key, state.iteration + 1)
+        return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
+
+    def _update(
+        self, state: PpoState, rollout: Rollout, last: Array, key: Array
+    ) -> tuple[Any, Any, dict[str, Array]]:
+        config = self.config
+        value_t = rollout.extra["value"]
+        value_tp1 = jnp.concatenate([value_t[1:], last[None]])
+        advantage, target = generalised_advantages(
+            rollout.reward,
+            value_t,
+            value_tp1,
+            rollout.terminated,
+            rollout.truncated,
+            config.gamma,
+            config.lambda_,
+        )
+        batch = {
+            "observation": rollout.observation,
+            "choice": rollout.choice,
+            "log_prob": rollout.extra["log_prob"],
+            "advantage": advantage,
+            "target": target,
+            "alive": rollout.alive.astype(jnp.float32),
+        }
+        batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+        size = config.steps_per_iteration
+
+        def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
+            order = jax.random.permutation(key, size).reshape(config.minibatches, -1)
+            return jax.lax.scan(minibatch, carry, order)
+
+        def minibatch(carry: tuple[Any, Any], rows: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
+            parameters, optimiser = carry
+            part = jax.tree.map(lambda leaf: leaf[rows], batch)
+            key = jax.random.fold_in(update_noise, rows[0])
+            (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key)
+            logs["gradient_norm"] = optax.global_norm(gradient)
+            change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
+            return (optax.apply_updates(parameters, change), optimiser), logs
+
+        order_key, update_noise = jax.random.split(key)
+        carry = (state.parameters, state.optimiser)
+        (parameters, optimiser), logs = jax.lax.scan(epoch, carry, jax.random.split(order_key, config.epochs))
+        return parameters, optimiser, {f"loss/{name}": value.mean() for name, value in logs.items()}
+
+    def _loss(self, parameters: Any, part: dict[str, Any], key: Array) -> tuple[Array, dict[str, Array]]:
+        config, network, alive = self.config, self.network(parameters), part["alive"]
+
+        def mean(value: Array) -> Array:
+            return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
+
+        policy = network.policy(part["observation"])
+        log_prob = policy.log_prob(part["choice"])
+        centre = mean(part["advantage"])
+        spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
+        advantage = (part["advantage"] - centre) / spread
+        policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
+        value = network.value(part["observation"])
+        value_loss = mean((value - part["target"]) ** 2)
+        # The entropy of a squashed Gaussian has no closed form: one fresh sample estimates it.
+        entropy = -mean(policy.log_prob(policy.sample(key)))
+        total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
+        ratio = jnp.exp(log_prob - part["log_prob"])
+        logs = {
+            "policy": policy_loss,
+            "value": value_loss,
+            "entropy": entropy,
+            "clipped_share": mean((jnp.abs(ratio - 1.0) > config.clip).astype(jnp.float32)),
+            "kl": mean(part["log_prob"] - log_prob),
+            "explained_variance": 1.0
+            - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
+        }
+        return total, logs

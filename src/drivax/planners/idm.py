@@ -1,0 +1,130 @@
+"""IDM along the route: follows the nearest thing on the route, stops for red, slows for curves, pursues the route."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from drivax.geometry.angles import wrap
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.queries import route_ahead
+from drivax.scenario.schema import LightState
+from drivax.simulator.idm import IdmParameters, idm_acceleration
+from drivax.simulator.types import SimState, Situation
+from drivax.tasks.actions import ActionSpace
+
+#: Look-ahead along the route and its spacing, m.
+_STEP_M, _POINTS = 2.0, 46
+_FALLBACK_LIMIT_MPS = 13.4
+#: Free space kept beside the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
+_SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
+#: A yellow light is a red one for a car that can stop with this deceleration, m/s2.
+_YELLOW_BRAKING_MPS2 = 3.0
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class IdmPlanner:
+    """A rule-based driver; uses the situation's truth, not observations."""
+
+    actions: ActionSpace = field(default_factory=ActionSpace, metadata={"static": True})
+    parameters: IdmParameters = field(default_factory=IdmParameters, metadata={"static": True})
+    name: str = field(default="idm", metadata={"static": True})
+    replays: bool = field(default=False, metadata={"static": True})
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
+        """Nothing to carry."""
+        return ()
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, "2"], Any]:
+        """IDM acceleration and pure-pursuit curvature."""
+        scene = situation.scene
+        me = situation.surroundings.frame.box[scene.slot]
+        speed = scene.history[-1, 3]
+        offsets = jnp.arange(_POINTS) * _STEP_M
+        path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
+        gap, leader_speed = self._leader(bank, situation, path, there, offsets)
+        wanted = self._desired_speed(path, there, offsets)
+        acceleration = idm_acceleration(speed, wanted, gap, leader_speed, self.parameters)
+        ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
+        target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, :2] - me[:2]
+        forward = target[0] * me[2] + target[1] * me[3]
+        left = target[1] * me[2] - target[0] * me[3]
+        curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
+        return jnp.clip(self.actions.action(acceleration, curvature, me[4]), -1.0, 1.0), carry
+
+    def _leader(
+        self, bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Gap to, and speed along the route of, the nearest thing in the corridor: an agent or a red light."""
+        scene, frame = situation.scene, situation.surroundings.frame
+        me = frame.box[scene.slot]
+        along, lateral, cos, sin = _project(path, there, offsets, frame.box[:, :2], frame.box[:, 2:4])
+        half_length = jnp.abs(cos) * frame.box[:, 4] / 2 + jnp.abs(sin) * frame.box[:, 5] / 2
+        half_width = jnp.abs(sin) * frame.box[:, 4] / 2 + jnp.abs(cos) * frame.box[:, 5] / 2
+        others = frame.valid & (jnp.arange(frame.valid.shape[0]) != scene.slot)
+        blocks = others & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
+        gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
+        speed = jnp.sqrt(jnp.sum(frame.velocity**2, axis=-1)) * cos
+        nearest = jnp.argmin(gaps)
+        stop = self._stop_line(bank, situation, path, there, offsets)
+        gap = jnp.minimum(gaps[nearest], stop)
+        gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
+        return gap, jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
+
+    def _stop_line(
+        self, bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array
+    ) -> Float[Array, ""]:
+        """Distance from the front bumper to the nearest stop line of the route whose light asks to stop."""
+        scene = situation.scene
+        line = bank.light_line[scene.index]
+        state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
+        middle = (line[:, 0:2] + line[:, 2:4]) / 2
+        heading = jnp.stack([jnp.cos(line[:, 5]), jnp.sin(line[:, 5])], axis=-1)
+        along, lateral, _, _ = _project(path, there, offsets, middle, heading)
+        front = along - situation.surroundings.frame.box[scene.slot, 4] / 2
+        speed = scene.history[-1, 3]
+        can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
+        red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
+        yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
+        asks = (red | (yellow & can_stop)) & (line[:, 7] > 0) & (jnp.abs(lateral) < 2.5) & (front > 0.0)
+        return jnp.min(jnp.where(asks, front + self.parameters.min_gap_m - 1.0, jnp.inf))
+
+    def _desired_speed(self, path: Array, there: Array, offsets: Array) -> Float[Array, ""]:
+        """The limit here, and what the curves ahead allow with gentle braking."""
+        limit = jnp.where(path[0, 5] > 0, path[0, 5], _FALLBACK_LIMIT_MPS)
+        heading = jnp.arctan2(path[:, 4], path[:, 3])
+        curvature = jnp.abs(wrap(heading[1:] - heading[:-1])) / _STEP_M
+        curvature = jnp.where(there[1:], curvature, 0.0)
+        allowed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
+        return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))
+
+
+def _project(
+    path: Float[Array, "K 7"], there: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
+    heading: Float[Array, "S 2"],
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Arc length ahead and lateral offset of points on a path, and cosine and sine of headings relative to it."""
+    dx, dy = xy[:, None, 0] - path[:, 0], xy[:, None, 1] - path[:, 1]
+    nearest = jnp.argmin(jnp.where(there, dx * dx + dy * dy, jnp.inf), axis=1)
+    row = path[nearest]
+    x, y = xy[:, 0] - row[:, 0], xy[:, 1] - row[:, 1]
+    cos, sin = row[:, 3], row[:, 4]
+    # Beyond either end of the path the tangent goes on; nothing there is on it.
+    forward, left = x * cos + y * sin, y * cos - x * sin
+    on = jnp.abs(forward) <= 2.0 * _STEP_M
+    relative_cos = heading[:, 0] * cos + heading[:, 1] * sin
+    relative_sin = heading[:, 1] * cos - heading[:, 0] * sin
+    return offsets[nearest] + forward, jnp.where(on, left, jnp.inf), relative_cos, relative_sin

@@ -1,0 +1,90 @@
+"""Planners that need no thought: the expert, replayed and driven, and constant velocity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.simulator.dynamics import follow
+from drivax.simulator.types import Scene, SimState, Situation
+from drivax.tasks.actions import ActionSpace
+
+
+def logged_motion(bank: ScenarioBank, scene: Scene, ahead: int) -> Float[Array, "4"]:
+    """Logged motion of the driven slot ``ahead`` steps from now; its present motion where the log has none.
+
+    Beyond the end of the log its last motion goes on at its last velocity.
+    """
+    at = scene.step + ahead
+    row = bank.agents[scene.index, jnp.minimum(at, bank.steps - 1), scene.slot]
+    speed = jnp.maximum(jnp.sum(row[5:7] * row[3:5]), 0.0)
+    beyond = jnp.maximum(at - (bank.steps - 1), 0) * 0.1
+    xy = row[:2] + beyond * row[5:7]
+    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(row[AGENT_SIN], row[AGENT_COS]), speed])
+    return jnp.where(row[AGENT_VALID] > 0, motion, scene.history[-1])
+
+
+def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Float[Array, "2"]:
+    """The action that follows the log from here; what lies outside [-1, 1] would be clipped by the dynamics."""
+    command = follow(scene.history[-1], logged_motion(bank, scene, 1), logged_motion(bank, scene, 2))
+    return actions.action(*command, bank.agent_box[scene.index, scene.slot, 0])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Expert:
+    """The log. ``expert`` replays it exactly; ``expert_actions`` drives it through the dynamics."""
+
+    actions: ActionSpace = field(default_factory=ActionSpace, metadata={"static": True})
+    replays: bool = field(default=True, metadata={"static": True})
+
+    @property
+    def name(self) -> str:
+        """``expert`` or ``expert_actions``."""
+        return "expert" if self.replays else "expert_actions"
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
+        """Nothing to carry."""
+        return ()
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, "2"], Any]:
+        """Follows the log."""
+        return jnp.clip(expert_action(bank, state.scene, self.actions), -1.0, 1.0), carry
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """Keeps speed and heading."""
+
+    name: str = field(default="constant_velocity", metadata={"static": True})
+    replays: bool = field(default=False, metadata={"static": True})
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
+        """Nothing to carry."""
+        return ()
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, "2"], Any]:
+        """No acceleration, no curvature."""
+        return jnp.zeros(2), carry

@@ -1,0 +1,277 @@
+"""The scenario bank: many scenarios stacked on the device, an argument of everything that simulates.
+
+A bank is built from stored scenarios and trimmed to what the set really uses, so that padding costs nothing. It holds
+what a step reads, in the layout in which a step reads it: agents time-major (a frame is one contiguous read), map
+segments feature-major (a grid query is three contiguous reads per feature).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from drivax.errors import DataError, DrivaxError
+from drivax.scenario.schema import Flag, RoadKind, Scenario
+
+#: Lane width where the source gives none, m.
+DEFAULT_LANE_WIDTH_M = 3.7
+#: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
+CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
+
+AGENT_X, AGENT_Y, AGENT_Z, AGENT_COS, AGENT_SIN, AGENT_VX, AGENT_VY, AGENT_VALID = range(8)
+ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range(7)
+ROAD_X, ROAD_Y, ROAD_DX, ROAD_DY, ROAD_LENGTH, ROAD_KIND, ROAD_LIMIT, ROAD_CURVATURE = range(8)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ScenarioBank:
+    """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, P parked ones, G grid cells a side.
+
+    Attributes:
+        agents: x, y, z, cos, sin, vx, vy, valid of moving agents; slot 0 is ego.
+        agent_box: Length, width, height, kind.
+        parked: x, y, cos, sin, length, width, z, kind.
+        light_line: Stop line x, y, x, y, height, lane heading, exit heading, on-route flag.
+        edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
+        lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index, corridor flag of car-lane segments,
+            sorted by cell. The corridor is the route's lanes and their same-direction neighbours.
+        grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
+        grid_side: 1 drivable, -1 not, 0 unknown, for cells with no edge around.
+        map_box: Smallest and largest x, y of edges and lanes.
+        routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
+        log_progress: Arc length of the logged ego along route 0.
+        road: Observation pieces in order of rank: x, y, direction, length, kind, limit (-1), curvature.
+        flags: ``scenario.schema.Flag`` bits.
+        cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
+        long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
+    """
+
+    agents: Float[Array, "N T A 8"]
+    agent_box: Float[Array, "N A 4"]
+    parked: Float[Array, "N P 8"]
+    parked_valid: Bool[Array, "N T P"]
+    light_line: Float[Array, "N L 8"]
+    light_state: Int[Array, "N T L"]
+    edges: Float[Array, "N 5 E"]
+    lanes: Float[Array, "N 9 C"]
+    grid_edge: Int[Array, "N cells1"]
+    grid_lane: Int[Array, "N cells1"]
+    grid_side: Int[Array, "N cells"]
+    grid_origin: Float[Array, "N 2"]
+    map_box: Float[Array, "N 4"]
+    routes: Float[Array, "N 2 R 7"]
+    route_points: Int[Array, "N 2"]
+    goal: Float[Array, "N 2"]
+    log_progress: Float[Array, "N T"]
+    road: Float[Array, "N O 8"]
+    road_rows: Int[Array, " N"]
+    flags: UInt[Array, " N"]
+    cell_m: float = field(metadata={"static": True})
+    edge_run: int = field(metadata={"static": True})
+    lane_run: int = field(metadata={"static": True})
+    long_ego: bool = field(metadata={"static": True})
+
+    def __len__(self) -> int:
+        return self.agents.shape[0]
+
+    @property
+    def steps(self) -> int:
+        """Steps T of a scenario."""
+        return self.agents.shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the bank takes on the device."""
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+    @classmethod
+    def from_scenarios(cls, scenarios: Iterable[Scenario], *, allow_no_future: bool = False) -> ScenarioBank:
+        """Stacks scenarios of one capacity.
+
+        Raises:
+            DrivaxError: If there are none, or one has no future and ``allow_no_future`` is not set.
+        """
+        kept = list(scenarios)
+        if not kept:
+            raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
+        for scenario in kept:
+            if Flag.NO_FUTURE in scenario.has and not allow_no_future:
+                raise DataError(
+                    "has no logged future (a test split)", record=scenario.id, cure="leave it out of the set"
+                )
+        arrays, static = _stack(kept)
+        return cls(**{name: jnp.asarray(value) for name, value in arrays.items()}, **static)
+
+
+def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
+    return np.stack([scenario.record[name] for scenario in scenarios])
+
+
+def _used(mask: np.ndarray[Any, Any], multiple: int = 8) -> int:
+    """How many columns of ``mask [N, columns]`` are used, rounded up; trailing padding is cut."""
+    used = np.flatnonzero(mask.any(0))
+    return 0 if used.size == 0 else min(mask.shape[1], -(-(int(used[-1]) + 1) // multiple) * multiple)
+
+
+def _stack(scenarios: Sequence[Scenario]) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+    arrays = _stack_agents(scenarios) | _stack_routes(scenarios) | _stack_lights(scenarios)
+    maps, static = _stack_maps(scenarios)
+    reach = np.hypot(arrays["agent_box"][:, 0, 0], arrays["agent_box"][:, 0, 1]) / 2
+    capacity = scenarios[0].capacity
+    # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
+    static |= {"cell_m": capacity.cell_m, "long_ego": bool((reach + 3.0 > capacity.cell_m - 2.0).any())}
+    return arrays | maps, static
+
+
+def _stack_agents(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
+    valid = _column(scenarios, "agent_valid")
+    slots = max(1, _used(valid.any(1)))
+    heading = _column(scenarios, "agent_heading")
+    agents = np.concatenate(
+        [
+            _column(scenarios, "agent_xy"),
+            _column(scenarios, "agent_z")[..., None],
+            np.cos(heading)[..., None],
+            np.sin(heading)[..., None],
+            _column(scenarios, "agent_velocity"),
+            valid[..., None],
+        ],
+        -1,
+        dtype=np.float32,
+    )[:, :, :slots]
+    size, kind = _column(scenarios, "agent_size"), _column(scenarios, "agent_kind")
+    parked_valid = _column(scenarios, "parked_valid")
+    places = _used(parked_valid.any(1))
+    parked_heading = _column(scenarios, "parked_heading")[..., None]
+    parked = np.concatenate(
+        [
+            _column(scenarios, "parked_xy"),
+            np.cos(parked_heading),
+            np.sin(parked_heading),
+            _column(scenarios, "parked_size")[..., :2],
+            _column(scenarios, "parked_z")[..., None],
+            _column(scenarios, "parked_kind")[..., None],
+        ],
+        -1,
+        dtype=np.float32,
+    )
+    return {
+        "agents": agents,
+        "agent_box": np.concatenate([size, kind[..., None]], -1, dtype=np.float32)[:, :slots],
+        "parked": parked[:, :places],
+        "parked_valid": parked_valid[:, :, :places],
+        "flags": _column(scenarios, "flags"),
+    }
+
+
+def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
+    heading = _column(scenarios, "route_heading")[:, :2, :, None]
+    routes = np.concatenate(
+        [
+            _column(scenarios, "route_xy")[:, :2],
+            _column(scenarios, "route_z")[:, :2, :, None],
+            np.cos(heading),
+            np.sin(heading),
+            _column(scenarios, "route_limit")[:, :2, :, None],
+            _column(scenarios, "route_lane")[:, :2, :, None],
+        ],
+        -1,
+        dtype=np.float32,
+    )
+    return {
+        "routes": routes,
+        "route_points": _column(scenarios, "route_points")[:, :2].astype(np.int32),
+        "goal": _column(scenarios, "goal_xy"),
+        "log_progress": _column(scenarios, "log_progress"),
+    }
+
+
+def _stack_lights(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
+    line, lane, state = (_column(scenarios, f"light_{name}") for name in ("line", "lane", "state"))
+    route_lane = _column(scenarios, "route_lane")[:, 0]
+    on_route = ((lane[:, :, None] == route_lane[:, None, :]) & (lane[:, :, None] >= 0)).any(-1)
+    light = np.concatenate(
+        [line, *(_column(scenarios, f"light_{n}")[..., None] for n in ("z", "heading", "exit_heading"))], -1
+    )
+    light = np.concatenate([light, on_route[..., None]], -1, dtype=np.float32)
+    used = max(1, _used((state >= 0).any(1)))
+    return {"light_line": light[:, :used], "light_state": state[:, :, :used]}
+
+
+def _stack_maps(scenarios: Sequence[Scenario]) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+    blocks = _column(scenarios, "segment_blocks").astype(np.int64)
+    edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
+    grid = scenarios[0].capacity.grid
+    grid_edge = _column(scenarios, "grid_edge").astype(np.int16)
+    grid_lane = (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16)
+    edge_run, lane_run = _longest_run(grid_edge, grid), _longest_run(grid_lane, grid)
+    # A run is read whole, so every start must leave room for one behind it.
+    edges = np.full((len(scenarios), 5, int(edge_count.max()) + edge_run), 1e6, np.float32)
+    lanes = np.full((len(scenarios), 9, int(lane_count.max()) + lane_run), 1e6, np.float32)
+    box = np.zeros((len(scenarios), 4), np.float32)
+    for row, scenario in enumerate(scenarios):
+        e, n = int(edge_count[row]), int(lane_count[row])
+        a, b = scenario.segment_a, scenario.segment_b
+        edges[row, :, :e] = np.stack([a[:e, 0], a[:e, 1], b[:e, 0], b[:e, 1], (a[:e, 2] + b[:e, 2]) / 2])
+        lanes[row, :, :n] = _lane_rows(scenario, slice(e, e + n))
+        points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
+        if len(points):
+            box[row] = [*points.min(0), *points.max(0)]
+    rows = _column(scenarios, "road_rows").astype(np.int32)
+    used = max(1, int(rows.max()))
+    road = [_column(scenarios, "road_xy"), _column(scenarios, "road_direction")]
+    road += [_column(scenarios, f"road_{n}")[..., None] for n in ("length", "kind", "limit", "curvature")]
+    arrays = {
+        "edges": edges,
+        "lanes": lanes,
+        "grid_edge": grid_edge,
+        "grid_lane": grid_lane,
+        "grid_side": _column(scenarios, "grid_side"),
+        "grid_origin": _column(scenarios, "grid_origin"),
+        "map_box": box,
+        "road": np.concatenate(road, -1, dtype=np.float32)[:, :used],
+        "road_rows": rows,
+    }
+    return arrays, {"edge_run": edge_run, "lane_run": lane_run}
+
+
+def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
+    """Longest run over three neighbouring cells of a grid row, at least 8, rounded up to 8."""
+    begin = start[:, :-1].reshape(-1, grid, grid).astype(np.int64)
+    end = start[:, 1:].reshape(-1, grid, grid).astype(np.int64)
+    longest = max(int((end[:, :, 2:] - begin[:, :, :-2]).max()), 1)
+    return -(-longest // 8) * 8
+
+
+def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
+    a, b = scenario.segment_a[rows], scenario.segment_b[rows]
+    lane = scenario.segment_lane[rows].astype(np.int64)
+    width = scenario.lane_width[lane]
+    half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
+    limit = scenario.lane_limit[lane].astype(np.float32)
+    for kind, fallback in CLASS_LIMIT_MPS.items():
+        limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
+    corridor = _corridor(scenario)[lane]
+    return np.stack(
+        [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, lane, corridor]
+    ).astype(np.float32)
+
+
+def _corridor(scenario: Scenario) -> np.ndarray[Any, Any]:
+    """Which lanes are the route's own or their same-direction neighbours (at any distance sideways)."""
+    member = np.zeros(len(scenario.lane_id), bool)
+    todo = list(np.unique(scenario.route_lane[0][: int(scenario.route_points[0])]))
+    while todo:
+        lane = int(todo.pop())
+        if lane < 0 or member[lane]:
+            continue
+        member[lane] = True
+        todo += [int(scenario.lane_left[lane]), int(scenario.lane_right[lane])]
+    return member

@@ -1,0 +1,290 @@
+"""The only map tests: pure functions of a pose, unbatched, for real and hypothetical poses alike.
+
+Each looks up the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly inside them. What is
+beyond the cut-off of a test (edges 3 m from a point, lanes 4 m) never changes its result, so no result depends on the
+grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more than 3 m above or below are ignored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.angles import wrap
+from drivax.scenario.bank import DEFAULT_LANE_WIDTH_M, ScenarioBank
+
+EDGE_CUTOFF_M = 3.0
+LANE_CUTOFF_M = 4.0
+LEVEL_M = 3.0
+#: A corner may be this far beyond an edge before it counts as off the road (semantics, ``offroad``).
+OFFROAD_TOLERANCE_M = 0.3
+#: A lane's border is fuzzy by this much (semantics, ``lane_straddle``).
+LANE_MARGIN_M = 0.2
+_FAR = 1e9
+
+
+def _cell(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2]) -> Int[Array, 2]:
+    """Grid cell (x, y) of a point, clamped so that its 3 x 3 block lies in the grid."""
+    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
+    return jnp.clip(cell, 1, grid - 2)
+
+
+def _runs(
+    start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int, index: Int[Array, ""],
+    cell: Int[Array, 2], grid: int,
+) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
+    """The rows of the 3 x 3 cells around ``cell``: three contiguous reads of fixed length, and which rows count."""
+    features, inside = [], []
+    for below in (-1, 0, 1):
+        first = (cell[1] + below) * grid + cell[0] - 1
+        bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
+        block = jax.lax.dynamic_slice(rows, (index, 0, bounds[0]), (1, rows.shape[1], run))[0]
+        features.append(block)
+        inside.append(jnp.arange(run) < bounds[3] - bounds[0])
+    return jnp.concatenate(features, axis=1), jnp.concatenate(inside)
+
+
+def _to_segments(
+    rows: Float[Array, "F K"], points: Float[Array, "P 2"]
+) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
+    """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
+    ax, ay, bx, by = rows[0], rows[1], rows[2], rows[3]
+    ux, uy = bx - ax, by - ay
+    wx, wy = points[:, 0:1] - ax, points[:, 1:2] - ay
+    squared = jnp.maximum(ux * ux + uy * uy, 1e-9)
+    along = jnp.clip((wx * ux + wy * uy) / squared, 0.0, 1.0)
+    dx, dy = wx - along * ux, wy - along * uy
+    return dx * dx + dy * dy, (ux * wy - uy * wx) * jax.lax.rsqrt(squared)
+
+
+def left_of_edges(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, 2], points: Float[Array, "P 2"],
+    z: Float[Array, ""],
+) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
+    """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
+
+    At a vertex two segments are equally near; the one whose line is further away has the right side (the other one's
+    line passes through the wrong wedge). Points must lie within 5 m of ``centre``, whose cells are read.
+
+    Returns:
+        Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
+    """
+    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    rows, inside = _runs(bank.grid_edge, bank.edges, bank.edge_run, index, _cell(bank, index, centre), grid)
+    squared, side = _to_segments(rows, points)
+    squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
+    nearest = squared.min(axis=1)
+    tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
+    left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
+    right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
+    distance = jnp.sqrt(nearest)
+    return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LaneHits:
+    """What the lanes around a box say about it; booleans and distances of its centre unless said otherwise.
+
+    Attributes:
+        near: A lane centre lies within the cut-off of the box's centre.
+        points_near: The same for each of the points (box corners).
+        on_corridor: Inside a lane of the route's corridor.
+        wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
+        straddling: Some corner is outside every lane that runs ego's way.
+        leaving_lane: Some corner is outside the lane that the centre is in (nuPlan's several lanes, for fault).
+        limit: Speed limit of the lane, m/s; -1 where unknown.
+        lane: Index of the nearest lane that runs ego's way, -1 where none is near.
+        offset: Signed distance to its centre line, positive left of it, m.
+        z: Height of the nearest lane, of the query's own height where none is near.
+    """
+
+    near: Bool[Array, ""]
+    points_near: Bool[Array, " P"]
+    on_corridor: Bool[Array, ""]
+    wrong_way: Bool[Array, ""]
+    straddling: Bool[Array, ""]
+    leaving_lane: Bool[Array, ""]
+    limit: Float[Array, ""]
+    lane: Int[Array, ""]
+    offset: Float[Array, ""]
+    z: Float[Array, ""]
+
+
+def around_lanes(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, 2], heading: Float[Array, 2],
+    points: Float[Array, "P 2"], z: Float[Array, ""],
+) -> LaneHits:  # fmt: skip
+    """Where a box lies among the lanes around it.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        centre: Centre of the box, m.
+        heading: Cosine and sine of its heading.
+        points: Its corners.
+        z: Its height.
+    """
+    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, centre), grid)
+    inside = inside & (jnp.abs(rows[4] - z) <= LEVEL_M)
+    squared, side = _to_segments(rows, jnp.concatenate([centre[None], points]))
+    squared = jnp.where(inside, squared, _FAR)
+    half, limit = rows[5], rows[6]
+    ux, uy = rows[2] - rows[0], rows[3] - rows[1]
+    aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
+    aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
+    own, corner = squared[0], squared[1:]
+    reachable = own <= LANE_CUTOFF_M**2
+    best = jnp.argmin(jnp.where(aligned, own, _FAR))
+    has_lane = aligned[best] & reachable[best]
+    nearest = jnp.argmin(own)
+    opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
+    friendly = jnp.where(against, _FAR, own).min()
+    beyond = jnp.sqrt(corner) - (half + LANE_MARGIN_M)
+    outside = jnp.where(aligned, beyond, _FAR).min(axis=1) > 0.0
+    leaving = jnp.abs(side[1:, best]) - (half[best] + LANE_MARGIN_M) > 0.0
+    near = reachable.any()
+    return LaneHits(
+        near=near,
+        points_near=corner.min(axis=1) <= LANE_CUTOFF_M**2,
+        on_corridor=((rows[8] == 1.0) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
+        wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
+        straddling=outside.any(),
+        leaving_lane=has_lane & leaving.any(),
+        limit=jnp.where(has_lane, limit[best], -1.0),
+        lane=jnp.where(has_lane, rows[7, best], -1.0).astype(jnp.int32),
+        offset=jnp.where(has_lane, side[0, best], 0.0),
+        z=jnp.where(near, rows[4, nearest], z),
+    )
+
+
+def offroad_distance(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, 2], points: Float[Array, "P 2"],
+    points_near_lane: Bool[Array, " P"], z: Float[Array, ""],
+) -> Float[Array, " P"]:  # fmt: skip
+    """How far each point is beyond the nearest road edge, m: positive off the road, negative on it.
+
+    Without an edge within the cut-off the stored side of the point's grid cell decides, and without that the road
+    is where a lane centre is near; such points get plus or minus the cut-off.
+    """
+    if bank.long_ego:
+        look = jax.vmap(lambda p: left_of_edges(bank, index, p, p[None], z))
+        left, known = (part[:, 0] for part in look(points))
+    else:
+        left, known = left_of_edges(bank, index, centre, points, z)
+    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    cells = jnp.floor((points - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
+    inside = ((cells >= 0) & (cells < grid)).all(axis=1)
+    flat = jnp.clip(cells[:, 1] * grid + cells[:, 0], 0, grid * grid - 1)
+    stored = jnp.where(inside, bank.grid_side[index, flat], 0)
+    off = jnp.where(stored != 0, stored < 0, ~points_near_lane)
+    return jnp.where(known, -left, jnp.where(off, EDGE_CUTOFF_M, -EDGE_CUTOFF_M))
+
+
+def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2]) -> Bool[Array, ""]:
+    """Whether a point lies outside the box around all edges and lanes of the scenario."""
+    box = bank.map_box[index]
+    return (xy < box[:2]).any() | (xy > box[2:]).any()
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RouteHit:
+    """Projection on the route: arc length, signed lateral distance (left positive), m; heading cosine and sine."""
+
+    along_m: Float[Array, ""]
+    lateral_m: Float[Array, ""]
+    distance_m: Float[Array, ""]
+    heading: Float[Array, 2]
+
+
+_WINDOW = 40
+_WINDOW_BEHIND = 6
+
+
+def project_on_route(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2], near_m: Float[Array, ""], route: int = 0
+) -> RouteHit:
+    """Projects a point on the route within a window from 6 m behind to 33 m ahead of ``near_m``.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        xy: The point, m.
+        near_m: Arc length around which to look; the last known position along the route.
+        route: 0 the route to the goal, 1 the log's own.
+    """
+    count = bank.routes.shape[2]
+    first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
+    size = min(_WINDOW, count)
+    window = jax.lax.dynamic_slice(bank.routes, (index, route, first, 0), (1, 1, size, 5))[0, 0]
+    a, b = window[:-1], window[1:]
+    real = first + 1 + jnp.arange(size - 1) < bank.route_points[index, route]
+    rows = jnp.stack([a[:, 0], a[:, 1], b[:, 0], b[:, 1]])
+    squared, side = _to_segments(rows, xy[None])
+    k = jnp.argmin(jnp.where(real, squared[0], _FAR))
+    u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
+    part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
+    distance = jnp.sqrt(squared[0, k])
+    return RouteHit(
+        along_m=(first + k).astype(jnp.float32) + part,
+        lateral_m=jnp.where(side[0, k] >= 0, distance, -distance),
+        distance_m=distance,
+        heading=window[k, 3:5],
+    )
+
+
+def route_ahead(
+    bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""], offsets_m: Float[Array, " K"],
+    route: int = 0,
+) -> tuple[Float[Array, "K 7"], Bool[Array, " K"]]:  # fmt: skip
+    """Route rows at arc lengths ``along_m + offsets_m`` (linear between points) and which of them exist."""
+    at = jnp.maximum(along_m + offsets_m, 0.0)
+    last = bank.route_points[index, route] - 1
+    low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
+    part = (at - low)[:, None]
+    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
+    # Lanes and limits are not numbers to blend.
+    rows = rows.at[:, 5:].set(bank.routes[index, route, low, 5:])
+    return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
+
+
+def light_crossing(
+    bank: ScenarioBank, index: Int[Array, ""], before: Float[Array, 2], now: Float[Array, 2]
+) -> tuple[Bool[Array, " L"], Float[Array, " L"]]:
+    """Which stop lines a point crossed forwards between two steps, and its distance before each line now (m).
+
+    A line is crossed when the signed distance along the lane's heading changes sign and the point passes through the
+    finite segment.
+    """
+    line = bank.light_line[index]
+    middle = (line[:, 0:2] + line[:, 2:4]) / 2
+    half = jnp.sqrt(jnp.sum((line[:, 2:4] - line[:, 0:2]) ** 2, -1)) / 2
+    cos, sin = jnp.cos(line[:, 5]), jnp.sin(line[:, 5])
+
+    def split(point: Float[Array, 2]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
+        d = point - middle
+        return d[:, 0] * cos + d[:, 1] * sin, d[:, 1] * cos - d[:, 0] * sin
+
+    (s0, t0), (s1, t1) = split(before), split(now)
+    share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
+    through = jnp.abs(t0 + (t1 - t0) * share) <= half
+    return (s0 < 0.0) & (s1 >= 0.0) & through, -s1
+
+
+def turns_right(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, " L"]:
+    """Whether the lane behind each stop line ends more than 45 deg to the right of its start."""
+    line = bank.light_line[index]
+    return wrap(line[:, 6] - line[:, 5]) < -jnp.pi / 4
+
+
+__all__ = [
+    "DEFAULT_LANE_WIDTH_M", "EDGE_CUTOFF_M", "LANE_CUTOFF_M", "LANE_MARGIN_M", "LEVEL_M", "OFFROAD_TOLERANCE_M",
+    "LaneHits", "RouteHit", "around_lanes", "left_of_edges", "left_the_map", "light_crossing", "offroad_distance",
+    "project_on_route", "route_ahead", "turns_right",
+]  # fmt: skip

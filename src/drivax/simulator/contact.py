@@ -1,0 +1,127 @@
+"""Contacts of one agent with the others: overlap, who is at fault, what kind of collision, time to collision."""
+
+from __future__ import annotations
+
+import enum
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, overlap, time_to_overlap
+from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.schema import AgentKind
+from drivax.simulator.types import Frame
+
+TTC_HORIZON_S = 5.0
+#: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
+STOPPED_MPS = 0.05
+#: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
+REAR_AXLE = 1.461 / 5.176
+ABSENT, APART, TOUCHING, IGNORED = range(4)
+
+
+class CollisionType(enum.IntEnum):
+    """Kind of the first collision, seen from the judged agent."""
+
+    NONE = 0
+    REAR_END = 1
+    REAR_ENDED = 2
+    SIDE_SWIPE = 3
+    HEAD_ON = 4
+    VULNERABLE = 5
+    STOPPED_OBJECT = 6
+
+
+def overlaps(frame: Frame, slot: Int[Array, ""]) -> Bool[Array, " S"]:
+    """Which valid others overlap the agent now, on its level."""
+    others = frame.valid & (jnp.arange(frame.valid.shape[0]) != slot)
+    level = jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
+    return overlap(frame.box[slot], frame.box) & others & level
+
+
+def next_contacts(
+    before: Int[Array, " S"], touching: Bool[Array, " S"], valid: Bool[Array, " S"]
+) -> Int[Array, " S"]:
+    """Contact code of every slot: an overlap that was there when the agent appeared is ignored until it parts."""
+    ignored = touching & ((before == IGNORED) | (before == ABSENT))
+    code = jnp.where(ignored, IGNORED, jnp.where(touching, TOUCHING, APART))
+    return jnp.where(valid, code, ABSENT).astype(jnp.int8)
+
+
+def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, Array]:
+    """Every slot's centre in the agent's frame (ahead, left) and cosine and sine of its heading there."""
+    me = frame.box[slot]
+    dx, dy = frame.box[:, X] - me[X], frame.box[:, Y] - me[Y]
+    cos = frame.box[:, COS] * me[COS] + frame.box[:, SIN] * me[SIN]
+    sin = frame.box[:, SIN] * me[COS] - frame.box[:, COS] * me[SIN]
+    return dx * me[COS] + dy * me[SIN], dy * me[COS] - dx * me[SIN], cos, sin
+
+
+def judge_contacts(
+    frame: Frame, slot: Int[Array, ""], fresh: Bool[Array, " S"], speed: Float[Array, ""],
+    others_speed: Float[Array, " S"], unlawful: Bool[Array, ""],
+) -> tuple[Bool[Array, ""], Int[Array, ""]]:  # fmt: skip
+    """Fault and type of contacts that began at this step.
+
+    Fault follows nuPlan's order: agent itself stopped: no; the other stopped: yes; the other behind: no; hit with the
+    front: yes; sideways: yes when the agent leaves its lane or the road.
+
+    Args:
+        frame: Everyone now.
+        slot: The judged agent.
+        fresh: Slots whose contact began at this step.
+        speed: The larger speed of the agent before and after the step.
+        others_speed: The same for every slot.
+        unlawful: The agent is in several lanes or off the road.
+
+    Returns:
+        Whether any fresh contact is the agent's fault, and the type of the nearest one.
+    """
+    me = frame.box[slot]
+    ahead, left, cos, sin = relative(frame, slot)
+    bearing = jnp.arctan2(jnp.abs(left), ahead + REAR_AXLE * me[LENGTH])
+    behind = bearing > 5 * jnp.pi / 6
+    # The front bumper as a thin box.
+    bumper = jnp.stack(
+        [me[X] + me[LENGTH] / 2 * me[COS], me[Y] + me[LENGTH] / 2 * me[SIN], me[COS], me[SIN],
+         jnp.full((), 0.02), me[WIDTH]]
+    )  # fmt: skip
+    front = overlap(bumper, frame.box)
+    stopped, other_stopped = speed < STOPPED_MPS, others_speed < STOPPED_MPS
+    fault = ~stopped & (other_stopped | (~behind & (front | unlawful)))
+    vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
+    head_on = cos < -(0.5**0.5)
+    kind = jnp.where(
+        vulnerable,
+        CollisionType.VULNERABLE,
+        jnp.where(
+            other_stopped & front,
+            CollisionType.STOPPED_OBJECT,
+            jnp.where(
+                head_on & (front | ~behind),
+                CollisionType.HEAD_ON,
+                jnp.where(
+                    front,
+                    CollisionType.REAR_END,
+                    jnp.where(behind, CollisionType.REAR_ENDED, CollisionType.SIDE_SWIPE),
+                ),
+            ),
+        ),
+    )
+    nearest = jnp.argmin(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
+    return (fresh & fault).any(), jnp.where(fresh.any(), kind[nearest], CollisionType.NONE).astype(jnp.int8)
+
+
+def time_to_collision(frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"]) -> Float[Array, ""]:
+    """Seconds to the first overlap at constant velocities and fixed headings, at most 5 (semantics, ``ttc``).
+
+    Agents that lie entirely behind the rear axle are followers and never count. Of the rest, whoever overlaps within
+    the horizon is ahead or comes into the lane that the agent sweeps; no cone narrows the view.
+    """
+    me = frame.box[slot]
+    ahead, _, cos, sin = relative(frame, slot)
+    reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
+    counts = frame.valid & ~ignored & (jnp.arange(frame.valid.shape[0]) != slot)
+    counts &= (ahead + reach > -REAR_AXLE * me[LENGTH]) & (jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M)
+    times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
+    return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))

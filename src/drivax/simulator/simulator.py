@@ -1,0 +1,161 @@
+"""The simulator: reset and step as pure functions of a bank, a state and an action."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.contact import ABSENT
+from drivax.simulator.situation import PAUSE_STEPS, measure
+from drivax.simulator.traffic import LogTraffic, alone, frame_of, logged_history
+from drivax.simulator.types import Frame, Scene, SimState, Situation, Task, Traffic, Transition
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A task in a kind of traffic. Holds configuration only; everything computed is an argument or a result.
+
+    Functions are unbatched; ``jax.vmap(simulator.step, in_axes=(None, 0, 0))`` steps a batch. ``step`` never resets;
+    :meth:`step_or_begin` is for collectors.
+    """
+
+    task: Task
+    traffic: Traffic = field(default_factory=LogTraffic)
+
+    def reset(self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0) -> SimState:
+        """The state of agent ``slot`` at ``step`` of scenario ``index``, as logged."""
+        scene = self.scene(bank, index, step, slot)
+        cast = alone(scene)
+        now, before = self.frame(bank, scene, cast, 0), self.frame(bank, scene, cast, 1)
+        # Overlaps at the start are ignored until they part, as if everyone had just appeared.
+        contacts = jnp.full(now.valid.shape, ABSENT, jnp.int8)
+        pause = jnp.full(bank.light_state.shape[2], PAUSE_STEPS + 1, jnp.int8)
+        situation, contacts, pause = measure(bank, scene, now, before, contacts, pause)
+        return SimState(
+            situation.scene, situation.facts, contacts, pause, self.task.episode_start(), situation.scene.step
+        )
+
+    def scene(self, bank: ScenarioBank, index: Any, step: Any, slot: Any = 0) -> Scene:
+        """A logged moment as a scene: what offline sampling and resets start from."""
+        index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
+        return Scene(
+            index=index,
+            step=step,
+            slot=slot,
+            history=logged_history(bank, index, step, slot),
+            action=jnp.zeros(2),
+            route_m=bank.log_progress[index, step],
+            traffic=self.traffic.start(bank, index, step),
+        )
+
+    def frame(self, bank: ScenarioBank, scene: Scene, cast: Scene, back: int) -> Frame:
+        """Everyone ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
+        return frame_of(bank, scene.index, scene.step, self.traffic.agents(bank, scene, back), cast, back)
+
+    def step(
+        self, bank: ScenarioBank, state: SimState, action: Float[Array, 2]
+    ) -> tuple[SimState, Transition]:
+        """Drives one step of 0.1 s with an action of the task's action space."""
+        return self._drive(bank, state, action, None)
+
+    def replay(
+        self, bank: ScenarioBank, state: SimState, motion: Float[Array, 4], action: Float[Array, 2]
+    ) -> tuple[SimState, Transition]:
+        """Puts the agent at ``motion`` one step later, without dynamics (the exact expert); ``action`` is recorded."""
+        return self._drive(bank, state, action, motion)
+
+    def step_together(
+        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K 2"]
+    ) -> tuple[SimState, Transition]:
+        """Drives K agents of one scenario at once; ``states`` is the stack of their states."""
+        moved = jax.vmap(lambda s, a: self._move(bank, s.scene, states.scene, a, None))(states, actions)
+        return jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, a))(states, moved, actions)
+
+    def situation(self, bank: ScenarioBank, state: SimState) -> Situation:
+        """The present pose measured again, with its surroundings; for planners."""
+        cast = alone(state.scene)
+        now, before = self.frame(bank, state.scene, cast, 0), self.frame(bank, state.scene, cast, 1)
+        return measure(bank, state.scene, now, before, state.contacts, state.light_pause)[0]
+
+    def observe(self, bank: ScenarioBank, scene: Scene, cast: Scene | None = None) -> Mapping[str, Any]:
+        """The task's observation of a scene, live or replayed."""
+        cast = alone(scene) if cast is None else cast
+
+        def frames(back: int) -> Frame:
+            return self.frame(bank, scene, cast, back)
+
+        return self.task.observe(bank, scene, frames, frames(0))
+
+    def step_or_begin(
+        self,
+        bank: ScenarioBank,
+        state: SimState,
+        action: Float[Array, "2"],
+        over: Bool[Array, ""],
+        index: Any,
+        step: Any = CURRENT_STEP,
+    ) -> tuple[SimState, Transition]:
+        """A step, or where the episode is ``over`` the beginning of scenario ``index`` instead.
+
+        For collectors: an episode that ends costs one call that only resets, whose transition means nothing and is to
+        be masked; in exchange nothing is measured or observed twice, and every state that a policy sees, final ones
+        included, is seen once.
+        """
+        fresh = self.scene(bank, index, step)
+        moved = self._move(bank, state.scene, alone(state.scene), action, None)
+        scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
+        before = replace(
+            state,
+            contacts=jnp.where(over, jnp.int8(ABSENT), state.contacts),
+            light_pause=jnp.where(over, jnp.int8(PAUSE_STEPS + 1), state.light_pause),
+            start=jnp.where(over, fresh.step, state.start),
+        )
+        after, transition = self._settle(bank, before, scene, alone(scene), action)
+        first = self.task.episode_start()
+        episode = jax.tree.map(lambda new, old: jnp.where(over, new, old), first, after.episode)
+        after = replace(after, episode=episode)
+        flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
+        return after, replace(transition, after=after, **flags)
+
+    def _drive(
+        self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None
+    ) -> tuple[SimState, Transition]:
+        moved = self._move(bank, state.scene, alone(state.scene), action, motion)
+        return self._settle(bank, state, moved, alone(moved), action)
+
+    def _move(
+        self, bank: ScenarioBank, scene: Scene, cast: Scene, action: Array, motion: Array | None
+    ) -> Scene:
+        """Everyone moves one step; nothing is measured yet."""
+        if motion is None:
+            motion = self.task.motion(scene.history[-1], action, bank.agent_box[scene.index, scene.slot, 0])
+        frame = self.frame(bank, scene, cast, 0)
+        return replace(
+            scene,
+            step=scene.step + 1,
+            history=jnp.concatenate([scene.history[1:], motion[None]]),
+            action=action,
+            traffic=self.traffic.advance(bank, scene, frame),
+        )
+
+    def _settle(
+        self, bank: ScenarioBank, before: SimState, moved: Scene, cast: Scene, action: Array
+    ) -> tuple[SimState, Transition]:
+        """Measures an agent after everyone has moved, and turns the step into a transition."""
+        now, previous = self.frame(bank, moved, cast, 0), self.frame(bank, moved, cast, 1)
+        found, contacts, pause = measure(bank, moved, now, previous, before.contacts, before.light_pause)
+        terminated, truncated = self.task.ended(bank, found.scene, found.facts)
+        terms = self.task.reward(before.facts, found.facts, found.surroundings)
+        after = SimState(found.scene, found.facts, contacts, pause, before.episode, before.start)
+        final = found.scene.step >= bank.steps - 1
+        episode = self.task.episode_add(before.episode, after, terminated | truncated | final)
+        after = replace(after, episode=episode)
+        reward = sum(terms.values(), start=jnp.zeros(()))
+        return after, Transition(before, after, action, reward, terms, terminated, truncated)

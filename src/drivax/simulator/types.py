@@ -1,0 +1,208 @@
+"""Records of the simulator (decision 0002). Unbatched; ``vmap`` adds the batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.queries import LaneHits, RouteHit
+
+#: Rows of recent motion that a scene carries: the 15-sample comfort window needs one more speed than accelerations.
+HISTORY = 16
+MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """All that an observation depends on beside the bank; what a replay stores.
+
+    Attributes:
+        index: Row of the bank.
+        step: Time step t in the log.
+        slot: Agent slot that is driven (0: ego).
+        history: x, y, heading, speed of the driven agent over the last 16 steps; the last row is now.
+        action: The last action, in the action space's own units ([-1, 1]^2 for the continuous ones).
+        route_m: Arc length along the route to the goal, m; never decreases.
+        traffic: State of the traffic model; an empty tuple where the others replay the log.
+    """
+
+    index: Int[Array, "*batch"]
+    step: Int[Array, "*batch"]
+    slot: Int[Array, "*batch"]
+    history: Float[Array, "*batch 16 4"]
+    action: Float[Array, "*batch 2"]
+    route_m: Float[Array, "*batch"]
+    traffic: Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Frame:
+    """Everyone at one step: the A moving slots of the bank, then its P parked ones.
+
+    Attributes:
+        box: x, y, cos, sin, length, width.
+        velocity: m/s.
+        z: Height of the box centre, m.
+        valid: Whether the agent is there.
+        kind: ``scenario.schema.AgentKind``.
+    """
+
+    box: Float[Array, "*batch S 6"]
+    velocity: Float[Array, "*batch S 2"]
+    z: Float[Array, "*batch S"]
+    valid: Bool[Array, "*batch S"]
+    kind: Int[Array, "*batch S"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Facts:
+    """What was measured at one pose, as scalars; kept in the state. Units in names; definitions in the semantics.
+
+    ``ttc_defined`` is false while standing; ``limit_mps`` is -1 where no limit is known; ``on_lane`` says whether a
+    lane is near at all.
+    """
+
+    collision: Bool[Array, "*batch"]
+    at_fault: Bool[Array, "*batch"]
+    collision_type: Int[Array, "*batch"]
+    offroad: Bool[Array, "*batch"]
+    offroad_m: Float[Array, "*batch"]
+    left_map: Bool[Array, "*batch"]
+    red_light: Bool[Array, "*batch"]
+    ttc_s: Float[Array, "*batch"]
+    ttc_defined: Bool[Array, "*batch"]
+    speed_mps: Float[Array, "*batch"]
+    limit_mps: Float[Array, "*batch"]
+    on_lane: Bool[Array, "*batch"]
+    wrong_way: Bool[Array, "*batch"]
+    straddling: Bool[Array, "*batch"]
+    moved_m: Float[Array, "*batch"]
+    progress_m: Float[Array, "*batch"]
+    log_progress_m: Float[Array, "*batch"]
+    route_deviation_m: Float[Array, "*batch"]
+    off_route: Bool[Array, "*batch"]
+    log_divergence_m: Float[Array, "*batch"]
+    goal_distance_m: Float[Array, "*batch"]
+    lateral_acceleration_mps2: Float[Array, "*batch"]
+    acceleration_mps2: Float[Array, "*batch"]
+    jerk_mps3: Float[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Surroundings:
+    """What was found around a pose; arrays, never carried from step to step."""
+
+    frame: Frame
+    lanes: LaneHits
+    route: RouteHit
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Situation:
+    """A scene, measured."""
+
+    scene: Scene
+    facts: Facts
+    surroundings: Surroundings
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SimState:
+    """State of one driven agent in one scenario.
+
+    Attributes:
+        scene: What observations depend on.
+        facts: The last measurement.
+        contacts: Per slot: 0 absent, 1 apart, 2 touching, 3 ignored until it parts.
+        light_pause: Steps since the agent last stood before each stop line; saturates.
+        episode: Accumulators of the task's metrics since ``start``.
+        start: Step at which the episode began.
+    """
+
+    scene: Scene
+    facts: Facts
+    contacts: Int[Array, "*batch S"]
+    light_pause: Int[Array, "*batch L"]
+    episode: Any
+    start: Int[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Transition:
+    """One step. ``after`` is the state that the step led to, never a reset state.
+
+    Attributes:
+        before, after: States on both sides.
+        action: What was done, in the action space.
+        reward: Weighted sum of the reward terms.
+        reward_terms: Each weighted term by name.
+        terminated: The episode ended for good: bootstrap zero.
+        truncated: The log (or the map) ended: bootstrap the value of ``after``.
+    """
+
+    before: SimState
+    after: SimState
+    action: Float[Array, "*batch 2"]
+    reward: Float[Array, "*batch"]
+    reward_terms: dict[str, Float[Array, "*batch"]]
+    terminated: Bool[Array, "*batch"]
+    truncated: Bool[Array, "*batch"]
+
+
+@runtime_checkable
+class Traffic(Protocol):
+    """How everyone who is not driven moves."""
+
+    def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
+        """Traffic state at a step of the log."""
+        ...
+
+    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> Any:
+        """Traffic state one step later, given everyone's present frame."""
+        ...
+
+    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+        """Rows of ``bank.agents`` for the moving slots ``back`` steps ago."""
+        ...
+
+
+class Task(Protocol):
+    """What makes it a learning problem; satisfied by ``tasks.Task``, which the simulator never imports."""
+
+    def motion(self, motion: Float[Array, 4], action: Float[Array, 2], length: Any) -> Float[Array, 4]:
+        """Next motion of the driven agent for an action of the task's action space."""
+        ...
+
+    def observe(self, bank: ScenarioBank, scene: Scene, agents: Any, frame: Frame) -> Mapping[str, Any]:
+        """Observation of a scene."""
+        ...
+
+    def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
+        """Weighted reward terms by name."""
+        ...
+
+    def ended(
+        self, bank: ScenarioBank, scene: Scene, facts: Facts
+    ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Whether the episode is terminated, and whether it is truncated."""
+        ...
+
+    def episode_start(self) -> Any:
+        """Empty metric accumulators."""
+        ...
+
+    def episode_add(self, episode: Any, state: SimState, final: Bool[Array, ""]) -> Any:
+        """Accumulators after one more step."""
+        ...

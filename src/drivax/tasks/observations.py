@@ -1,0 +1,212 @@
+"""Observations: named groups of features with masks, in the ego frame, scaled to about [-1, 1].
+
+Layout (semantics, Observation): each group is an array whose last axis are features and a boolean mask over its rows.
+Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m (pieces of road by 10 m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.angles import rotate
+from drivax.scenario.bank import ROUTE_LIMIT, ScenarioBank
+from drivax.scenario.queries import route_ahead
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, LightState
+from drivax.simulator.types import HISTORY, Frame, Scene
+
+POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
+#: Reach of the road group ahead, behind and to each side, m.
+ROAD_AHEAD_M, ROAD_BEHIND_M, ROAD_SIDE_M = 70.0, 10.0, 25.0
+Observation = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """Which groups, how many rows, how many past steps.
+
+    Attributes:
+        agents: How many of the nearest others.
+        steps: Past steps of ego and agents, the present one included; at most 10.
+        road: Rows of the road group; 0 leaves it out.
+        edges: Whether the road group shows road edges beside lanes and crosswalks.
+        lights: How many of the nearest lights on or near the route.
+        route: Points of the route, ``route_step_m`` apart.
+    """
+
+    agents: int = 16
+    steps: int = 5
+    road: int = 200
+    edges: bool = True
+    lights: int = 5
+    route: int = 10
+    route_step_m: float = 5.0
+
+
+PRESETS = {
+    "minimal": ObservationConfig(agents=8, steps=1, edges=False),
+    "standard": ObservationConfig(edges=False),
+    "optimal": ObservationConfig(),
+    "maximal": ObservationConfig(agents=32, steps=10),
+}
+
+
+def observe(
+    config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Callable[[int], Frame]
+) -> Observation:
+    """The observation of a scene.
+
+    Args:
+        config: Groups and sizes.
+        bank: The scenarios.
+        scene: The scene.
+        frames: Everyone ``back`` steps ago.
+
+    Returns:
+        ``ego [steps, 7]``: position, heading (sin, cos), velocity, and in every row the last action's place is taken
+        by ``ego_static [4]``: length, width, last action. ``agents [agents, steps, 12]`` with ``agents_mask [agents,
+        steps]``, ``road [road, 10]``, ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``.
+    """
+    view = _View.of(scene)
+    result = _ego(config, bank, scene, view) | _agents(config, scene, view, frames)
+    if config.road:
+        result |= _road(config, bank, scene, view)
+    return result | _lights(config, bank, scene, view) | _route(config, bank, scene, view)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _View:
+    """The ego frame."""
+
+    xy: Float[Array, 2]
+    cos: Float[Array, ""]
+    sin: Float[Array, ""]
+
+    @classmethod
+    def of(cls, scene: Scene) -> _View:
+        now = scene.history[-1]
+        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
+
+    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        return rotate(xy - self.xy, self.cos, -self.sin)
+
+    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        return rotate(xy, self.cos, -self.sin)
+
+
+def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
+    return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
+
+
+def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+    past = scene.history[HISTORY - config.steps :]
+    direction = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
+    turned = view.vector(direction)
+    rows = jnp.concatenate(
+        [view.point(past[:, :2]) / POSITION_M, turned[:, ::-1], turned * past[:, 3:4] / SPEED_MPS], axis=-1
+    )
+    size = bank.agent_box[scene.index, scene.slot, :2] / SIZE_M
+    return {"ego": rows, "ego_static": jnp.concatenate([size, scene.action])}
+
+
+def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
+    """Indices of the smallest entries, nearest first; repeats the last ones where there are too few."""
+    count_there = min(count, distance.shape[0])
+    chosen = jax.lax.top_k(-distance, count_there)[1]
+    return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
+
+
+def _agents(
+    config: ObservationConfig, scene: Scene, view: _View, frames: Callable[[int], Frame]
+) -> Observation:
+    now = frames(0)
+    slots = now.valid.shape[0]
+    seen = now.valid & (jnp.arange(slots) != scene.slot)
+    offset = now.box[:, :2] - view.xy
+    distance = jnp.where(seen, jnp.sum(offset * offset, axis=-1), jnp.inf)
+    chosen = _nearest(distance, config.agents)
+    there = seen[chosen] & (jnp.arange(config.agents) < slots)
+
+    def row(back: int) -> tuple[Float[Array, "K 6"], Bool[Array, " K"]]:
+        frame = now if back == 0 else frames(back)
+        box = frame.box[chosen]
+        direction = view.vector(box[:, 2:4])
+        parts = [view.point(box[:, :2]) / POSITION_M, direction[:, ::-1]]
+        parts.append(view.vector(frame.velocity[chosen]) / SPEED_MPS)
+        return jnp.concatenate(parts, axis=-1), frame.valid[chosen]
+
+    rows = [row(back) for back in range(config.steps - 1, -1, -1)]
+    moving = jnp.stack([one for one, _ in rows], axis=1)
+    mask = jnp.stack([valid for _, valid in rows], axis=1) & there[:, None]
+    kind = now.kind[chosen]
+    static = jnp.concatenate(
+        [now.box[chosen, 4:6] / SIZE_M, (kind[:, None] == jnp.arange(1, 5)).astype(jnp.float32)], axis=-1
+    )
+    static = jnp.broadcast_to(static[:, None], (*moving.shape[:2], static.shape[-1]))
+    return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
+
+
+def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+    rows = bank.road[scene.index]
+    count = rows.shape[0]
+    kind = rows[:, 5]
+    lane, edge, area = (_is_one_of(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS))
+    xy = view.point(rows[:, :2])
+    inside = (xy[:, 0] < ROAD_AHEAD_M) & (xy[:, 0] > -ROAD_BEHIND_M) & (jnp.abs(xy[:, 1]) < ROAD_SIDE_M)
+    wanted = lane | area | (edge if config.edges else jnp.zeros_like(edge))
+    inside &= wanted & (jnp.arange(count) < bank.road_rows[scene.index])
+    # Compact without sorting: the j-th row inside is where the running count first reaches j + 1.
+    running = jnp.cumsum(inside.astype(jnp.int32))
+    place = jnp.searchsorted(running, jnp.arange(1, config.road + 1), method="scan_unrolled")
+    mask = jnp.arange(config.road) < running[-1]
+    take = jnp.clip(place, 0, count - 1)
+    types = jnp.stack([lane, edge, area], axis=-1).astype(jnp.float32)[take]
+    chosen = rows[take]
+    limit = jnp.where(chosen[:, 6:7] > 0, chosen[:, 6:7] / SPEED_MPS, 0.0)
+    parts = [xy[take] / POSITION_M, view.vector(chosen[:, 2:4]), chosen[:, 4:5] / PIECE_M, types, limit]
+    parts.append((chosen[:, 6:7] > 0).astype(jnp.float32))
+    return _masked("road", jnp.concatenate(parts, axis=-1), mask)
+
+
+def _is_one_of(kind: Float[Array, " R"], kinds: tuple[int, ...]) -> Bool[Array, " R"]:
+    return (kind >= min(kinds)) & (kind <= max(kinds))
+
+
+def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+    line = bank.light_line[scene.index]
+    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
+    middle = (line[:, 0:2] + line[:, 2:4]) / 2
+    offset = middle - view.xy
+    # Lights of the route come first, then the nearest.
+    distance = jnp.sum(offset * offset, axis=-1) - jnp.where(line[:, 7] > 0, 1e8, 0.0)
+    chosen = _nearest(jnp.where(state >= 0, distance, jnp.inf), config.lights)
+    there = (state[chosen] >= 0) & (jnp.arange(config.lights) < state.shape[0])
+    colour = _colour(state[chosen])
+    parts = [view.point(middle[chosen]) / POSITION_M, colour, line[chosen, 7:8]]
+    return _masked("lights", jnp.concatenate(parts, axis=-1), there)
+
+
+def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
+    """One-hot of unknown, green, yellow, red. Flashing lights count as unknown: they are not red."""
+    green = (state == LightState.GO) | (state == LightState.ARROW_GO)
+    yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
+    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
+    return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
+
+
+def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+    offsets = jnp.arange(1, config.route + 1) * config.route_step_m
+    rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
+    direction = view.vector(rows[:, 3:5])
+    limit = rows[:, ROUTE_LIMIT : ROUTE_LIMIT + 1]
+    parts = [
+        view.point(rows[:, :2]) / POSITION_M,
+        direction[:, ::-1],
+        jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
+    ]
+    return _masked("route", jnp.concatenate(parts, axis=-1), there)
