@@ -1,1 +1,150 @@
-"""The command line: one file per command; parses, calls, prints."""
+"""The command line: one file per command; parses, calls, prints.
+
+``drivax.cli.<command>`` defines one frozen dataclass (the command's name in CamelCase) from which tyro builds
+the flags, with an example in its docstring, and ``run(args) -> int``. Nothing of a command is imported before
+it is asked for, so that ``drivax --help`` answers at once. A command that takes free ``--section.key value``
+overrides of its configuration is registered with ``overrides=True`` and its ``run`` takes them as a second
+argument.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+
+from drivax.errors import DrivaxError, UsageError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Where a command lives and what the list of commands says about it."""
+
+    module: str
+    config: str
+    summary: str
+    overrides: bool = False
+
+
+COMMANDS = {
+    "demo": Command(
+        "drivax.cli.demo", "Demo", "the whole job on the built-in world: make, train, judge, report"
+    ),
+    "generate": Command("drivax.cli.generate", "Generate", "scenarios of the built-in world -> scenario set"),
+    "convert": Command("drivax.cli.convert", "Convert", "public data set -> scenario set"),
+    "inspect": Command("drivax.cli.inspect", "Inspect", "what a scenario set holds, and whether it is sound"),
+    "train": Command(
+        "drivax.cli.train", "Train", "train a planner from a configuration file", overrides=True
+    ),
+    "evaluate": Command(
+        "drivax.cli.evaluate", "Evaluate", "drive a planner through a scenario set and judge it"
+    ),
+    "report": Command("drivax.cli.report", "Report", "one HTML page with tables and pictures from runs"),
+    "bench": Command("drivax.cli.bench", "Bench", "simulation speed on this machine, by part"),
+}
+
+#: Packages that come with an extra, by the name they are imported under.
+_EXTRAS = {
+    "google_crc32c": "womd",
+    "google": "womd",
+    "matplotlib": "show",
+    "av": "show",
+    "tensorboardX": "track",
+    "gymnasium": "gym",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: Arguments without the program's name; those of the process by default.
+
+    Returns:
+        Exit status: 0 done, 1 failed, 2 usage, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        status = _dispatch(arguments)
+        sys.stdout.flush()
+    except SystemExit as stop:  # tyro's --help (0) and its usage errors (2)
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
+    except BrokenPipeError:
+        # The reader (head, less) has gone; keep the interpreter from complaining when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exc()
+        line, status = describe(error)
+        print(f"drivax: {line}", file=sys.stderr)
+    return status
+
+
+def describe(error: BaseException) -> tuple[str, int]:
+    """One line for the user, and the exit status, for an exception that ended a command."""
+    if isinstance(error, DrivaxError):
+        return str(error), error.status
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", 130
+    if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").split(".")[0])):
+        return f"{error.name} is not installed; pip install 'drivax[{extra}]'", 1
+    if isinstance(error, OSError) and error.strerror:
+        place = "" if error.filename is None else f"{error.filename}: "
+        return f"{place}{error.strerror}", 1
+    message = " ".join(str(error).split())
+    return f"unexpected {type(error).__name__}: {message}; --debug shows where", 1
+
+
+def overview() -> str:
+    """The list of commands that ``drivax --help`` prints; at most 100 columns."""
+    width = max(map(len, COMMANDS))
+    rows = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        (
+            "drivax trains, curates and judges driving planners on recorded traffic.",
+            "",
+            "usage: drivax COMMAND [options]      drivax COMMAND --help  explains one, with an example",
+            "",
+            *rows,
+            "",
+            "  --version  print the version      --debug  show the traceback of an error",
+        )
+    )
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(overview())
+        return 0
+    name, rest = arguments[0], arguments[1:]
+    if name in ("-V", "--version"):
+        print(f"drivax {metadata.version('drivax')}")
+        return 0
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        cure = f"did you mean {near[0]!r}?" if near else "see drivax --help"
+        kind = "option" if name.startswith("-") else "command"
+        raise UsageError(f"there is no {kind} {name!r}", cure=cure)
+    return _run(name, COMMANDS[name], rest)
+
+
+def _run(name: str, command: Command, arguments: list[str]) -> int:
+    import tyro
+
+    module = importlib.import_module(command.module)
+    config = getattr(module, command.config)
+    options = (tyro.conf.FlagCreatePairsOff,)
+    if not command.overrides:
+        return int(module.run(tyro.cli(config, prog=f"drivax {name}", args=arguments, config=options)))
+    args, overrides = tyro.cli(
+        config, prog=f"drivax {name}", args=arguments, config=options, return_unknown_args=True
+    )
+    return int(module.run(args, overrides))

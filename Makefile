@@ -1,0 +1,61 @@
+# Two commands to know:  make demo   and   make test.  Each sets itself up when .venv is missing or out of date.
+#
+#   make demo ACCELERATOR=cuda13     with the GPU build of JAX (cuda12, cuda13)
+#   make test PYTHON=python3.12      with another Python (3.11 to 3.13)
+#   make demo ARGS="--help"          arguments for the command
+
+PYTHON ?= python3
+ACCELERATOR ?=
+ARGS ?=
+WORKERS ?= 2
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed$(ACCELERATOR)
+JAX := $(shell sed -n 's/^jax==//p' requirements.lock)
+
+# Tests run in several processes: each gets one thread for linear algebra and one for XLA.
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false
+
+.PHONY: help demo test test-all lint bench setup clean
+.DEFAULT_GOAL := help
+
+help:
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
+	@echo "targets: demo  test  test-all  lint  bench  setup  clean"
+
+setup: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "make: $(PYTHON) is not Python 3.11 to 3.13; choose one with PYTHON=..." >&2; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+ifneq ($(ACCELERATOR),)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "jax[$(ACCELERATOR)]==$(JAX)"
+endif
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/drivax demo $(ARGS)
+
+bench: $(STAMP)
+	$(BIN)/drivax bench $(ARGS)
+
+test: $(STAMP)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
+
+test-all: $(STAMP)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/python -m pytest -q -p no:cacheprovider tests/test_architecture.py -k "machine or large or lock or names"
+
+clean:
+	rm -rf .cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist
+	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} +

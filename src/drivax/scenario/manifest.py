@@ -1,0 +1,168 @@
+"""The manifest of a scenario set and the layout of its files: what is written and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from drivax.errors import DataError
+from drivax.scenario.schema import (
+    SCHEMA_VERSION,
+    Capacity,
+    Scenario,
+    SourceCounts,
+    record_dtype,
+    scenario_fields,
+)
+
+MANIFEST = "manifest.json"
+#: The cure for a set that cannot be repaired.
+AGAIN = "convert or generate the set again"
+_HEADER_LIMIT = 100_000
+
+
+def field_table(capacity: Capacity) -> list[dict[str, Any]]:
+    """The manifest's description of a record: name, dtype, shape and byte offset of every field."""
+    offsets = {name: entry[1] for name, entry in (record_dtype(capacity).fields or {}).items()}
+    return [
+        {"name": name, "dtype": np.dtype(kind).str, "shape": list(shape), "offset": offsets[name]}
+        for name, (kind, shape) in scenario_fields(capacity).items()
+    ]
+
+
+def manifest_entry(scenario: Scenario) -> dict[str, Any]:
+    """What the manifest says about one scenario."""
+    return {
+        "scenario_id": scenario.id,
+        "dataset": _text(scenario.record["dataset"]),
+        "segment": _text(scenario.record["segment"]),
+        "flags": [str(flag.name) for flag in scenario.has],
+        "segments": int(scenario.record["segment_blocks"][3]),
+        "source": plain(dataclasses.asdict(scenario.source)),
+        "overflow": plain(scenario.overflow),
+        "audit": plain(scenario.audit),
+        "tags": plain(scenario.tags),
+    }
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The checked manifest of the set at ``path``.
+
+    Raises:
+        DataError: No such folder, no manifest, damaged JSON, a missing key, another schema version or layout.
+    """
+    file = path / MANIFEST
+    if not path.is_dir():
+        problem = "is not a scenario set (a folder)" if path.exists() else "does not exist"
+        raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
+    if not file.is_file():
+        raise DataError("no manifest.json, so this is no complete scenario set", file=path, cure=AGAIN)
+    try:
+        manifest = json.loads(file.read_bytes())
+        version = manifest["schema_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"manifest is damaged ({error})", file=file, cure=AGAIN) from error
+    if version != SCHEMA_VERSION:
+        newer = isinstance(version, int) and version > SCHEMA_VERSION
+        raise DataError(
+            f"schema version {version}, this drivax reads {SCHEMA_VERSION}",
+            file=file,
+            cure="upgrade drivax" if newer else AGAIN,
+        )
+    _check_manifest(manifest, file)
+    return manifest
+
+
+def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
+    try:
+        fields_agree = manifest["fields"] == field_table(Capacity(**manifest["capacity"]))
+        _need(manifest["shards"], ("file", "count", "sha256"))
+        _need(
+            manifest["scenarios"], ("scenario_id", "dataset", "segment", "flags", "overflow", "audit", "tags")
+        )
+        for entry in manifest["scenarios"]:
+            SourceCounts(**entry["source"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
+    if not fields_agree:
+        raise DataError("field table is not this version's", file=file, cure=AGAIN)
+
+
+def _need(rows: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
+    for row in rows:
+        for key in keys:
+            if key not in row:
+                raise KeyError(key)
+
+
+def shard_name(number: int) -> str:
+    """File name of a shard."""
+    return f"shard-{number:05d}.npy"
+
+
+def crc_name(shard: str) -> str:
+    """File name of the checksums of the shard in file ``shard``."""
+    return shard.removesuffix(".npy") + ".crc.npy"
+
+
+def write_header(file: IO[bytes], dtype: np.dtype[Any], count: int) -> None:
+    """Write the ``.npy`` header of ``count`` records; its length does not depend on ``count``."""
+    # numpy pads headers so that a growing first axis never changes their length (numpy.lib.format).
+    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (count,)}
+    np.lib.format.write_array_header_1_0(file, header)
+
+
+def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and dtype that a ``.npy`` file names; leaves ``file`` at the first byte of data.
+
+    Raises:
+        DataError: The header is damaged.
+    """
+    try:
+        np.lib.format.read_magic(file)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER_LIMIT)
+    except (ValueError, SyntaxError, TypeError) as error:
+        raise DataError("header is damaged, not a .npy shard", file=path, cure=AGAIN) from error
+    return shape, dtype
+
+
+def sync_and_close(file: IO[bytes]) -> None:
+    """Bring a file to the disk and close it."""
+    file.flush()
+    os.fsync(file.fileno())
+    file.close()
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring a folder's names to the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _text(value: Any) -> str:
+    return bytes(value[()]).rstrip(b"\0").decode()
+
+
+def plain(value: Any) -> Any:
+    """The value as strict JSON: numpy scalars unpacked, paths as text, NaN and infinities as null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value

@@ -1,0 +1,306 @@
+"""Plain values -> configuration records and back, strictly, with the dotted path of what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import re
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+import cattrs
+from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError, IterableValidationError
+from cattrs.gen import make_dict_structure_fn
+
+from drivax.errors import DrivaxError, UsageError
+from drivax.settings.text import parse_yaml
+
+_UNIONS = (Union, types.UnionType)
+
+
+class _Problem(ValueError):
+    """What is wrong with a value, and where inside it."""
+
+    def __init__(self, problem: str, path: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+        self.path = path
+
+
+class Flag(str):
+    """The text of a command-line value: what it means depends on the type of the setting."""
+
+    __slots__ = ()
+
+
+def structure(values: Any, cls: Any) -> Any:
+    """An instance of ``cls`` from plain values.
+
+    Raises:
+        ValueError: ``path: problem; cure`` of the first thing that is wrong.
+    """
+    try:
+        return _converter().structure(values, cls)
+    except Exception as error:
+        problem, path = _first_problem(error, "")
+        raise ValueError(f"{path}: {problem}" if path else problem) from error
+
+
+def plain(record: Any) -> Any:
+    """A record as mappings, lists and scalars; members of unions carry ``kind``."""
+    return _plain(record, type(record))
+
+
+def kind_of(cls: type) -> str:
+    """What ``kind:`` says for a record in a union: the default of its field ``kind``, else its name in snake_case."""
+    for field in dataclasses.fields(cls):
+        if field.name == "kind":
+            return str(field.default)
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", cls.__name__).lower()
+
+
+def nearest(name: str, names: Sequence[str]) -> str:
+    """A cure for a misspelt name: the nearest valid one, else all of them."""
+    near = difflib.get_close_matches(name, names, n=1)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"use one of {', '.join(names)}" if names else "there are none"
+
+
+def _value(value: Any) -> Any:
+    if not isinstance(value, Flag):
+        return value
+    try:
+        return parse_yaml(str(value))
+    except UsageError as error:
+        raise _refuse(value, "a value that YAML can read") from error
+
+
+def _refuse(value: Any, wanted: str) -> ValueError:
+    return ValueError(f"{str(value) if isinstance(value, Flag) else value!r} is not {wanted}")
+
+
+def _to_bool(value: Any, _: Any) -> bool:
+    if not isinstance(result := _value(value), bool):
+        raise _refuse(value, "true or false")
+    return result
+
+
+def _to_int(value: Any, _: Any) -> int:
+    result = _value(value)
+    if isinstance(result, float) and result.is_integer():
+        return int(result)  # steps: 25e6
+    if isinstance(result, bool) or not isinstance(result, int):
+        raise _refuse(value, "a whole number")
+    return result
+
+
+def _to_float(value: Any, _: Any) -> float:
+    result = _value(value)
+    if isinstance(result, bool) or not isinstance(result, int | float):
+        raise _refuse(value, "a number")
+    return float(result)
+
+
+def _to_str(value: Any, _: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{value!r} is not text (quote it)")
+    return str(value)
+
+
+def _to_path(value: Any, _: Any) -> Path:
+    return Path(value if isinstance(value, Path) else _to_str(value, None))
+
+
+def _to_none(value: Any, _: Any) -> None:
+    if _value(value) is not None:
+        raise _refuse(value, "null")
+
+
+def _to_literal(value: Any, cls: Any) -> Any:
+    allowed = get_args(cls)
+    for option in (value, _value(value)):
+        for candidate in allowed:
+            if type(option) in (type(candidate), Flag) and option == candidate:
+                return candidate
+    near = nearest(str(value), [str(option) for option in allowed])
+    raise ValueError(f"{str(value)!r} is none of {', '.join(map(str, allowed))}; {near}")
+
+
+def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
+    items = _value(value)
+    if not isinstance(items, list | tuple):
+        raise _refuse(value, "a list")
+    members: tuple[Any, ...] = get_args(cls)
+    if len(members) == 2 and members[1] is Ellipsis:
+        members = (members[0],) * len(items)
+    if not members:
+        return tuple(items)
+    if len(members) != len(items):
+        raise ValueError(f"{len(items)} values, not {len(members)}")
+    result = []
+    for number, (item, member) in enumerate(zip(items, members, strict=True)):
+        try:
+            result.append(_converter().structure(item, member))
+        except Exception as error:
+            raise _Problem(*_first_problem(error, f"[{number}]")) from error
+    return tuple(result)
+
+
+def _to_union(value: Any, cls: Any) -> Any:
+    members = get_args(cls)
+    records = {kind_of(member): member for member in members if _is_record(member)}
+    value = _value(value) if isinstance(value, Flag) and records else value
+    if isinstance(value, str) and value in records:
+        return _converter().structure({}, records[value])
+    if isinstance(value, Mapping) and records:
+        return _to_record_of_kind(dict(value), records)
+    problems = []
+    for member in sorted(members, key=_specific):
+        if not _is_record(member):
+            try:
+                return _converter().structure(value, member)
+            except (ValueError, TypeError, ClassValidationError, IterableValidationError) as error:
+                if member is not type(None):
+                    problems.append(_first_problem(error, "")[0])
+    if records:
+        raise ValueError(f"{value!r} is no section with a kind ({', '.join(records)})")
+    raise ValueError(" and ".join(problems))
+
+
+def _specific(member: Any) -> int:
+    """Text takes anything a flag can say, so it is tried last, and numbers go from narrow to wide."""
+    order = (type(None), bool, int, float)
+    return order.index(member) if member in order else len(order) + (member is str)
+
+
+def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
+    if len(records) == 1 and "kind" not in value:
+        return _converter().structure(value, next(iter(records.values())))
+    if "kind" not in value:
+        raise ValueError(f"has no kind; use one of {', '.join(records)}")
+    kind = str(value["kind"])
+    if kind not in records:
+        raise ValueError(f"there is no kind {kind!r}; {nearest(kind, list(records))}")
+    if "kind" not in {field.name for field in dataclasses.fields(records[kind])}:
+        del value["kind"]
+    return _converter().structure(value, records[kind])
+
+
+def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
+    build = make_dict_structure_fn(
+        cls, converter, _cattrs_forbid_extra_keys=True, _cattrs_detailed_validation=True
+    )
+
+    def hook(value: Any, _: Any) -> Any:
+        value = {} if value is None else _value(value)
+        if not isinstance(value, Mapping):
+            raise _refuse(
+                value, f"a section of settings ({', '.join(f.name for f in dataclasses.fields(cls))})"
+            )
+        return build(_on_defaults(cls, value), cls)
+
+    return hook
+
+
+def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """``given`` with nested sections completed from the defaults of this record, not from those of their own."""
+    result = dict(given)
+    hints = typing.get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        if not _is_record(type(default)):
+            continue
+        section = _value(given.get(field.name))
+        if isinstance(section, Mapping):
+            result[field.name] = _completed(_plain(default, hints[field.name]), default, section)
+    return result
+
+
+def _completed(base: dict[str, Any], default: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    if "kind" in given and str(given["kind"]) != kind_of(type(default)):
+        return dict(given)
+    result = base | dict(given)
+    for name, value in given.items():
+        inner = getattr(default, name, None)
+        if _is_record(type(inner)) and isinstance(value, Mapping):
+            result[name] = _completed(base[name], inner, value)
+    return result
+
+
+def _is_record(cls: Any) -> bool:
+    return isinstance(cls, type) and dataclasses.is_dataclass(cls)
+
+
+@functools.cache
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter()
+    for cls, hook in ((bool, _to_bool), (int, _to_int), (float, _to_float), (str, _to_str), (Path, _to_path)):
+        converter.register_structure_hook(cls, hook)
+    converter.register_structure_hook(type(None), _to_none)
+    converter.register_structure_hook_func(lambda cls: get_origin(cls) is Literal, _to_literal)
+    converter.register_structure_hook_func(lambda cls: cls is tuple or get_origin(cls) is tuple, _to_tuple)
+    converter.register_structure_hook_func(lambda cls: get_origin(cls) in _UNIONS, _to_union)
+    converter.register_structure_hook_factory(_is_record, _record_hook)
+    return converter
+
+
+def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
+    """The first thing that is wrong inside a cattrs error, and its dotted path."""
+    if isinstance(error, ForbiddenExtraKeysError):
+        names = [field.name for field in dataclasses.fields(error.cl)]
+        unknown = sorted(error.extra_fields)[0]
+        return f"there is no such setting; {nearest(unknown, names)}", _join(path, unknown)
+    if isinstance(error, ClassValidationError | IterableValidationError):
+        noted, plain_errors = error.group_exceptions()
+        if noted:
+            inner, note = noted[0]
+            name = getattr(note, "name", None)
+            step = _join(path, name) if name is not None else f"{path}[{getattr(note, 'index', '?')}]"
+            return _first_problem(inner, step)
+        return _first_problem(plain_errors[0], path)
+    if isinstance(error, _Problem):
+        return error.problem, path + error.path if error.path.startswith("[") else _join(path, error.path)
+    if isinstance(error, KeyError):
+        return f"the setting {error.args[0]!r} is missing", path
+    if isinstance(error, TypeError) and "missing" in str(error):
+        return str(error).split(") ")[-1], path
+    if isinstance(error, DrivaxError):
+        return error.problem + (f"; {error.cure}" if error.cure else ""), path
+    return str(error) or type(error).__name__, path
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _plain(value: Any, declared: Any) -> Any:
+    if _is_record(type(value)):
+        hints = typing.get_type_hints(type(value))
+        inside = {f.name: _plain(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
+        tagged = "kind" not in inside and any(_is_record(member) for member in _members(declared))
+        return {"kind": kind_of(type(value))} | inside if tagged else inside
+    if isinstance(value, Mapping):
+        member = get_args(declared)[-1] if get_args(declared) else Any
+        return {str(key): _plain(item, member) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, _item_type(declared, number)) for number, item in enumerate(value)]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _members(declared: Any) -> tuple[Any, ...]:
+    return get_args(declared) if get_origin(declared) in _UNIONS else ()
+
+
+def _item_type(declared: Any, number: int) -> Any:
+    for candidate in (declared, *_members(declared)):
+        if get_origin(candidate) in (tuple, list):
+            members = get_args(candidate)
+            return members[0] if members[-1] is Ellipsis or len(members) <= number else members[number]
+    return Any

@@ -1,0 +1,232 @@
+"""Checkpoints: a whole training state on disk, restored bit for bit.
+
+Orbax stores the arrays; ``about.json`` beside them names every leaf with its dtype, shape and CRC-32, so that a state
+that does not fit, or a damaged file, is told by the name of the leaf. A checkpoint appears under its name only when
+it is complete.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zlib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drivax.errors import DataError
+from drivax.tracking.runs import write_text
+
+ABOUT = "about.json"
+_ARRAYS = "arrays"
+_SCALARS: tuple[type, ...] = (bool, int, float)
+
+State = TypeVar("State")
+
+
+class Checkpoints:
+    """The checkpoints of one run: the newest few, and the best one by a score.
+
+    Args:
+        folder: Where they lie; made when first needed. Each is a sub-folder ``step-000001000``.
+        keep: How many of the newest stay.
+        keep_best: Whether the one with the highest score stays too.
+    """
+
+    def __init__(self, folder: str | Path, keep: int = 2, keep_best: bool = True) -> None:
+        if keep < 1:
+            raise ValueError("keep at least one checkpoint")
+        self.folder = Path(folder)
+        self.keep = keep
+        self.keep_best = keep_best
+
+    def steps(self) -> list[int]:
+        """Steps of all complete checkpoints, ascending."""
+        found = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
+        return sorted(int(name) for name in found if name.isdecimal())
+
+    def best(self) -> int | None:
+        """The step with the highest score (the later one of equals), None when no checkpoint has a score."""
+        scores = [(self.about(step)["score"], step) for step in self.steps()]
+        known = [(score, step) for score, step in scores if score is not None]
+        return max(known)[1] if known else None
+
+    def about(self, step: int) -> dict[str, Any]:
+        """What ``about.json`` says of a checkpoint: step, score, leaves.
+
+        Raises:
+            DataError: There is no such checkpoint, or its description is damaged.
+        """
+        file = self._path(step) / ABOUT
+        if not file.is_file():
+            have = ", ".join(map(str, self.steps())) or "none"
+            raise DataError(
+                f"there is no checkpoint of step {step}", file=self.folder, cure=f"there are: {have}"
+            )
+        try:
+            return json.loads(file.read_bytes())
+        except ValueError as error:
+            raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
+
+    def save(self, step: int, state: Any, score: float | None = None) -> Path:
+        """Store a state and drop checkpoints that need not stay.
+
+        Args:
+            step: Training step; an existing checkpoint of it is replaced.
+            state: Pytree of JAX or numpy arrays (typed keys too) and Python numbers.
+            score: What "best" compares; higher is better. NaN counts as none.
+
+        Returns:
+            The folder of the checkpoint.
+        """
+        arrays, leaves = _describe(state)
+        score = None if score is None or np.isnan(score) else float(score)
+        final = self._path(step)
+        partial = self.folder / f".step-{step}.partial-{os.getpid()}"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        try:
+            if arrays:
+                _save_arrays(partial / _ARRAYS, arrays)
+            write_text(
+                partial / ABOUT, json.dumps({"step": step, "score": score, "leaves": leaves}, indent=1)
+            )
+            shutil.rmtree(final, ignore_errors=True)
+            partial.rename(final)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        self._drop()
+        return final
+
+    def restore(self, template: State, step: int | None = None) -> State:
+        """The stored state.
+
+        Args:
+            template: A state of the same structure (values do not matter; ``jax.ShapeDtypeStruct`` leaves will do).
+            step: Which; None: the newest.
+
+        Raises:
+            DataError: No such checkpoint, it is damaged, or it does not fit the template; names the first leaf.
+        """
+        steps = self.steps()
+        if step is None:
+            if not steps:
+                raise DataError("there is no checkpoint", file=self.folder, cure="train without --resume")
+            step = steps[-1]
+        leaves = self.about(step)["leaves"]
+        path = self._path(step)
+        wanted, structure = jax.tree_util.tree_flatten_with_path(template)
+        _compare(path, leaves, [(jax.tree_util.keystr(key), leaf) for key, leaf in wanted])
+        arrays = _load_arrays(path, leaves)
+        values = [_rebuild(array, leaf) for array, (_, leaf) in zip(arrays, wanted, strict=True)]
+        return jax.tree_util.tree_unflatten(structure, values)
+
+    def _path(self, step: int) -> Path:
+        return self.folder / f"step-{step:09d}"
+
+    def _drop(self) -> None:
+        steps = self.steps()
+        stay = set(steps[-self.keep :])
+        if self.keep_best:
+            stay.add(self.best() or steps[-1])
+        for step in steps:
+            if step not in stay:
+                # Renamed first: a half-deleted folder must not look like a checkpoint.
+                doomed = self.folder / f".step-{step}.old-{os.getpid()}"
+                self._path(step).rename(doomed)
+                shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[str, Any]]]:
+    """Arrays by number, and name, type, shape and checksum of every leaf. Orbax refuses arrays without elements."""
+    arrays, leaves = {}, []
+    for number, (key, leaf) in enumerate(jax.tree_util.tree_flatten_with_path(state)[0]):
+        array = np.asarray(_to_numpy(leaf), order="C")
+        leaves.append(
+            {
+                "name": jax.tree_util.keystr(key),
+                "type": _type_name(leaf),
+                "shape": list(np.shape(leaf)),
+                "stored": [str(array.dtype), list(array.shape)],
+                "crc": zlib.crc32(array.tobytes()),
+            }
+        )
+        if array.size:
+            arrays[f"{number:05d}"] = array
+    return arrays, leaves
+
+
+def _is_key(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _to_numpy(leaf: Any) -> np.ndarray[Any, Any]:
+    array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+    if array.dtype == object or array.dtype.kind in "US":
+        raise TypeError(f"a {type(leaf).__name__} cannot be stored in a checkpoint")
+    return array
+
+
+def _type_name(leaf: Any) -> str:
+    return type(leaf).__name__ if type(leaf) in _SCALARS else str(leaf.dtype)
+
+
+def _compare(path: Path, stored: list[dict[str, Any]], wanted: list[tuple[str, Any]]) -> None:
+    cure = "use the configuration that the checkpoint was trained with"
+    have = {leaf["name"]: (leaf["type"], tuple(leaf["shape"])) for leaf in stored}
+    need = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in wanted}
+    for name in [*need, *have]:
+        if name not in have:
+            raise DataError(f"the checkpoint has no {name}", file=path, cure=cure)
+        if name not in need:
+            raise DataError(f"the checkpoint holds {name}, which is not wanted", file=path, cure=cure)
+        if have[name] != need[name]:
+            is_, want = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
+            raise DataError(f"{name} is {is_} in the checkpoint, not {want}", file=path, cure=cure)
+
+
+def _save_arrays(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+    import orbax.checkpoint as ocp
+
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(path.resolve(), arrays)
+
+
+def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[Any, Any]]:
+    import orbax.checkpoint as ocp
+
+    empty = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
+    target = {f"{number:05d}": array for number, array in enumerate(empty) if array.size}
+    found: dict[str, Any] = {}
+    if target:
+        try:
+            with ocp.StandardCheckpointer() as checkpointer:
+                found = checkpointer.restore((path / _ARRAYS).resolve(), target)
+        except Exception as error:
+            raise DataError(
+                f"arrays cannot be read ({error})", file=path, cure="use another checkpoint"
+            ) from error
+    arrays = [np.asarray(found.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
+    for array, leaf in zip(arrays, leaves, strict=True):
+        if zlib.crc32(array.tobytes()) != leaf["crc"]:
+            raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure="use another checkpoint")
+    return arrays
+
+
+def _rebuild(array: np.ndarray[Any, Any], like: Any) -> Any:
+    if type(like) in _SCALARS:
+        return type(like)(array)
+    if _is_key(like):
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=_key_name(like))
+    if isinstance(like, np.ndarray | np.generic):
+        return array[()] if isinstance(like, np.generic) else array
+    return jnp.asarray(array)
+
+
+def _key_name(like: Any) -> str:
+    # "key<fry>": the dtype is all that a ShapeDtypeStruct has.
+    return like.dtype._impl.name

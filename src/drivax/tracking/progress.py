@@ -1,0 +1,139 @@
+"""Progress of long work: a bar with rate and time left on a terminal, plain lines now and then in a log."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+#: Seconds between two lines in a log.
+INTERVAL_S = 10.0
+
+
+class Progress:
+    """Shows how far a long job is, how fast it goes and how long it still takes.
+
+    Use as a context manager and call :meth:`update`; the end prints one line with the total rate.
+
+    Args:
+        what: What is going on ("converting").
+        unit: What is counted ("scenarios").
+        total: How many there will be; None where nobody knows.
+        stream: Text file to write to; standard error by default, so that results on standard output stay clean.
+        interval_s: Seconds between two lines where ``stream`` is no terminal.
+        clock: Seconds; a test may pass its own.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        unit: str,
+        total: int | None = None,
+        *,
+        stream: Any = None,
+        interval_s: float = INTERVAL_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.what = what
+        self.unit = unit
+        self.total = total
+        self.done = 0
+        self._stream = sys.stderr if stream is None else stream
+        self._interval_s = interval_s
+        self._clock = clock
+        self._begin = self._last = clock()
+        self._bar: Any = None
+        self._task: Any = None
+
+    def __enter__(self) -> Self:
+        self._begin = self._last = self._clock()
+        if self._stream.isatty():
+            self._start_bar()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        if kind is None:
+            self._say(self.summary())
+
+    def update(self, done: int, note: str = "", total: int | None = None) -> None:
+        """Tell how many are done; ``note`` is shown behind (a loss, a count of skipped records)."""
+        self.done = done
+        self.total = self.total if total is None else total
+        if self._bar is not None:
+            rate = f"{_number(self.rate())} {self.unit}/s"
+            self._bar.update(self._task, completed=done, total=self.total, rate=rate, note=note)
+            return
+        now = self._clock()
+        if now - self._last >= self._interval_s:
+            self._last = now
+            self._say(self.line(note))
+
+    def advance(self, count: int = 1, note: str = "") -> None:
+        """Tell that ``count`` more are done."""
+        self.update(self.done + count, note)
+
+    def rate(self) -> float:
+        """Per second, since the beginning."""
+        return self.done / max(self._clock() - self._begin, 1e-9)
+
+    def line(self, note: str = "") -> str:
+        """One line about now."""
+        parts = [f"{self.what}: {self.done:,}"]
+        rate = self.rate()
+        if self.total:
+            parts[0] += f" of {self.total:,} {self.unit} ({100 * self.done / self.total:.0f} %)"
+        else:
+            parts[0] += f" {self.unit}"
+        parts.append(f"{_number(rate)}/s")
+        if self.total and rate > 0:
+            parts.append(f"{duration((self.total - self.done) / rate)} left")
+        if note:
+            parts.append(note)
+        return ", ".join(parts)
+
+    def summary(self) -> str:
+        """One line about the whole."""
+        seconds = self._clock() - self._begin
+        return f"{self.what}: {self.done:,} {self.unit} in {duration(seconds)}, {_number(self.rate())}/s"
+
+    def _say(self, text: str) -> None:
+        self._stream.write(text + "\n")
+        self._stream.flush()
+
+    def _start_bar(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+        )
+        self._bar = Bar(*columns, console=Console(file=self._stream), transient=True)
+        self._task = self._bar.add_task(self.what, total=self.total, rate="", note="")
+        self._bar.start()
+
+
+def duration(seconds: float) -> str:
+    """Seconds as a person writes them: ``4.2 s``, ``3 min 5 s``, ``2 h 10 min``."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

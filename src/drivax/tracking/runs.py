@@ -1,0 +1,201 @@
+"""Run folders: what was run, on which data, with which versions, on which machine.
+
+A run folder holds ``config.yaml`` (the whole configuration, defaults included), ``run.json`` (everything else that a
+reader needs to believe or repeat the run), and what the run produces: ``metrics.jsonl``, ``checkpoints/``,
+``episodes.csv``, reports.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+from drivax import settings
+from drivax.errors import DataError, UsageError
+from drivax.scenario.store import ScenarioSet
+
+CONFIG_FILE = "config.yaml"
+RUN_FILE = "run.json"
+_PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
+
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """An existing run folder.
+
+    Attributes:
+        path: The folder.
+        info: Content of ``run.json``.
+    """
+
+    path: Path
+    info: dict[str, Any]
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        config: Any,
+        data: Sequence[ScenarioSet] = (),
+        overwrite: bool = False,
+        **notes: Any,
+    ) -> RunFolder:
+        """Make the folder and write ``config.yaml`` and ``run.json``; the folder appears with both in it.
+
+        Args:
+            path: Folder to create.
+            config: Configuration record (a dataclass).
+            data: The scenario sets that the run reads.
+            overwrite: Replace an existing run folder; other folders are never replaced.
+            notes: More facts for ``run.json``, plain JSON values.
+
+        Raises:
+            UsageError: ``path`` exists.
+        """
+        path = Path(path)
+        _refuse_existing(path, overwrite)
+        info = describe_run(data) | notes
+        partial = path.parent / f".{path.name}.partial-{os.getpid()}"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        try:
+            write_text(partial / CONFIG_FILE, settings.dump(config))
+            write_text(partial / RUN_FILE, json.dumps(info, indent=1) + "\n")
+            old = path.parent / f".{path.name}.old-{os.getpid()}"
+            if path.exists():
+                path.rename(old)
+            partial.rename(path)
+            shutil.rmtree(old, ignore_errors=True)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        return cls(path, info)
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """Open a run folder.
+
+        Raises:
+            DataError: It is no run folder, or ``run.json`` is damaged.
+        """
+        path = Path(path)
+        for name in (CONFIG_FILE, RUN_FILE):
+            if not (path / name).is_file():
+                raise DataError(
+                    f"is no run folder (no {name})", file=path, cure="name a folder that a run wrote"
+                )
+        try:
+            info = json.loads((path / RUN_FILE).read_bytes())
+        except ValueError as error:
+            raise DataError(f"is damaged ({error})", file=path / RUN_FILE, cure="run again") from error
+        return cls(path, info)
+
+    def config(self, cls: type[Record]) -> Record:
+        """The run's configuration as a record.
+
+        Raises:
+            UsageError: ``config.yaml`` does not fit ``cls``.
+        """
+        return settings.load(cls, self.path / CONFIG_FILE)
+
+    def note(self, **notes: Any) -> RunFolder:
+        """The run with more facts in ``run.json`` (an end time, a result)."""
+        info = self.info | notes
+        write_text(self.path / RUN_FILE, json.dumps(info, indent=1) + "\n")
+        return RunFolder(self.path, info)
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        """File of the logged metrics."""
+        return self.path / "metrics.jsonl"
+
+
+def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
+    """Facts about this process, its program, its data and its machine, as plain JSON values."""
+    return {
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
+        "git": git_state(Path(__file__).resolve().parent),
+        "data": [{"path": str(d.path.resolve()), "hash": d.hash, "scenarios": len(d)} for d in data],
+        "machine": machine(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of python and of the packages that decide numbers."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """The machine; asks JAX for its devices, which starts the accelerator."""
+    import jax
+
+    devices = jax.devices()
+    return {
+        "platform": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cpu_count": os.cpu_count(),
+        "device": devices[0].device_kind,
+        "devices": len(devices),
+        "backend": jax.default_backend(),
+    }
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """Commit and cleanliness of the checkout that ``folder`` belongs to; None outside of one or without git."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        # An installed package may lie inside a foreign repository: only a checkout that tracks this file counts.
+        git("ls-files", "--error-unmatch", str(Path(__file__).resolve()))
+        return {"commit": git("rev-parse", "HEAD"), "changed": bool(git("status", "--porcelain"))}
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a text file so that it is either the old one or the whole new one."""
+    partial = file.with_name(f".{file.name}.partial-{os.getpid()}")
+    with partial.open("w", encoding="utf-8") as out:
+        out.write(text)
+        out.flush()
+        os.fsync(out.fileno())
+    partial.replace(file)
+
+
+def _refuse_existing(path: Path, overwrite: bool) -> None:
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not (path / RUN_FILE).is_file():
+        raise UsageError("exists and is no run folder", file=path, cure="choose another name")
+    if not overwrite:
+        raise UsageError(
+            "exists already", file=path, cure="choose another name, --resume it or pass --overwrite"
+        )

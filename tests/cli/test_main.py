@@ -1,0 +1,171 @@
+"""The frame of the command line: what is listed, how errors are told, which status comes back."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivax import cli
+from drivax.errors import DataError, UsageError
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """A command for tests. Example: drivax probe --number 3"""
+
+    number: int = 1
+    flag: bool = False
+
+
+@pytest.fixture
+def probe(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes ``drivax probe`` run a function."""
+
+    def install(function: Any, overrides: bool = False) -> None:
+        module = types.ModuleType("drivax_probe")
+        module.Probe, module.run = Probe, function  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "drivax_probe", module)
+        command = cli.Command("drivax_probe", "Probe", "for tests", overrides)
+        monkeypatch.setattr(cli, "COMMANDS", {**cli.COMMANDS, "probe": command})
+
+    return install
+
+
+def raiser(error: BaseException) -> Any:
+    def run(args: Probe) -> int:
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize("argv", [[], ["--help"], ["-h"], ["help"]])
+def test_overview(argv: list[str], capsys: pytest.CaptureFixture[str]):
+    assert cli.main(argv) == 0
+    out = capsys.readouterr().out
+    assert all(f"  {name} " in out for name in cli.COMMANDS)
+    assert max(map(len, out.splitlines())) <= 100
+
+
+def test_version(capsys: pytest.CaptureFixture[str], repository: Path):
+    assert cli.main(["--version"]) == 0
+    version = capsys.readouterr().out.removeprefix("drivax ").strip()
+    assert f'version = "{version}"' in (repository / "pyproject.toml").read_text()
+
+
+def test_flags_reach_the_command(probe: Any):
+    seen = []
+    probe(lambda args: seen.append(args) or 0)
+    assert cli.main(["probe", "--number", "3", "--flag"]) == 0
+    assert seen == [Probe(3, True)]
+
+
+def test_status_is_the_commands(probe: Any):
+    probe(lambda args: 5)
+    assert cli.main(["probe"]) == 5
+
+
+def test_overrides_reach_the_command(probe: Any):
+    seen = []
+    probe(lambda args, rest: seen.append((args, rest)) or 0, overrides=True)
+    assert cli.main(["probe", "--number", "3", "--section.key", "1e-3"]) == 0
+    assert seen == [(Probe(3), ["--section.key", "1e-3"])]
+
+
+@pytest.mark.parametrize(
+    ("error", "line", "status"),
+    [
+        (
+            DataError("is damaged", file="a.npy", record=3, cure="copy it again"),
+            "a.npy: record 3: is damaged; copy it again",
+            1,
+        ),
+        (UsageError("is wrong"), "is wrong", 2),
+        (KeyboardInterrupt(), "interrupted", 130),
+        (PermissionError(13, "Permission denied", "/x"), "/x: Permission denied", 1),
+        (OSError(28, "No space left on device"), "No space left on device", 1),
+        (
+            ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot"),
+            "matplotlib.pyplot is not installed; pip install 'drivax[show]'",
+            1,
+        ),
+        (KeyError("a\nb"), r"unexpected KeyError: 'a\nb'; --debug shows where", 1),
+    ],
+)
+def test_errors_are_one_line(
+    probe: Any, capsys: pytest.CaptureFixture[str], error: BaseException, line: str, status: int
+):
+    probe(raiser(error))
+    assert cli.main(["probe"]) == status
+    captured = capsys.readouterr()
+    assert captured.err == f"drivax: {line}\n"
+    assert captured.out == ""
+
+
+def test_debug_shows_the_traceback(probe: Any, capsys: pytest.CaptureFixture[str]):
+    probe(raiser(DataError("is damaged")))
+    assert cli.main(["probe", "--debug"]) == 1
+    error = capsys.readouterr().err
+    assert "Traceback" in error
+    assert "in raiser" in error or "in run" in error
+    assert error.endswith("drivax: is damaged\n")
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["convrt"], "there is no command 'convrt'; did you mean 'convert'?"),
+        (["zzz"], "there is no command 'zzz'; see drivax --help"),
+        (["--vresion"], "there is no option '--vresion'; see drivax --help"),
+    ],
+)
+def test_unknown_commands(argv: list[str], line: str, capsys: pytest.CaptureFixture[str]):
+    assert cli.main(argv) == 2
+    assert capsys.readouterr().err == f"drivax: {line}\n"
+
+
+@pytest.mark.parametrize("argv", [["probe", "--nmber", "3"], ["probe", "--number", "x"], ["probe", "extra"]])
+def test_usage_errors_have_status_2(probe: Any, argv: list[str], capsys: pytest.CaptureFixture[str]):
+    probe(lambda args: 0)
+    assert cli.main(argv) == 2
+    assert "drivax probe" in capsys.readouterr().err or argv[-1] == "x"
+
+
+def test_a_commands_help(probe: Any, capsys: pytest.CaptureFixture[str]):
+    probe(lambda args: 0)
+    assert cli.main(["probe", "--help"]) == 0
+    assert "--number" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest.CaptureFixture[str]):
+    command = cli.COMMANDS[name]
+    assert cli.main([name, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"drivax {name}" in out
+    config = getattr(importlib.import_module(command.module), command.config)
+    assert dataclasses.is_dataclass(config)
+    assert config.__dataclass_params__.frozen  # type: ignore[attr-defined]
+    assert "Example" in (config.__doc__ or "")
+
+
+def test_help_imports_nothing_heavy():
+    program = (
+        "import sys; from drivax.cli import main; main(['--help'])\n"
+        "print(sorted({'jax', 'numpy', 'tyro', 'rich', 'yaml'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_closed_pipe_is_no_error():
+    """``drivax --help | head -1``: no traceback, nothing on standard error."""
+    pipeline = f"'{sys.executable}' -m drivax --help | head -c 1"
+    result = subprocess.run(["bash", "-c", pipeline], capture_output=True, text=True, check=False)
+    assert (result.stdout, result.stderr) == ("d", "")

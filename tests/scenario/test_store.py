@@ -1,0 +1,388 @@
+"""The store: what is written comes back bit for bit, and every kind of damage is named."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivax.errors import DataError, UsageError
+from drivax.scenario.schema import Capacity, Flag, Scenario, SourceCounts, record_dtype
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+
+SMALL = Capacity(
+    name="small", agents=3, parked=2, steps=5, segments=8, features=4, lanes=4, lights=2, stops=1, routes=2,
+    route_points=6, road_rows=4, events=1, extension=2, grid=2,
+)  # fmt: skip
+
+
+def make_scenario(number: int, capacity: Capacity = SMALL) -> Scenario:
+    """A scenario whose every field holds random bytes of its dtype, the same for the same number."""
+    rng = np.random.default_rng(number)
+    dtype = record_dtype(capacity)
+    record = np.zeros((), dtype)
+    for name in dtype.names or ():
+        kind = record[name].dtype.kind
+        shape = record[name].shape
+        if kind == "f":
+            record[name] = rng.normal(size=shape)
+        elif kind in "iu":
+            record[name] = rng.integers(0, 100, size=shape)
+        elif kind == "b":
+            record[name] = rng.random(shape) < 0.5
+    record["scenario_id"] = f"scenario-{number}".encode()
+    record["dataset"] = b"synthetic"
+    record["segment"] = f"segment-{number // 2}".encode()
+    record["flags"] = int(Flag.LIGHTS | Flag.ROUTE)
+    record["segment_blocks"] = (0, 2, 5, 7)
+    source = SourceCounts(5, number, number // 2, {"lane": 3}, 40, 1)
+    return Scenario(record, capacity, source, {"agents": 2}, {"collision": False}, {"domain": "urban"})
+
+
+@pytest.fixture
+def scenario_set(tmp_path: Path) -> Path:
+    """Seven scenarios in shards of three."""
+    path = tmp_path / "set"
+    with ScenarioWriter(path, SMALL, {"command": "test"}, shard_size=3) as writer:
+        for number in range(7):
+            writer.add(make_scenario(number))
+    return path
+
+
+def edit_manifest(path: Path, **changes: object) -> None:
+    file = path / "manifest.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+def test_round_trip(scenario_set: Path):
+    opened = ScenarioSet.open(scenario_set)
+    assert len(opened) == 7
+    assert opened.capacity == SMALL
+    for number, scenario in enumerate(opened):
+        expected = make_scenario(number)
+        for name in record_dtype(SMALL).names or ():
+            np.testing.assert_array_equal(scenario.record[name], expected.record[name], err_msg=name)
+        assert scenario.id == f"scenario-{number}"
+        assert scenario.source == expected.source
+        assert (scenario.overflow, scenario.audit, scenario.tags) == (
+            {"agents": 2},
+            {"collision": False},
+            {"domain": "urban"},
+        )
+    assert opened[-1].id == "scenario-6"
+    assert [scenario.id for scenario in opened[5:]] == ["scenario-5", "scenario-6"]
+    with pytest.raises(IndexError):
+        opened[7]
+
+
+def test_manifest(scenario_set: Path):
+    manifest = json.loads((scenario_set / "manifest.json").read_text())
+    assert [shard["count"] for shard in manifest["shards"]] == [3, 3, 1]
+    assert manifest["source"] == {"command": "test"}
+    assert manifest["capacity"]["name"] == "small"
+    assert manifest["scenarios"][3] == {
+        "scenario_id": "scenario-3",
+        "dataset": "synthetic",
+        "segment": "segment-1",
+        "flags": ["LIGHTS", "ROUTE"],
+        "segments": 7,
+        "source": {
+            "steps": 5, "tracks": 3, "tracks_valid_now": 1, "map_features": {"lane": 3}, "map_points": 40,
+            "lights": 1,
+        },
+        "overflow": {"agents": 2},
+        "audit": {"collision": False},
+        "tags": {"domain": "urban"},
+    }  # fmt: skip
+    for shard in manifest["shards"]:
+        assert hashlib.sha256((scenario_set / shard["file"]).read_bytes()).hexdigest() == shard["sha256"]
+
+
+def test_files_are_plain_numpy(scenario_set: Path):
+    """The format is documented as readable by numpy alone, with the field table as its description."""
+    shard = np.load(scenario_set / "shard-00001.npy", mmap_mode="r")
+    crcs = np.load(scenario_set / "shard-00001.crc.npy")
+    manifest = json.loads((scenario_set / "manifest.json").read_text())
+    assert shard.shape == (3,)
+    assert crcs.dtype == np.uint32
+    data = (scenario_set / "shard-00001.npy").read_bytes()
+    size = manifest["record_bytes"]
+    first = len(data) - 3 * size
+    for row in range(3):
+        raw = data[first + row * size : first + (row + 1) * size]
+        assert zlib.crc32(raw) == crcs[row]
+        field = next(field for field in manifest["fields"] if field["name"] == "agent_xy")
+        values = np.frombuffer(raw, field["dtype"], int(np.prod(field["shape"])), field["offset"])
+        np.testing.assert_array_equal(
+            values.reshape(field["shape"]), make_scenario(3 + row).record["agent_xy"]
+        )
+
+
+def test_sets_are_reproducible_and_their_hash_follows_the_data(tmp_path: Path, scenario_set: Path):
+    def write(name: str, numbers: list[int]) -> ScenarioSet:
+        with ScenarioWriter(tmp_path / name, SMALL, {"command": "test"}, shard_size=3) as writer:
+            for number in numbers:
+                # A record whose padding bytes are not zero must be stored as one whose are.
+                noisy = np.frombuffer(b"\xff" * record_dtype(SMALL).itemsize, record_dtype(SMALL)).copy()
+                for field in record_dtype(SMALL).names or ():
+                    noisy[field][0] = make_scenario(number).record[field]
+                scenario = make_scenario(number)
+                writer.add(
+                    Scenario(
+                        noisy.reshape(()), SMALL, scenario.source, scenario.overflow, scenario.audit,
+                        scenario.tags,
+                    )
+                )  # fmt: skip
+        return ScenarioSet.open(tmp_path / name)
+
+    same = write("same", list(range(7)))
+    for file in sorted(scenario_set.iterdir()):
+        assert file.read_bytes() == (same.path / file.name).read_bytes(), file.name
+    assert same.hash == ScenarioSet.open(scenario_set).hash
+    assert write("other", [1, 0, 2, 3, 4, 5, 6]).hash != same.hash
+
+
+def test_records_are_batches_in_the_order_asked_for(scenario_set: Path):
+    opened = ScenarioSet.open(scenario_set)
+    wanted = [6, 0, 4, 4, -1, 2]
+    records = opened.records(wanted)
+    assert records.dtype == record_dtype(SMALL)
+    for record, index in zip(records, wanted, strict=True):
+        np.testing.assert_array_equal(record["agent_xy"], make_scenario(index % 7).record["agent_xy"])
+        assert bytes(record["scenario_id"]).decode() == f"scenario-{index % 7}"
+    assert opened.records([]).shape == (0,)
+    with pytest.raises(IndexError):
+        opened.records([7])
+    records["agent_xy"] = 0.0  # copies: the set must not change
+    assert np.any(opened[0].agent_xy)
+
+
+def test_scenarios_are_read_only_views(scenario_set: Path):
+    with pytest.raises(ValueError, match="read-only"):
+        ScenarioSet.open(scenario_set)[0].agent_xy[:] = 0.0
+
+
+def test_a_set_can_be_sent_to_a_worker(scenario_set: Path):
+    opened = ScenarioSet.open(scenario_set)
+    opened[0]
+    data = pickle.dumps(opened)
+    assert len(data) < 2000
+    assert pickle.loads(data)[6].id == "scenario-6"
+
+
+def test_nothing_is_left_after_an_exception(tmp_path: Path):
+    with pytest.raises(RuntimeError), ScenarioWriter(tmp_path / "set", SMALL, shard_size=1) as writer:
+        writer.add(make_scenario(0))
+        writer.add(make_scenario(1))
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_exception_while_overwriting_keeps_the_old_set(scenario_set: Path):
+    with pytest.raises(RuntimeError), ScenarioWriter(scenario_set, SMALL, overwrite=True) as writer:
+        writer.add(make_scenario(99))
+        raise RuntimeError
+    assert len(ScenarioSet.open(scenario_set)) == 7
+    assert [path.name for path in scenario_set.parent.iterdir()] == ["set"]
+
+
+def test_overwrite(scenario_set: Path):
+    with pytest.raises(UsageError, match="--overwrite"):
+        ScenarioWriter(scenario_set, SMALL)
+    with ScenarioWriter(scenario_set, SMALL, overwrite=True) as writer:
+        writer.add(make_scenario(99))
+    assert [scenario.id for scenario in ScenarioSet.open(scenario_set)] == ["scenario-99"]
+    assert [path.name for path in scenario_set.parent.iterdir()] == ["set"]
+
+
+def test_overwrite_never_replaces_what_is_no_set(tmp_path: Path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="not a scenario set"):
+        ScenarioWriter(tmp_path, SMALL, overwrite=True)
+    with pytest.raises(UsageError, match="not a scenario set"):
+        ScenarioWriter(tmp_path / "thesis.tex", SMALL, overwrite=True)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path):
+    (tmp_path / "set").mkdir()
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        writer.add(make_scenario(0))
+    assert len(ScenarioSet.open(tmp_path / "set")) == 1
+
+
+def test_writer_refuses_what_does_not_belong(tmp_path: Path):
+    with pytest.raises(DataError, match="no scenario"), ScenarioWriter(tmp_path / "empty", SMALL):
+        pass
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        writer.add(make_scenario(0))
+        with pytest.raises(DataError, match="'scenario-0' of 'synthetic'"):
+            writer.add(make_scenario(0))
+        with pytest.raises(UsageError, match=r"'default'.*'small'"):
+            writer.add(make_scenario(1, Capacity()))
+    with pytest.raises(UsageError, match="shard_size"):
+        ScenarioWriter(tmp_path / "zero", SMALL, shard_size=0)
+
+
+def test_audit_values_become_strict_json(tmp_path: Path):
+    scenario = make_scenario(0)
+    scenario.audit.update(
+        {"score": float("nan"), "count": np.int64(3), "share": np.float32(0.5), "bad": np.bool_(True)}
+    )  # type: ignore[dict-item]
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        writer.add(scenario)
+    assert ScenarioSet.open(tmp_path / "set")[0].audit == {
+        "collision": False, "score": None, "count": 3, "share": 0.5, "bad": True,
+    }  # fmt: skip
+
+
+def flip_bit(file: Path, position: int) -> None:
+    data = bytearray(file.read_bytes())
+    data[position] ^= 0x10
+    file.write_bytes(data)
+
+
+def test_flipped_bit(scenario_set: Path):
+    record_bytes = record_dtype(SMALL).itemsize
+    file = scenario_set / "shard-00001.npy"
+    flip_bit(file, file.stat().st_size - record_bytes - 100)  # in the second record of the shard
+    opened = ScenarioSet.open(scenario_set)
+    assert opened[3].id == "scenario-3"
+    for read in (lambda: opened[4], lambda: opened.records([3, 4])):
+        with pytest.raises(
+            DataError, match=r"shard-00001\.npy: record 1: checksum mismatch.*; copy the file"
+        ):
+            read()
+    with pytest.raises(DataError, match="checksum mismatch"):
+        opened.check()
+    assert ScenarioSet.open(scenario_set, verify=False)[4].id == "scenario-4"
+
+
+def test_every_single_flipped_bit_is_found(scenario_set: Path):
+    """CRC-32 finds any one-bit error, in the padding between fields too."""
+    file = scenario_set / "shard-00002.npy"
+    whole = file.read_bytes()
+    start = len(whole) - record_dtype(SMALL).itemsize
+    for position in range(start, len(whole), 97):
+        flip_bit(file, position)
+        with pytest.raises(DataError, match="checksum mismatch"):
+            ScenarioSet.open(scenario_set)[6]
+        file.write_bytes(whole)
+    ScenarioSet.open(scenario_set).check()
+
+
+def test_check_compares_sha256(scenario_set: Path):
+    """A record changed together with its CRC passes the CRC, not the manifest."""
+    file = scenario_set / "shard-00002.npy"
+    flip_bit(file, file.stat().st_size - 1)
+    raw = file.read_bytes()[-record_dtype(SMALL).itemsize :]
+    np.save(scenario_set / "shard-00002.crc.npy", np.array([zlib.crc32(raw)], np.uint32))
+    opened = ScenarioSet.open(scenario_set)
+    assert opened[6].id == "scenario-6"
+    with pytest.raises(DataError, match="SHA-256"):
+        opened.check()
+
+
+def test_truncated_shard(scenario_set: Path):
+    file = scenario_set / "shard-00000.npy"
+    file.write_bytes(file.read_bytes()[: -record_dtype(SMALL).itemsize - 1])
+    with pytest.raises(
+        DataError, match=r"shard-00000\.npy: record 1: shard is truncated.*1 whole records of 3"
+    ):
+        ScenarioSet.open(scenario_set)
+
+
+@pytest.mark.parametrize("name", ["shard-00001.npy", "shard-00001.crc.npy"])
+def test_missing_shard(scenario_set: Path, name: str):
+    (scenario_set / name).unlink()
+    with pytest.raises(DataError, match=f"{name}: shard is missing; restore"):
+        ScenarioSet.open(scenario_set)
+
+
+@pytest.mark.parametrize("name", ["shard-00001.npy", "shard-00001.crc.npy"])
+@pytest.mark.parametrize("content", [b"", b"not numpy at all", b"\x93NUMPY\x01\x00\xff\xff"])
+def test_damaged_header(scenario_set: Path, name: str, content: bytes):
+    (scenario_set / name).write_bytes(content)
+    with pytest.raises(DataError, match=f"{name}: header is damaged"):
+        ScenarioSet.open(scenario_set)[3]
+
+
+def test_checksums_of_another_shard(scenario_set: Path):
+    (scenario_set / "shard-00002.crc.npy").write_bytes((scenario_set / "shard-00001.crc.npy").read_bytes())
+    with pytest.raises(DataError, match="checksum file does not fit"):
+        ScenarioSet.open(scenario_set)[6]
+
+
+def test_another_layout(scenario_set: Path):
+    np.save(scenario_set / "shard-00001.npy", np.zeros(3, np.float32))
+    with pytest.raises(DataError, match="layout"):
+        ScenarioSet.open(scenario_set)
+
+
+def test_no_set(tmp_path: Path, scenario_set: Path):
+    with pytest.raises(DataError, match=r"nowhere: does not exist; name the folder"):
+        ScenarioSet.open(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="is not a scenario set"):
+        ScenarioSet.open(scenario_set / "manifest.json")
+    (scenario_set / "manifest.json").unlink()
+    with pytest.raises(DataError, match=r"no manifest\.json"):
+        ScenarioSet.open(scenario_set)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"schema_version": 1}', "null", "\\x00\\xff"])
+def test_damaged_manifest(scenario_set: Path, content: str):
+    (scenario_set / "manifest.json").write_text(content)
+    with pytest.raises(DataError, match=r"manifest\.json: manifest is damaged.*; convert"):
+        ScenarioSet.open(scenario_set)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema_version": 2}, "schema version 2, this drivax reads 1; upgrade drivax"),
+        ({"schema_version": 0}, "schema version 0, this drivax reads 1; convert or generate"),
+        ({"fields": []}, "field table"),
+        ({"capacity": {"agnets": 3}}, "manifest is damaged"),
+        ({"scenarios": [{"scenario_id": "x"}]}, "manifest is damaged"),
+        ({"shards": [{"file": "shard-00000.npy"}]}, "manifest is damaged"),
+        ({"shards": []}, "lists 7 scenarios but its shards hold 0"),
+    ],
+)
+def test_manifest_of_another_kind(scenario_set: Path, changes: dict[str, object], message: str):
+    edit_manifest(scenario_set, **changes)
+    with pytest.raises(DataError, match=message):
+        ScenarioSet.open(scenario_set)
+
+
+def test_errors_are_one_line(scenario_set: Path):
+    (scenario_set / "manifest.json").write_text('{\n"a":\n')
+    with pytest.raises(DataError) as error:
+        ScenarioSet.open(scenario_set)
+    assert "\n" not in str(error.value)
+
+
+def test_default_capacity_opens_with_plain_numpy(tmp_path: Path):
+    """The header of a full-size record must stay below numpy's limit for untrusted headers."""
+    with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
+        writer.add(make_scenario(0, Capacity()))
+    assert np.load(tmp_path / "set" / "shard-00000.npy", mmap_mode="r").dtype == record_dtype(Capacity())
+
+
+def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path):
+    program = (
+        "import os, sys; sys.path.insert(0, sys.argv[2]); import test_store as t\n"
+        "w = t.ScenarioWriter(sys.argv[1], t.SMALL, shard_size=1).__enter__()\n"
+        "w.add(t.make_scenario(0)); w.add(t.make_scenario(1)); os.kill(os.getpid(), 9)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "set"), str(Path(__file__).parent)], check=False
+    )
+    assert result.returncode == -9
+    assert not (tmp_path / "set").exists()

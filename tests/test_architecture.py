@@ -1,0 +1,142 @@
+"""Who may import whom, what must work without JAX, and rules about files."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+#: Rooms that are pure functions on arrays: nothing but these, the standard library and rooms below.
+PURE_ROOMS = ("geometry", "scenario", "simulator", "metrics", "tasks", "rl")
+PURE_PACKAGES = {"numpy", "jax", "jaxtyping"}
+#: Modules of pure rooms that read or write files.
+EDGES = {"scenario/store.py", "scenario/manifest.py"}
+#: Functions that are one long table.
+TABLES = {"scenario/schema.py: scenario_fields"}
+REGISTRIES = ("pypi." + "org", "files.python" + "hosted", "download.py" + "torch", "registry.npm" + "js")
+
+
+@pytest.fixture(scope="module")
+def package(repository: Path) -> Path:
+    return repository / "src" / "drivax"
+
+
+def imported(file: Path) -> set[str]:
+    """Full names of the modules that a file imports, inside functions too."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def test_layers(repository: Path):
+    result = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
+        cwd=repository, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout
+
+
+@pytest.mark.parametrize("room", PURE_ROOMS)
+def test_pure_rooms(package: Path, room: str):
+    for file in sorted((package / room).rglob("*.py")):
+        if str(file.relative_to(package)) in EDGES:
+            continue
+        for name in imported(file):
+            top = name.split(".")[0]
+            allowed = top in PURE_PACKAGES | {"drivax", "__future__"} or top in sys.stdlib_module_names
+            assert allowed, f"{file.relative_to(package)} imports {name}"
+            assert not name.startswith(
+                ("drivax.tracking", "drivax.scenario.store", "drivax.scenario.manifest")
+            ), f"{file.relative_to(package)} imports {name}"
+
+
+def test_readers_and_the_world_work_without_jax(package: Path):
+    """Their worker processes must start fast and never touch an accelerator."""
+    modules = ["drivax", "drivax.errors", "drivax.geometry.boxes", "drivax.simulator.idm"]
+    for room in ("datasets", "synthetic"):
+        for file in sorted((package / room).rglob("*.py")):
+            name = ".".join(file.relative_to(package.parent).with_suffix("").parts)
+            modules.append(name.removesuffix(".__init__"))
+    modules += [
+        f"drivax.scenario.{name}" for name in ("schema", "store", "manifest", "assemble", "routes", "grid")
+    ]
+    program = f"import sys, {', '.join(modules)}\nprint('jax' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == "False\n"
+
+
+def test_every_module_imports_without_printing(package: Path):
+    files = sorted(package.rglob("*.py"))
+    names = [".".join(file.relative_to(package.parent).with_suffix("").parts) for file in files]
+    names = [name.removesuffix(".__init__") for name in names if not name.endswith("__main__")]
+    program = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)"
+    result = subprocess.run(
+        [sys.executable, "-c", program, *names], capture_output=True, text=True, check=False
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def test_names_of_files(package: Path):
+    forbidden = {"utils", "util", "helpers", "helper", "common", "misc"}
+    found = [file for file in package.rglob("*") if file.stem in forbidden]
+    assert found == []
+
+
+def test_sizes(package: Path):
+    """Files of at most 400 lines, functions of at most 60 lines and 8 parameters."""
+    found = []
+    for file in sorted(package.rglob("*.py")):
+        text = file.read_text()
+        place = str(file.relative_to(package))
+        if (lines := len(text.splitlines())) > 400:
+            found.append(f"{place}: {lines} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                if lines > 60 and f"{place}: {node.name}" not in TABLES:
+                    found.append(f"{place}: {node.name}: {lines} lines")
+                own = {"self", "cls"} & {arg.arg for arg in node.args.args[:1]}
+                if (count := len(node.args.args) + len(node.args.kwonlyargs) - len(own)) > 8:
+                    found.append(f"{place}: {node.name}: {count} parameters")
+    assert found == []
+
+
+def tracked_files(repository: Path) -> list[Path]:
+    command = ["git", "-C", str(repository), "ls-files", "--cached", "--others", "--exclude-standard"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        pytest.skip("not a git checkout")
+    return [repository / line for line in result.stdout.splitlines() if (repository / line).is_file()]
+
+
+def test_no_registry_hosts_and_no_paths_of_one_machine(repository: Path):
+    pattern = re.compile(
+        "|".join([*map(re.escape, REGISTRIES), "/" + "work/", "/" + r"home/\w", "/" + "root/"])
+    )
+    for file in tracked_files(repository):
+        try:
+            text = file.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue
+        found = pattern.search(text)
+        assert found is None, f"{file.relative_to(repository)}: {found}"
+
+
+def test_no_large_files(repository: Path):
+    large = [file for file in tracked_files(repository) if file.stat().st_size > 2_000_000]
+    assert large == []
+
+
+def test_lock_file_pins_exactly(repository: Path):
+    for line in (repository / "requirements.lock").read_text().splitlines():
+        assert re.fullmatch(r"[A-Za-z0-9_.\-\[\]]+==[A-Za-z0-9_.+!]+( ; .+)?", line), line

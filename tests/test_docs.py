@@ -1,0 +1,112 @@
+"""The documentation is true: its Python runs, its commands exist, its links lead somewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+import sys
+import types
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from drivax import cli
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
+_FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<body>.*?)^(?P=indent)```", re.M | re.S)
+_LINK = re.compile(r"!?\[[^\]]*\]\((?P<target>[^)\s]+)\)")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    @property
+    def place(self) -> str:
+        return f"{self.page.relative_to(REPOSITORY)}:{self.line}"
+
+
+def blocks(page: Path, *languages: str) -> list[Block]:
+    text = page.read_text()
+    found = []
+    for match in _FENCE.finditer(text):
+        if match["language"] in languages:
+            lines = match["body"].splitlines()
+            body = "\n".join(line.removeprefix(match["indent"]) for line in lines)
+            found.append(
+                Block(page, text.count("\n", 0, match.start("body")) + 1, match["language"], body + "\n")
+            )
+    return found
+
+
+def commands(block: Block) -> list[list[str]]:
+    """The ``drivax`` commands of a shell block, as lists of words."""
+    text = block.text.replace("\\\n", " ")
+    lines = (line.strip().removeprefix("$ ") for line in text.splitlines())
+    return [shlex.split(line, comments=True) for line in lines if re.match(r"drivax\b", line)]
+
+
+@cache
+def help_of(command: str) -> str:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        assert cli.main([command, "--help"]) == 0, f"drivax {command} --help fails"
+    return out.getvalue()
+
+
+PYTHON_PAGES = [page for page in PAGES if blocks(page, "python")]
+SHELL_BLOCKS = [block for page in PAGES for block in blocks(page, "bash", "console", "sh") if commands(block)]
+
+
+def test_pages_are_found():
+    assert REPOSITORY / "README.md" in PAGES
+    assert SHELL_BLOCKS
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Blocks of a page share their names, as a reader who types them in order has them."""
+    monkeypatch.chdir(tmp_path)
+    module = types.ModuleType("page")  # dataclasses look their module up
+    monkeypatch.setitem(sys.modules, "page", module)
+    for block in blocks(page, "python"):
+        code = compile("\n" * (block.line - 1) + block.text, str(page), "exec", dont_inherit=True)
+        exec(code, module.__dict__)
+
+
+@pytest.mark.parametrize("block", SHELL_BLOCKS, ids=lambda block: block.place)
+def test_commands_exist(block: Block):
+    for words in commands(block):
+        flags = [word.split("=")[0] for word in words[1:] if word.startswith("--")]
+        if len(words) == 1 or words[1] in ("--help", "--version"):
+            continue
+        assert words[1] in cli.COMMANDS, f"{block.place}: there is no command {words[1]}"
+        for flag in flags:
+            dotted = "." in flag and cli.COMMANDS[words[1]].overrides
+            known = flag in ("--debug", "--help") or re.search(
+                rf"(?<![\w-]){flag}(?![\w-])", help_of(words[1])
+            )
+            assert dotted or known, f"{block.place}: drivax {words[1]} has no {flag}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_lead_somewhere(page: Path):
+    text = _FENCE.sub("", page.read_text())
+    for match in _LINK.finditer(text):
+        target = match["target"].split("#")[0]
+        if target and "://" not in target and not target.startswith("mailto:"):
+            assert (page.parent / target).exists(), f"{page.relative_to(REPOSITORY)}: {match['target']}"
+
+
+def test_readme_is_short():
+    assert len((REPOSITORY / "README.md").read_text().splitlines()) < 200

@@ -1,0 +1,300 @@
+"""Settings: what is written is read back exactly, and every mistake is named with its path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivax import settings
+from drivax.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Adam:
+    lr: float = 3e-4
+    clip: float | None = None
+    betas: tuple[float, float] = (0.9, 0.999)
+
+
+@dataclass(frozen=True)
+class Sgd:
+    lr: float = 0.1
+    momentum: float = 0.0
+
+
+@dataclass(frozen=True)
+class TD3BC:
+    kind: Literal["td3_bc"] = "td3_bc"
+    alpha: float = 2.5
+
+
+@dataclass(frozen=True)
+class Network:
+    hidden: tuple[int, ...] = (256, 256)
+    activation: Literal["relu", "gelu", "tanh"] = "relu"
+    optimizer: Adam = field(default_factory=lambda: Adam(lr=1e-3))
+
+
+@dataclass(frozen=True)
+class Training:
+    steps: int = 1000
+    name: str = "run"
+    resume: bool = False
+    data: Path = Path("sets/a")
+    seed: int | None = 7
+    optimizer: Adam | Sgd = field(default_factory=Adam)
+    stages: tuple[Adam | Sgd, ...] = ()
+    algorithm: TD3BC | Sgd | None = None
+    network: Network = field(default_factory=Network)
+    weights: dict[str, float] = field(default_factory=dict)
+    limit: int | str = 3
+
+
+@dataclass(frozen=True)
+class Needy:
+    steps: int
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise UsageError("steps are negative", cure="use 0 or more")
+
+
+def load(text: str, *overrides: str) -> Training:
+    return settings.load(Training, settings.parse_yaml(text) or {}, overrides)
+
+
+def test_defaults_and_values():
+    assert load("") == Training()
+    assert load("steps: 5\nseed: null\ndata: b/c\nnetwork: {hidden: [3]}") == Training(
+        steps=5, seed=None, data=Path("b/c"), network=Network(hidden=(3,))
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3e-4", 3e-4), ("1E5", 1e5), ("+2.", 2.0), (".5e+2", 50.0), ("-7", -7), ("010", 10), ("1_000", 1000), ("0", 0),
+        (".inf", math.inf), ("-.inf", -math.inf), ("true", True), ("False", False), ("null", None), ("~", None),
+        ("", None), ("no", "no"), ("yes", "yes"), ("on", "on"), ("1:30", "1:30"), ("2026-01-01", "2026-01-01"),
+        ("1e", "1e"), ("e4", "e4"), ("'3'", "3"), ("0x10", "0x10"), ("None", None), (".", "."), ("-", ["x"]),
+    ],
+)  # fmt: skip
+def test_scalars_by_the_core_rules(text: str, value: object):
+    if text == "-":
+        text = "- x"
+    result = settings.parse_yaml(text)
+    assert result == value
+    assert type(result) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stpes: 5", r"^stpes: there is no such setting; did you mean 'steps'\?$"),
+        ("network: {optimizer: {lrr: 1}}", r"^network\.optimizer\.lrr: there is no such setting; did you mean 'lr'\?"),
+        ("qqqq: 1", r"^qqqq: there is no such setting; use one of steps, name, "),
+        ("steps: 1.5", r"^steps: 1\.5 is not a whole number"),
+        ("steps: true", r"^steps: True is not a whole number"),
+        ("steps: '5'", r"^steps: '5' is not a whole number"),
+        ("steps: null", r"^steps: None is not a whole number"),
+        ("name: 5", r"^name: 5 is not text \(quote it\)"),
+        ("resume: 1", r"^resume: 1 is not true or false"),
+        ("resume: 'yes'", r"^resume: 'yes' is not true or false"),
+        ("seed: x", r"^seed: 'x' is not a whole number"),
+        ("data: [a]", r"^data: \['a'\] is not text"),
+        ("network: 3", r"^network: 3 is not a section of settings \(hidden, activation, optimizer\)"),
+        ("network: {hidden: 256}", r"^network\.hidden: 256 is not a list"),
+        ("network: {hidden: '256'}", r"^network\.hidden: '256' is not a list"),
+        ("network: {hidden: [256, x]}", r"^network\.hidden\[1\]: 'x' is not a whole number"),
+        ("network: {activation: rleu}", r"^network\.activation: 'rleu' is none of relu, gelu, tanh; did you mean 'r"),
+        ("network: {optimizer: {betas: [0.9]}}", r"^network\.optimizer\.betas: 1 values, not 2"),
+        ("network: {optimizer: {lr: true}}", r"^network\.optimizer\.lr: True is not a number"),
+        ("optimizer: {lr: 1, kind: rmsprop}", r"^optimizer: there is no kind 'rmsprop'; use one of adam, sgd"),
+        ("optimizer: {kind: adma}", r"^optimizer: there is no kind 'adma'; did you mean 'adam'"),
+        ("optimizer: {kind: sgd, clip: 1}", r"^optimizer\.clip: there is no such setting"),
+        ("stages: [{lr: 1}]", r"^stages\[0\]: has no kind; use one of adam, sgd"),
+        ("stages: [adam, {kind: sgd, momentum: x}]", r"^stages\[1\]\.momentum: 'x' is not a number"),
+        ("algorithm: 5", r"^algorithm: 5 is no section with a kind \(td3_bc, sgd\)"),
+        ("weights: {a: x}", r"^weights.*'x' is not a number"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named_with_their_path(text: str, message: str):
+    with pytest.raises(UsageError, match=message) as error:
+        load(text)
+    assert error.value.status == 2
+
+
+def test_missing_setting_and_the_records_own_check():
+    with pytest.raises(UsageError, match="'steps' is missing"):
+        settings.load(Needy, {})
+    with pytest.raises(UsageError, match="steps are negative; use 0 or more"):
+        settings.load(Needy, {"steps": -1})
+
+
+def test_whole_floats_count_as_steps():
+    assert load("steps: 25e6").steps == 25_000_000
+    assert isinstance(load("steps: 25e6").steps, int)
+    assert isinstance(load("network: {optimizer: {lr: 1}}").network.optimizer.lr, float)
+
+
+def test_unions():
+    assert load("optimizer: {kind: sgd, momentum: 0.5}").optimizer == Sgd(momentum=0.5)
+    assert load("optimizer: sgd").optimizer == Sgd()
+    assert load("algorithm: {kind: td3_bc, alpha: 1}").algorithm == TD3BC(alpha=1.0)
+    assert load("algorithm: null").algorithm is None
+    assert load("stages: [adam, {kind: sgd, lr: 1}]").stages == (Adam(), Sgd(lr=1.0))
+    assert load("limit: all").limit == "all"
+    assert load("limit: 4").limit == 4
+
+
+def test_kind_names():
+    class BcSac:
+        pass
+
+    bc_sac = dataclass(frozen=True)(BcSac)
+    assert settings.kind_of(bc_sac) == "bc_sac"
+    assert settings.kind_of(Adam) == "adam"
+    assert settings.kind_of(TD3BC) == "td3_bc"
+
+
+def test_a_section_is_completed_from_the_default_of_its_owner():
+    """Network's optimizer has lr 1e-3 where a bare Adam has 3e-4; naming clip alone must not change lr."""
+    assert load("network: {optimizer: {clip: 1}}").network.optimizer == Adam(lr=1e-3, clip=1.0)
+    assert load("", "--network.optimizer.clip=1").network.optimizer == Adam(lr=1e-3, clip=1.0)
+    assert load("optimizer: {clip: 2}").optimizer == Adam(clip=2.0)  # the kind is that of the default
+
+
+def test_overrides():
+    changed = load(
+        "steps: 5\noptimizer: {kind: sgd, lr: 1}",
+        "--steps", "1e3", "--resume", "--name=12", "--network.hidden", "[3, 4]", "--seed", "null",
+        "--optimizer.lr", "1e-3", "--data", "x/y", "--weights.left", "-2", "--network.activation", "tanh",
+        "--stages", "[{kind: sgd}, adam]",
+    )  # fmt: skip
+    assert changed == Training(
+        steps=1000, resume=True, name="12", seed=None, data=Path("x/y"), optimizer=Sgd(lr=1e-3),
+        network=Network(hidden=(3, 4), activation="tanh"), weights={"left": -2.0}, stages=(Sgd(), Adam()),
+    )  # fmt: skip
+    assert load("resume: true", "--resume", "false").resume is False
+    assert load("limit: 4", "--limit", "all").limit == "all"
+    assert load("", "--limit", "5").limit == 5
+
+
+def test_another_kind_drops_the_settings_of_the_former():
+    text = "optimizer: {kind: adam, clip: 1}"
+    assert load(text, "--optimizer.kind", "sgd", "--optimizer.momentum", "0.5").optimizer == Sgd(momentum=0.5)
+    assert load(text, "--optimizer.kind", "adam").optimizer == Adam(clip=1.0)
+    assert load(text, "--optimizer", "sgd").optimizer == Sgd()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("steps", "'steps' is no setting; write --section.key value"),
+        ("--stesp=1", r"stesp: .* did you mean 'steps'\?"),
+        ("--steps=x", "steps: 'x' is not a whole number"),
+        ("--network.optimizer.lr=fast", r"network\.optimizer\.lr: 'fast' is not a number"),
+        ("--steps.deep=1", "steps: .* is not a whole number"),
+        ("--network.hidden=[1", r"^network\.hidden: '\[1' is not a value"),
+    ],
+)
+def test_mistaken_overrides(override: str, message: str):
+    with pytest.raises(UsageError, match=message):
+        load("", override)
+
+
+def test_overrides_leave_the_mapping_alone():
+    values = {"network": {"hidden": [1]}}
+    settings.load(Training, values, ["--network.hidden=[2]"])
+    assert values == {"network": {"hidden": [1]}}
+
+
+def test_files(tmp_path: Path):
+    file = tmp_path / "train.yaml"
+    file.write_text("stpes: 5\n")
+    with pytest.raises(UsageError, match=r"train\.yaml: stpes: there is no such setting"):
+        settings.load(Training, file)
+    file.write_text("a: [1,\nb: }\n")
+    with pytest.raises(UsageError, match=r"train\.yaml: line 2: .*; correct it"):
+        settings.load(Training, file)
+    file.write_text("steps: 1\nsteps: 2\n")
+    with pytest.raises(UsageError, match=r"line 2: the key 'steps' appears twice"):
+        settings.load(Training, file)
+    file.write_text("- 1\n")
+    with pytest.raises(UsageError, match="is not a mapping of settings"):
+        settings.load(Training, file)
+    file.write_bytes(b"\xff\xfe\x00a")
+    with pytest.raises(UsageError, match="is not text"):
+        settings.load(Training, file)
+    with pytest.raises(UsageError, match=r"none\.yaml: does not exist"):
+        settings.load(Training, str(tmp_path / "none.yaml"))
+    with pytest.raises(UsageError, match="is a folder"):
+        settings.load(Training, tmp_path)
+    file.write_text("")
+    assert settings.load(Training, str(file)) == Training()
+
+
+def test_yaml_cannot_make_objects(tmp_path: Path):
+    with pytest.raises(UsageError, match="could not determine a constructor"):
+        settings.parse_yaml("!!python/object/apply:os.system ['true']")
+
+
+def test_presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(settings, "_configs", lambda: tmp_path)
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "fast.yaml").write_text("steps: 3\n")
+    (tmp_path / "studies" / "slow.yaml").write_text("steps: 4\n")
+    assert settings.presets() == ["fast", "studies/slow"]
+    assert settings.load(Training, "fast").steps == 3
+    assert settings.load(Training, "studies/slow").steps == 4
+    with pytest.raises(UsageError, match=r"no preset or file 'fsat'; did you mean 'fast'\?"):
+        settings.load(Training, "fsat")
+
+
+def test_presets_are_those_of_the_checkout(repository: Path):
+    files = (repository / "configs").rglob("*.yaml")
+    assert settings.presets() == sorted(
+        str(file.relative_to(repository / "configs").with_suffix("")) for file in files
+    )
+
+
+words = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=12)
+numbers = st.floats(allow_nan=False)
+adams = st.builds(Adam, lr=numbers, clip=st.none() | numbers, betas=st.tuples(numbers, numbers))
+sgds = st.builds(Sgd, lr=numbers, momentum=numbers)
+trainings = st.builds(
+    Training,
+    steps=st.integers(),
+    name=words
+    | st.sampled_from(["3e-4", "null", "true", "no", "1", "", "-", "~", "a: b", "# c", "1_0", "'"]),
+    resume=st.booleans(),
+    data=st.sampled_from([Path("a/b"), Path("/"), Path("1"), Path("3e4")]),
+    seed=st.none() | st.integers(),
+    optimizer=adams | sgds,
+    stages=st.lists(adams | sgds, max_size=3).map(tuple),
+    algorithm=st.none() | sgds | st.builds(TD3BC, alpha=numbers),
+    network=st.builds(Network, hidden=st.lists(st.integers(), max_size=4).map(tuple), optimizer=adams),
+    weights=st.dictionaries(words, numbers, max_size=3),
+    limit=st.integers() | words,
+)
+
+
+@given(trainings)
+def test_round_trip_is_exact(record: Training):
+    text = settings.dump(record)
+    again = settings.load(Training, settings.parse_yaml(text))
+    assert again == record
+    assert settings.dump(again) == text
+
+
+def test_dump_is_readable():
+    text = settings.dump(Training(optimizer=Sgd(), network=Network(hidden=(1, 2))))
+    assert "hidden: [1, 2]" in text
+    assert "optimizer: {kind: sgd, lr: 0.1, momentum: 0.0}" in text
+    assert text.index("steps") < text.index("name") < text.index("network")

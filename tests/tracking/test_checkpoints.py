@@ -1,0 +1,181 @@
+"""Checkpoints come back bit for bit, stay in the number asked for, and say what does not fit."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import DataError
+from drivax.tracking.checkpoints import Checkpoints
+
+
+class State(NamedTuple):
+    key: Any
+    keys: Any
+    params: Any
+    step: int
+    lr: float
+    done: bool
+    host: Any
+    nothing: Any
+    empty: Any
+
+
+def make_state(seed: int) -> State:
+    key = jax.random.key(seed)
+    params = {
+        "w": jax.random.normal(key, (7, 3)),
+        "half": jax.random.normal(key, (5,), jnp.bfloat16),
+        "count": jnp.int32(seed),
+        "mask": jnp.array([True, False]),
+        "bytes": jnp.arange(4, dtype=jnp.uint8),
+        "odd": jnp.array([jnp.nan, -0.0, jnp.inf, 1e-45], jnp.float32),
+    }
+    return State(
+        key=key,
+        keys=jax.random.split(jax.random.key(seed, impl="rbg"), 3),
+        params=params,
+        step=2**40 + seed,
+        lr=0.1 + seed,
+        done=bool(seed % 2),
+        host=np.array([2**40 + seed, -1], np.int64),
+        nothing=None,
+        empty=jnp.zeros((0, 3)),
+    )
+
+
+def bits(state: State) -> list[Any]:
+    leaves = []
+    for leaf in jax.tree_util.tree_leaves(state):
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaves.append((str(leaf.dtype), np.asarray(jax.random.key_data(leaf)).tobytes()))
+        else:
+            leaves.append((type(leaf), np.asarray(leaf).dtype, np.shape(leaf), np.asarray(leaf).tobytes()))
+    return leaves
+
+
+def test_bit_for_bit(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    state = make_state(1)
+    path = checkpoints.save(100, state)
+    again = checkpoints.restore(make_state(0))
+    assert bits(again) == bits(state)
+    assert jax.random.uniform(again.key) == jax.random.uniform(state.key)
+    assert jax.random.bits(again.keys[2]) == jax.random.bits(state.keys[2])
+    assert isinstance(again.host, np.ndarray)
+    assert path.name == "step-000000100"
+    assert [item.name for item in (tmp_path / "checkpoints").iterdir()] == [path.name]
+
+
+def test_shapes_are_template_enough(tmp_path: Path):
+    """As a fresh process does: nothing is computed to make the template."""
+    checkpoints = Checkpoints(tmp_path)
+
+    def initial(seed: int) -> dict[str, Any]:
+        key = jax.random.key(seed)
+        return {"key": key, "w": jax.random.normal(key, (4,)), "n": jnp.int32(3)}
+
+    state = initial(5)
+    checkpoints.save(1, state)
+    again = checkpoints.restore(jax.eval_shape(lambda: initial(5)))
+    np.testing.assert_array_equal(again["w"], state["w"])
+    assert jax.random.uniform(again["key"]) == jax.random.uniform(state["key"])
+
+
+def test_newest_and_best_stay(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path, keep=2)
+    for step, score in ((10, 0.1), (20, 0.9), (30, None), (40, float("nan")), (50, 0.3)):
+        checkpoints.save(step, {"step": step}, score)
+    assert checkpoints.steps() == [20, 40, 50]
+    assert checkpoints.best() == 20
+    assert checkpoints.restore({"step": 0}) == {"step": 50}
+    assert checkpoints.restore({"step": 0}, checkpoints.best()) == {"step": 20}
+    assert checkpoints.about(40)["score"] is None
+    checkpoints.save(60, {"step": 60}, 0.9)
+    assert checkpoints.best() == 60  # of equals the later one
+    assert checkpoints.steps() == [50, 60]
+
+
+def test_without_scores_only_the_newest_stay(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path, keep=1)
+    for step in (1, 2, 3):
+        checkpoints.save(step, {"step": step})
+    assert checkpoints.steps() == [3]
+    assert checkpoints.best() is None
+
+
+def test_saving_a_step_again_replaces_it(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"a": 1})
+    checkpoints.save(1, {"a": 2})
+    assert checkpoints.restore({"a": 0}) == {"a": 2}
+
+
+def test_a_failed_save_leaves_nothing_and_harms_nothing(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"a": 1})
+    with pytest.raises(TypeError, match="str"):
+        checkpoints.save(2, {"a": "text"})
+    assert checkpoints.steps() == [1]
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_left_overs_of_a_killed_process_are_no_checkpoints(tmp_path: Path):
+    (tmp_path / ".step-5.partial-123").mkdir()
+    (tmp_path / "step-x").mkdir()
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.steps() == []
+    with pytest.raises(DataError, match="there is no checkpoint; train without --resume"):
+        checkpoints.restore({"a": 0})
+
+
+@pytest.mark.parametrize(
+    ("template", "message"),
+    [
+        ({"w": jnp.zeros(3), "b": 0}, r"has no \['b'\]"),
+        ({}, r"holds \['w'\], which is not wanted"),
+        ({"w": jnp.zeros(4)}, r"\['w'\] is float32\[3\] in the checkpoint, not float32\[4\]"),
+        ({"w": jnp.zeros(3, jnp.int32)}, r"\['w'\] is float32\[3\] in the checkpoint, not int32\[3\]"),
+        ({"w": jax.random.split(jax.random.key(0), 3)}, r"not key<fry>\[3\]"),
+    ],
+)
+def test_a_template_that_does_not_fit(tmp_path: Path, template: dict[str, Any], message: str):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"w": jnp.ones(3)})
+    with pytest.raises(DataError, match=message):
+        checkpoints.restore(template)
+
+
+def test_unknown_step(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"a": 1})
+    with pytest.raises(DataError, match="no checkpoint of step 7; there are: 1"):
+        checkpoints.restore({"a": 0}, 7)
+
+
+def test_damage_is_told(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    state = {"w": jax.random.normal(jax.random.key(0), (1000,))}
+    path = checkpoints.save(1, state)
+    about = json.loads((path / "about.json").read_text())
+    about["leaves"][0]["crc"] ^= 1
+    (path / "about.json").write_text(json.dumps(about))
+    with pytest.raises(DataError, match=r"checksum mismatch in \['w'\]"):
+        checkpoints.restore(state)
+    checkpoints.save(1, state)
+    for file in (path / "arrays").rglob("*"):
+        if file.is_file() and file.parent.name == "d":
+            os.truncate(file, file.stat().st_size // 2)
+    with pytest.raises(DataError, match="use another checkpoint") as error:
+        checkpoints.restore(state)
+    assert "\n" not in str(error.value)
+    (path / "about.json").write_text("{")
+    with pytest.raises(DataError, match=r"about\.json: is damaged"):
+        checkpoints.restore(state)

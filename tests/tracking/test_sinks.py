@@ -1,0 +1,86 @@
+"""Logged numbers survive, and a resumed run continues where it stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivax.errors import DataError
+from drivax.tracking.sinks import MetricLog, read_rows
+
+
+def test_rows_are_on_disk_at_once(tmp_path: Path):
+    log = MetricLog(tmp_path, tensorboard=False)
+    log.write(0, {"loss": np.float32(0.5), "count": 3})
+    log.write(10, {"score": float("nan"), "big": float("inf")}, prefix="valid")
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert rows == [
+        {"step": 0, "loss": 0.5, "count": 3.0},
+        {"step": 10, "valid/score": None, "valid/big": None},
+    ]
+    log.close()
+    assert list(read_rows(tmp_path / "metrics.jsonl")) == rows
+
+
+def test_resume_drops_later_rows(tmp_path: Path):
+    with MetricLog(tmp_path, tensorboard=False) as log:
+        for step in (0, 10, 20, 30):
+            log.write(step, {"x": step})
+    with MetricLog(tmp_path, resume_step=10, tensorboard=False) as log:
+        log.write(20, {"x": -1})
+    rows = [(row["step"], row["x"]) for row in read_rows(tmp_path / "metrics.jsonl")]
+    assert rows == [(0, 0), (10, 10), (20, -1)]
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+def test_resume_drops_a_row_that_was_cut_off(tmp_path: Path):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"step": 0, "x": 1}\n{"step": 5, "x"')
+    assert [row["step"] for row in read_rows(file)] == [0]
+    with MetricLog(tmp_path, resume_step=5, tensorboard=False) as log:
+        log.write(6, {"x": 2})
+    assert file.read_text() == '{"step": 0, "x": 1}\n{"step": 6, "x": 2.0}\n'
+
+
+def test_a_whole_last_row_without_newline_is_kept(tmp_path: Path):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"step": 0}\n{"step": 5}')
+    with MetricLog(tmp_path, resume_step=5, tensorboard=False) as log:
+        log.write(6, {})
+    assert [row["step"] for row in read_rows(file)] == [0, 5, 6]
+
+
+def test_a_damaged_row_is_named(tmp_path: Path):
+    file = tmp_path / "metrics.jsonl"
+    for damaged in ("nonsense", "[]", "{}", '{"x": 1}'):
+        file.write_text(f'{{"step": 0}}\n{damaged}\n{{"step": 2}}\n')
+        with pytest.raises(
+            DataError, match=r"metrics\.jsonl: record 2: is no row of metrics; delete the row"
+        ):
+            MetricLog(tmp_path, resume_step=5, tensorboard=False)
+
+
+def test_a_fresh_log_replaces_an_old_one(tmp_path: Path):
+    for value in (1, 2):
+        with MetricLog(tmp_path, tensorboard=False) as log:
+            log.write(0, {"x": value})
+    assert [row["x"] for row in read_rows(tmp_path / "metrics.jsonl")] == [2]
+
+
+def test_tensorboard_events(tmp_path: Path):
+    pytest.importorskip("tensorboardX")
+    from tensorboardX.proto.event_pb2 import Event
+
+    with MetricLog(tmp_path) as log:
+        log.write(7, {"loss": 0.25}, prefix="train")
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    data, found = file.read_bytes(), []
+    while data:  # a TFRecord: length, its CRC, the payload, its CRC
+        size = int.from_bytes(data[:8], "little")
+        event = Event.FromString(data[12 : 12 + size])
+        found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
+        data = data[16 + size :]
+    assert found == [(7, "train/loss", 0.25)]
