@@ -1,0 +1,145 @@
+"""Protocol-buffer messages of the Waymo Open Motion Dataset and of tf.Example, built when first used.
+
+Only what drivax reads is declared (field numbers of ``waymo_open_dataset/protos/{scenario,map}.proto`` and
+``tensorflow/core/example``); undeclared fields, camera tokens and compressed lidar among them, are skipped. Enums
+are declared as int32, which is the same on the wire, so that values of later versions are kept. The messages live
+in a descriptor pool of their own and so never clash with an installed ``waymo-open-dataset`` package.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from drivax.errors import UsageError
+
+#: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
+_Field = tuple[str, int, str]
+
+_SCENARIO: dict[str, tuple[_Field, ...]] = {
+    "Scenario": (
+        ("timestamps_seconds", 1, "double*"),
+        ("tracks", 2, "Track*"),
+        ("objects_of_interest", 4, "int32*"),
+        ("scenario_id", 5, "string"),
+        ("sdc_track_index", 6, "int32"),
+        ("dynamic_map_states", 7, "DynamicMapState*"),
+        ("map_features", 8, "MapFeature*"),
+        ("current_time_index", 10, "int32"),
+        ("tracks_to_predict", 11, "RequiredPrediction*"),
+    ),
+    "RequiredPrediction": (("track_index", 1, "int32"), ("difficulty", 2, "int32")),
+    "Track": (("id", 1, "int32"), ("object_type", 2, "int32"), ("states", 3, "ObjectState*")),
+    "ObjectState": (
+        ("center_x", 2, "double"),
+        ("center_y", 3, "double"),
+        ("center_z", 4, "double"),
+        ("length", 5, "float"),
+        ("width", 6, "float"),
+        ("height", 7, "float"),
+        ("heading", 8, "float"),
+        ("velocity_x", 9, "float"),
+        ("velocity_y", 10, "float"),
+        ("valid", 11, "bool"),
+    ),
+    "DynamicMapState": (("lane_states", 1, "LaneState*"),),
+    "LaneState": (("lane", 1, "int64"), ("state", 2, "int32"), ("stop_point", 3, "MapPoint")),
+    "MapPoint": (("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")),
+    "MapFeature": (
+        ("id", 1, "int64"),
+        ("lane", 3, "Lane?"),
+        ("road_line", 4, "Polyline?"),
+        ("road_edge", 5, "Polyline?"),
+        ("stop_sign", 7, "StopSign?"),
+        ("crosswalk", 8, "Polygon?"),
+        ("speed_bump", 9, "Polygon?"),
+        ("driveway", 10, "Polygon?"),
+    ),
+    "Lane": (
+        ("speed_limit_mph", 1, "double"),
+        ("type", 2, "int32"),
+        ("interpolating", 3, "bool"),
+        ("polyline", 8, "MapPoint*"),
+        ("entry_lanes", 9, "int64*"),
+        ("exit_lanes", 10, "int64*"),
+        ("left_neighbors", 11, "LaneNeighbor*"),
+        ("right_neighbors", 12, "LaneNeighbor*"),
+    ),
+    "LaneNeighbor": (("feature_id", 1, "int64"),),
+    "Polyline": (("type", 1, "int32"), ("polyline", 2, "MapPoint*")),
+    "StopSign": (("lane", 1, "int64*"), ("position", 2, "MapPoint")),
+    "Polygon": (("polygon", 1, "MapPoint*"),),
+}
+
+#: A map field is on the wire a repeated message of key and value; lists are packed or not, parsers take both.
+_EXAMPLE: dict[str, tuple[_Field, ...]] = {
+    "Example": (("features", 1, "Features"),),
+    "Features": (("feature", 1, "Entry*"),),
+    "Entry": (("key", 1, "string"), ("value", 2, "Feature")),
+    "Feature": (
+        ("bytes_list", 1, "BytesList?"),
+        ("float_list", 2, "FloatList?"),
+        ("int64_list", 3, "Int64List?"),
+    ),
+    "BytesList": (("value", 1, "bytes*"),),
+    "FloatList": (("value", 1, "float*"),),
+    "Int64List": (("value", 1, "int64*"),),
+}
+
+
+def scenario_class() -> Any:
+    """The message class of a WOMD ``Scenario``.
+
+    Raises:
+        UsageError: protobuf is not installed.
+    """
+    return _classes("drivax.womd", "Scenario")
+
+
+def example_class() -> Any:
+    """The message class of a ``tf.Example``, its map of features declared as repeated entries.
+
+    Raises:
+        UsageError: protobuf is not installed.
+    """
+    return _classes("drivax.example", "Example")
+
+
+def parse(message_class: Any, payload: bytes) -> Any | None:
+    """The message in a payload, or None where the payload is not such a message."""
+    from google.protobuf.message import DecodeError
+
+    try:
+        return message_class.FromString(payload)
+    except DecodeError:
+        return None
+
+
+@cache
+def _classes(package: str, name: str) -> Any:
+    try:
+        from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    except ImportError as error:
+        raise UsageError("reading WOMD needs protobuf", cure="pip install 'drivax[womd]'") from error
+    messages = _SCENARIO if name == "Scenario" else _EXAMPLE
+    file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto2")
+    for message_name, fields in messages.items():
+        _declare(file.message_type.add(name=message_name), fields, package)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}"))
+
+
+def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
+    if any(kind.endswith("?") for _, _, kind in fields):
+        message.oneof_decl.add(name="kind")
+    for name, number, kind in fields:
+        field = message.field.add(name=name, number=number)
+        field.label = field.LABEL_REPEATED if kind.endswith("*") else field.LABEL_OPTIONAL
+        if kind.endswith("?"):
+            field.oneof_index = 0
+        plain = kind.rstrip("*?")
+        if plain[0].isupper():
+            field.type, field.type_name = field.TYPE_MESSAGE, f".{package}.{plain}"
+        else:
+            field.type = getattr(field, f"TYPE_{plain.upper()}")

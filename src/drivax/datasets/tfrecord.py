@@ -1,0 +1,125 @@
+"""TFRecord files without TensorFlow: framing with both checksums tested.
+
+A record is ``uint64 length | uint32 masked CRC of the length | payload | uint32 masked CRC of the payload``, all
+little-endian; the mask rotates a CRC-32C right by 15 bits and adds 0xA282EAD8 (TensorFlow, ``record_writer.h``).
+There is no file header, no index and no count.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from drivax.errors import DataError, UsageError
+
+_HEADER_BYTES, _FOOTER_BYTES = 12, 4
+_MASK = 0xA282EAD8
+#: Protocol buffers end here; a longer record is damage, whatever its checksum says.
+_LONGEST_BYTES = 2**31 - 1
+_FETCH = "copy or download the file again"
+
+
+def masked(crc: int) -> int:
+    """TFRecord's mask of a CRC-32C: rotate right by 15 bits, add a constant, modulo 2**32."""
+    return (((crc >> 15) | (crc << 17)) + _MASK) & 0xFFFFFFFF
+
+
+def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
+    """Record numbers (from 0) with their payloads, or with the error that stands in a record's place.
+
+    Records after one whose payload is damaged are read; where a length is damaged or the file ends early, nothing
+    after it can be found and the iteration ends with the error.
+
+    Args:
+        path: The file.
+
+    Yields:
+        (record number, payload or error). An empty file yields one error.
+
+    Raises:
+        DataError: The file cannot be opened.
+        UsageError: google-crc32c is not installed.
+    """
+    crc32c = _crc32c()
+    path = Path(path)
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise DataError(error.strerror or "cannot be opened", file=path, cure="check the path") from error
+    with file:
+        size = os.fstat(file.fileno()).st_size
+        if size == 0:
+            yield 0, DataError("the file is empty", file=path, record=0, cure=_FETCH)
+        number = 0
+        while file.tell() < size:
+            record = _read_one(file, size, crc32c)
+            lost = isinstance(record, DataError) and record.record == _LOST
+            if isinstance(record, DataError):
+                record = DataError(record.problem, file=path, record=number, cure=record.cure)
+            yield number, record
+            if lost:
+                return
+            number += 1
+
+
+#: Marks an error after which the next record cannot be found.
+_LOST = "lost"
+
+
+def _read_one(file: BinaryIO, size: int, crc32c: Callable[[bytes], int]) -> bytes | DataError:
+    start = file.tell()
+    header = file.read(_HEADER_BYTES)
+    if len(header) < _HEADER_BYTES:
+        return DataError(
+            f"truncated: {len(header)} bytes where a record's header of {_HEADER_BYTES} should be",
+            record=_LOST,
+            cure=_FETCH,
+        )
+    length, length_crc = struct.unpack("<QI", header)
+    if masked(crc32c(header[:8])) != length_crc:
+        return _bad_length(header, start)
+    left = size - file.tell()
+    if length > _LONGEST_BYTES or length + _FOOTER_BYTES > left:
+        return DataError(
+            f"truncated: the record needs {length + _FOOTER_BYTES} bytes, the file has {left} left",
+            record=_LOST,
+            cure=_FETCH,
+        )
+    payload = file.read(length)
+    footer = file.read(_FOOTER_BYTES)
+    if len(footer) < _FOOTER_BYTES:
+        return DataError("the file became shorter while it was read", record=_LOST, cure=_FETCH)
+    if masked(crc32c(payload)) != struct.unpack("<I", footer)[0]:
+        return DataError("the payload is damaged (checksum mismatch)", cure=_FETCH)
+    return payload
+
+
+def _bad_length(header: bytes, start: int) -> DataError:
+    if start == 0 and header[:2] == b"\x1f\x8b":
+        return DataError("the file is gzip-compressed", record=_LOST, cure="decompress it first (gunzip)")
+    if start == 0 and header[0] == 0x78 and int.from_bytes(header[:2], "big") % 31 == 0:
+        return DataError("the file is zlib-compressed", record=_LOST, cure="decompress it first (zlib)")
+    if start == 0:
+        return DataError(
+            "not a TFRecord file, or damaged (checksum mismatch in the first record's length)",
+            record=_LOST,
+            cure=f"give an uncompressed TFRecord; if it should be one, {_FETCH}",
+        )
+    return DataError(
+        "the length is damaged (checksum mismatch), so the rest of the file cannot be read",
+        record=_LOST,
+        cure=_FETCH,
+    )
+
+
+def _crc32c() -> Callable[[bytes], int]:
+    try:
+        import google_crc32c
+    except ImportError as error:
+        raise UsageError(
+            "reading TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'"
+        ) from error
+    return google_crc32c.value

@@ -1,0 +1,63 @@
+"""From real files to a set and its counts, through the program as a user starts it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from drivax.scenario.schema import Flag
+from drivax.scenario.store import ScenarioSet
+
+#: Counted by an independent reader (shared/data/README.md).
+COUNTS = {
+    "637f20cafde22ff8": {
+        "steps": 91, "tracks": 83, "tracks_valid_now": 50, "map_points": 19_636, "lights": 12,
+        "map_features": {
+            "lane": 199, "road_line": 59, "road_edge": 28, "crosswalk": 4, "speed_bump": 3, "stop_sign": 8,
+            "driveway": 0,
+        },
+    },
+    "a3bb37c25ce56418": {"steps": 91, "tracks": 128, "tracks_valid_now": 73, "map_points": 20_000, "lights": 21},
+}  # fmt: skip
+
+
+def drivax(*arguments) -> str:
+    command = [sys.executable, "-m", "drivax", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def converted(real_data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("real") / "set"
+    said = drivax("convert", real_data / "womd", out)
+    assert ": 2 scenarios from 2 files" in said and "0 records skipped" in said
+    return out
+
+
+def test_counts_are_those_of_the_source(converted):
+    scenarios = {s["scenario_id"]: s for s in json.loads(drivax("inspect", converted, "--json"))["scenarios"]}
+    assert set(scenarios) == set(COUNTS)
+    for name, counts in COUNTS.items():
+        assert {key: scenarios[name][key] for key in counts} == counts
+    assert sum(scenarios["a3bb37c25ce56418"]["map_features"].values()) == 254
+
+
+def test_flags_tell_what_the_format_lacks(converted):
+    by_id = {scenario.id: scenario for scenario in ScenarioSet.open(converted)}
+    proto, example = by_id["637f20cafde22ff8"].has, by_id["a3bb37c25ce56418"].has
+    assert Flag.SPEED_LIMITS in proto and Flag.LANE_GRAPH in proto and Flag.CHAINED_GRAPH not in proto
+    assert Flag.TRUNCATED_MAP in example and Flag.SPEED_LIMITS not in example
+    assert Flag.LIGHTS in proto & example and Flag.NO_FUTURE not in proto | example
+
+
+def test_every_track_of_the_proto_file_is_placed(converted):
+    scenario = next(s for s in ScenarioSet.open(converted) if s.id == "637f20cafde22ff8")
+    placed = int(scenario.agent_valid.any(axis=0).sum() + scenario.parked_valid.any(axis=0).sum())
+    assert placed == 83
+    now = int(scenario.agent_valid[10].sum() + scenario.parked_valid[10].sum())
+    assert now == 50
