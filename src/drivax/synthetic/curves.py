@@ -1,0 +1,200 @@
+"""Smooth plane curves from which roads are made: positions with exact tangent headings, about 0.5 m apart."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.geometry.angles import wrap
+
+#: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
+STEP_M = 0.5
+#: Below this change of heading two poses are joined by a quintic, above by a fillet.
+_FILLET_ANGLE = math.radians(25.0)
+#: A straight remainder shorter than this is left out, m.
+_SHORTEST_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A place and a direction: metres and radians CCW from +x."""
+
+    x: float
+    y: float
+    heading: float
+
+    def ahead(self, metres: float) -> Pose:
+        """The pose this far straight ahead."""
+        return Pose(
+            self.x + metres * math.cos(self.heading), self.y + metres * math.sin(self.heading), self.heading
+        )
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A sampled curve: points in metres and the tangent's heading in radians, unwrapped (no jumps of 2 pi)."""
+
+    xy: Float64[np.ndarray, "point 2"]
+    heading: Float64[np.ndarray, " point"]
+
+    @property
+    def arc_m(self) -> Float64[np.ndarray, " point"]:
+        """Distance along the chords from the first point to each point, m."""
+        steps = np.hypot(*np.diff(self.xy, axis=0).T)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def start(self) -> Pose:
+        """Where the curve begins."""
+        return Pose(float(self.xy[0, 0]), float(self.xy[0, 1]), float(self.heading[0]))
+
+    @property
+    def end(self) -> Pose:
+        """Where the curve ends."""
+        return Pose(float(self.xy[-1, 0]), float(self.xy[-1, 1]), float(self.heading[-1]))
+
+    def shifted(self, left_m: float) -> Curve:
+        """The parallel curve this far to the left (right where negative)."""
+        normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=-1)
+        return Curve(self.xy + left_m * normal, self.heading)
+
+    def reversed(self) -> Curve:
+        """The same points in the other direction."""
+        return Curve(self.xy[::-1].copy(), self.heading[::-1] + math.pi)
+
+    def piece(self, first: int, last: int) -> Curve:
+        """The samples ``first`` to ``last``, both included."""
+        return Curve(self.xy[first : last + 1], self.heading[first : last + 1])
+
+
+def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, start: Pose) -> Curve:
+    """Integrates curvature (1/m, one value per sample) to a curve; the midpoint rule, second order in the step."""
+    turns = (curvature[1:] + curvature[:-1]) * (step_m / 2)
+    heading = start.heading + np.concatenate([[0.0], np.cumsum(turns)])
+    middle = (heading[1:] + heading[:-1]) / 2
+    steps = step_m * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    origin = np.array([[start.x, start.y]])
+    return Curve(np.concatenate([origin, origin + np.cumsum(steps, axis=0)]), heading)
+
+
+def straight(start: Pose, length_m: float) -> Curve:
+    """A straight line."""
+    count = max(2, math.ceil(length_m / STEP_M) + 1)
+    return from_curvature(np.zeros(count), length_m / (count - 1), start)
+
+
+def joined(*curves: Curve) -> Curve:
+    """Curves one after the other; each begins where the one before ends, and that point is kept once."""
+    xy, heading = [curves[0].xy], [curves[0].heading]
+    for curve in curves[1:]:
+        # Headings continue without a jump of 2 pi, so that they can be interpolated.
+        jump = heading[-1][-1] - curve.heading[0]
+        xy.append(curve.xy[1:])
+        heading.append(curve.heading[1:] + 2 * math.pi * round(jump / (2 * math.pi)))
+    return Curve(np.concatenate(xy), np.concatenate(heading))
+
+
+def resampled(curve: Curve, step_m: float) -> Curve:
+    """The curve at equal distances of about ``step_m`` along its chords, both ends kept."""
+    arc = curve.arc_m
+    count = max(2, round(float(arc[-1]) / step_m) + 1)
+    at = np.linspace(0.0, arc[-1], count)
+    xy = np.stack([np.interp(at, arc, curve.xy[:, 0]), np.interp(at, arc, curve.xy[:, 1])], axis=-1)
+    return Curve(xy, np.interp(at, arc, curve.heading))
+
+
+def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Curve:
+    """A bend whose curvature rises, holds and falls linearly (clothoid, arc, clothoid).
+
+    Args:
+        start: Where the bend begins.
+        angle: Change of heading, rad, positive to the left.
+        tangent_m: Distance from the start to the corner where the tangents of both ends meet, m.
+        easing: Share of the length in each of the two clothoids.
+
+    Returns:
+        The bend; it ends ``tangent_m`` beyond the corner in the new direction.
+    """
+
+    def shape(count: int, length_m: float, at: Pose) -> Curve:
+        share = np.linspace(0.0, 1.0, count)
+        ramp = np.minimum(1.0, np.minimum(share, 1.0 - share) / easing)
+        curvature = ramp * (angle / float(np.trapezoid(ramp, share)) / length_m)
+        return from_curvature(curvature, length_m / (count - 1), at)
+
+    unit = shape(513, 1.0, Pose(0.0, 0.0, 0.0))
+    unit_tangent = math.hypot(*unit.xy[-1]) / 2 / math.cos(angle / 2)
+    length = tangent_m / unit_tangent
+    # Integrate eight times finer than kept: the end then meets the tangent point within a millimetre.
+    count = 8 * max(4, math.ceil(length / STEP_M))
+    fine = shape(count + 1, length, start)
+    return Curve(fine.xy[::8], fine.heading[::8])
+
+
+def quintic(start: Pose, end: Pose) -> Curve:
+    """The fifth-order Hermite curve with zero curvature at both poses; for nearly parallel poses."""
+    chord = math.hypot(end.x - start.x, end.y - start.y)
+    t = np.linspace(0.0, 1.0, max(8, math.ceil(chord / STEP_M) * 4))[:, None]
+    p0, p1 = np.array([start.x, start.y]), np.array([end.x, end.y])
+    d0 = chord * np.array([math.cos(start.heading), math.sin(start.heading)])
+    d1 = chord * np.array([math.cos(end.heading), math.sin(end.heading)])
+    step = 10 * t**3 - 15 * t**4 + 6 * t**5
+    step_rate = 30 * t**2 - 60 * t**3 + 30 * t**4
+    first, first_rate = t - 6 * t**3 + 8 * t**4 - 3 * t**5, 1 - 18 * t**2 + 32 * t**3 - 15 * t**4
+    last, last_rate = -4 * t**3 + 7 * t**4 - 3 * t**5, -12 * t**2 + 28 * t**3 - 15 * t**4
+    xy = p0 + (p1 - p0) * step + d0 * first + d1 * last
+    rate = (p1 - p0) * step_rate + d0 * first_rate + d1 * last_rate
+    heading = start.heading + wrap(np.arctan2(rate[:, 1], rate[:, 0]) - start.heading)
+    return resampled(Curve(xy, heading), STEP_M)
+
+
+def connected(start: Pose, end: Pose) -> Curve:
+    """A smooth way from one pose to another: a fillet of the two tangents, or a quintic where they hardly turn.
+
+    Raises:
+        ValueError: When the tangents do not meet ahead of the start and behind the end.
+    """
+    angle = float(wrap(end.heading - start.heading))
+    if abs(angle) < _FILLET_ANGLE:
+        return quintic(start, end)
+    dx, dy = end.x - start.x, end.y - start.y
+    before = (dx * math.sin(end.heading) - dy * math.cos(end.heading)) / math.sin(angle)
+    after = (dy * math.cos(start.heading) - dx * math.sin(start.heading)) / math.sin(angle)
+    if min(before, after) < 1.0:
+        raise ValueError("the poses cannot be joined by one bend")
+    tangent = min(before, after)
+    parts = [turn(start.ahead(before - tangent), angle, tangent)]
+    if before - tangent > _SHORTEST_M:
+        parts.insert(0, straight(start, before - tangent))
+    if after - tangent > _SHORTEST_M:
+        parts.append(straight(parts[-1].end, after - tangent))
+    return resampled(joined(*parts), STEP_M)
+
+
+def winding(
+    rng: np.random.Generator, length_m: float, *, max_curvature: float, max_turn: float, start: Pose
+) -> Curve:
+    """A road that bends left and right at random: curvature is linear between knots 35 to 90 m apart.
+
+    Args:
+        rng: Source of chance.
+        length_m: Length, m.
+        max_curvature: Largest curvature, 1/m.
+        max_turn: Largest difference between any two headings, rad; below pi the curve cannot meet itself.
+        start: Where it begins.
+    """
+    knots, values = [0.0], [0.0]
+    while knots[-1] < length_m:
+        knots.append(knots[-1] + rng.uniform(35.0, 90.0))
+        # Two knots in three bend the other way than the last one did: S-curves are common.
+        sign = -np.sign(values[-1]) if rng.random() < 2 / 3 and values[-1] else rng.choice([-1.0, 1.0])
+        values.append(float(sign) * max_curvature * float(rng.uniform(0.15, 1.0)))
+    count = math.ceil(length_m / STEP_M) + 1
+    at = np.arange(count) * STEP_M
+    curvature = np.interp(at, knots, values)
+    turned = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) * STEP_M / 2)])
+    excess = float(np.ptp(turned)) / max_turn
+    return from_curvature(curvature / max(1.0, excess), STEP_M, start)

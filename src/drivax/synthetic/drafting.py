@@ -1,0 +1,48 @@
+"""The table on which a family draws a road network: lanes are added and linked, then frozen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivax.scenario.schema import RoadKind
+from drivax.synthetic.curves import Curve
+from drivax.synthetic.roads import Lane, Line
+
+
+@dataclass
+class Draft:
+    """Lanes and lines on their way into a :class:`~drivax.synthetic.roads.RoadNetwork`."""
+
+    lanes: list[Lane] = field(default_factory=list)
+    edges: list[Line] = field(default_factory=list)
+    markings: list[Line] = field(default_factory=list)
+    crosswalks: list[Line] = field(default_factory=list)
+
+    def lane(self, curve: Curve, width_m: float, limit_mps: float, *, connector: bool = False) -> int:
+        """Adds a lane and returns its index."""
+        self.lanes.append(Lane(curve, width_m, limit_mps, connector=connector))
+        return len(self.lanes) - 1
+
+    def link(self, before: int, after: int) -> None:
+        """Traffic may go on from lane ``before`` to lane ``after``."""
+        a, b = self.lanes[before], self.lanes[after]
+        self.lanes[before] = replace(a, successors=(*a.successors, after))
+        self.lanes[after] = replace(b, predecessors=(*b.predecessors, before))
+
+    def beside(self, left: int, right: int) -> None:
+        """The two lanes run side by side in the same direction."""
+        self.lanes[left] = replace(self.lanes[left], right=right)
+        self.lanes[right] = replace(self.lanes[right], left=left)
+
+    def mark(self, kind: RoadKind, curve: Curve) -> None:
+        """Adds a marking of about 1 m sampling along a curve."""
+        self.markings.append(Line(kind, curve.xy[::2]))
+
+
+def ring(*curves: Curve) -> np.ndarray:
+    """The points of curves put one after the other as a closed ring, about 1 m apart, none repeated."""
+    points = np.concatenate([np.concatenate([curve.xy[:-1:2], curve.xy[-1:]]) for curve in curves])
+    far = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > 1e-6
+    return points[far]

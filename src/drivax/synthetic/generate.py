@@ -1,0 +1,191 @@
+"""Scenario sets of the built-in world: drawn and assembled in worker processes, written in order by one.
+
+The bytes of a set depend on the seed and the number of scenarios only, not on the number of workers. Nothing here
+imports JAX, so that workers start in a fraction of a second; an audit that needs it is handed in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import signal
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drivax.errors import DrivaxError, UsageError
+from drivax.scenario.assemble import assemble
+from drivax.scenario.schema import CAPACITIES, Scenario
+from drivax.scenario.store import ScenarioWriter
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
+
+#: Scenarios that are audited together, and that a worker draws at a time.
+_BATCH, _CHUNK = 64, 4
+
+#: Called with (scenarios done, scenarios).
+Progress = Callable[[int, int], None]
+#: Fills the audit of scenarios: one dictionary each.
+Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Generation:
+    """How to generate.
+
+    Attributes:
+        workers: Processes; with 1 everything happens in this one.
+        capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
+        overwrite: Replace an existing scenario set.
+        world: What the world is like.
+    """
+
+    workers: int = 1
+    capacity: str = "default"
+    overwrite: bool = False
+    world: WorldConfig = field(default_factory=WorldConfig)
+
+    def check(self) -> None:
+        """Refuses options that cannot be meant.
+
+        Raises:
+            UsageError: The first of them.
+        """
+        if self.workers < 1:
+            raise UsageError(f"workers is {self.workers}", cure="use 1 or more")
+        if self.capacity not in CAPACITIES:
+            raise UsageError(
+                f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
+            )
+
+
+@dataclass(frozen=True)
+class FamilyCount:
+    """How the draws of one family went: scenarios kept, and attempts thrown away by cause."""
+
+    kept: int
+    rejected: dict[str, int]
+
+    @property
+    def rejection_rate(self) -> float:
+        """Share of attempts that were thrown away."""
+        thrown = sum(self.rejected.values())
+        return thrown / (thrown + self.kept)
+
+
+@dataclass(frozen=True)
+class GeneratedSet:
+    """What a generation did: the set, its size, the wall time in seconds, and the counts per family."""
+
+    path: Path
+    scenarios: int
+    seconds: float
+    families: dict[str, FamilyCount]
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    scenario: Scenario
+    family: str
+    rejected: dict[str, int]
+
+
+def generate(
+    out: str | Path,
+    scenarios: int,
+    seed: int = 0,
+    options: Generation | None = None,
+    progress: Progress | None = None,
+    audit: Audit | None = None,
+) -> GeneratedSet:
+    """Generates a scenario set.
+
+    Args:
+        out: The scenario set to write; it appears when it is complete.
+        scenarios: How many.
+        seed: Scenario ``i`` of a seed is the same in every set.
+        options: How.
+        progress: Called after every scenario.
+        audit: Called in this process with batches of scenarios; what it returns is stored with them.
+
+    Raises:
+        UsageError: Options that cannot be meant, or ``out`` exists.
+    """
+    options = options or Generation()
+    options.check()
+    if scenarios < 1:
+        raise UsageError(f"scenarios is {scenarios}", cure="use 1 or more")
+    if seed < 0:
+        raise UsageError(f"seed is {seed}", cure="use 0 or more")
+    begin = time.monotonic()
+    source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios}
+    source["config"] = dataclasses.asdict(options.world)
+    kept: Counter[str] = Counter()
+    rejected: dict[str, Counter[str]] = {}
+    batch: list[Scenario] = []
+    with (
+        ScenarioWriter(out, CAPACITIES[options.capacity], source, overwrite=options.overwrite) as writer,
+        closing(_drawn(scenarios, seed, options)) as drawn,
+    ):
+        for done, one in enumerate(drawn, start=1):
+            kept[one.family] += 1
+            rejected.setdefault(one.family, Counter()).update(one.rejected)
+            batch.append(one.scenario)
+            if len(batch) == _BATCH or done == scenarios:
+                _write(writer, batch, audit)
+                batch = []
+            if progress is not None:
+                progress(done, scenarios)
+    families = {name: FamilyCount(kept[name], dict(rejected[name])) for name in sorted(kept)}
+    return GeneratedSet(Path(out), scenarios, time.monotonic() - begin, families)
+
+
+def _write(writer: ScenarioWriter, batch: list[Scenario], audit: Audit | None) -> None:
+    findings = [{} for _ in batch] if audit is None else audit(batch)
+    for scenario, finding in zip(batch, findings, strict=True):
+        writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
+
+
+def _draw(first: int, last: int, seed: int, options: Generation) -> list[_Drawn]:
+    """Scenarios ``first`` to ``last - 1``; runs in workers."""
+    capacity, result = CAPACITIES[options.capacity], []
+    for index in range(first, last):
+        one = generate_one(seed, index, options.world)
+        scenario = assemble(one.recording, capacity)
+        scenario = dataclasses.replace(scenario, tags={**scenario.tags, **one.tags})
+        result.append(_Drawn(scenario, one.family, one.rejected))
+    return result
+
+
+def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, None, None]:
+    """All scenarios in order."""
+    spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
+    if options.workers == 1:
+        for first, last in spans:
+            yield from _draw(first, last, seed, options)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(options.workers, len(spans)), context, initializer=_ignore_interrupts)
+    waiting: deque[Future[list[_Drawn]]] = deque()
+    try:
+        for first, last in spans:
+            waiting.append(pool.submit(_draw, first, last, seed, options))
+            # A few chunks ahead keep everyone busy; more would only fill memory.
+            if len(waiting) > 3 * options.workers:
+                yield from waiting.popleft().result()
+        while waiting:
+            yield from waiting.popleft().result()
+    except BrokenProcessPool as error:
+        raise DrivaxError("a worker process was killed", cure="try fewer --workers") from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ignore_interrupts() -> None:
+    """Leaves Ctrl-C to the parent, which stops the workers in order."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

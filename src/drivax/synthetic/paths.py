@@ -1,0 +1,226 @@
+"""The way that one vehicle drives: a sequence of lanes as one smooth curve, and where on it each lane lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from drivax.synthetic.curves import STEP_M, Curve, joined, resampled
+from drivax.synthetic.roads import RoadNetwork
+
+#: Lanes that a vehicle can be on at once: its own, and those that need the same space at this place.
+SLOTS = 3
+_NOWHERE = -1
+#: Length over which curvature is averaged before it limits the speed, m.
+_CURVATURE_WINDOW_M = 3.0
+
+
+@dataclass(frozen=True)
+class LaneSpan:
+    """A lane on a path.
+
+    Attributes:
+        lane: Its index.
+        begin_m: Path position of the lane's start, m; below zero where the path begins inside the lane.
+        scale: Path metres per lane metre.
+        from_m, until_m: The range of path positions of the driver's centre in which others on this lane matter.
+    """
+
+    lane: int
+    begin_m: float
+    scale: float
+    from_m: float = -math.inf
+    until_m: float = math.inf
+
+
+@dataclass(frozen=True)
+class Path:
+    """A curve to drive along, sampled every ``STEP_M`` (nearly: equal steps that end at the end).
+
+    Attributes:
+        curve: Where the vehicle's centre goes; its heading is the vehicle's.
+        step_m: Distance between samples, m.
+        curvature: Curvature, 1/m, averaged over 3 m.
+        limit_mps: Speed limit of the lane there.
+        spans: The lanes in order of travel.
+        lane, lane_m: Which lanes the vehicle is on when its centre is at a sample (-1: no more), and where, m.
+    """
+
+    curve: Curve
+    step_m: float
+    curvature: Float64[np.ndarray, " point"]
+    limit_mps: Float64[np.ndarray, " point"]
+    spans: tuple[LaneSpan, ...]
+    lane: Int64[np.ndarray, "point slot"]
+    lane_m: Float64[np.ndarray, "point slot"]
+
+    @property
+    def length_m(self) -> float:
+        """Length, m."""
+        return self.step_m * (len(self.curve.xy) - 1)
+
+
+@dataclass(frozen=True)
+class LaneChange:
+    """A planned change from one lane to its neighbour, both in sections that run side by side.
+
+    Attributes:
+        section: Index in the lane sequence of the lane that is left; the next one in the sequence is beside it.
+        begin_m: Where on that lane the change begins, m.
+        length_m: Distance over which it is carried out, m.
+    """
+
+    section: int
+    begin_m: float
+    length_m: float
+
+
+def random_lanes(network: RoadNetwork, first: int, rng: np.random.Generator) -> tuple[int, ...]:
+    """A random way from a lane to the end of the map; where lanes fork each way is as likely."""
+    lanes = [first]
+    while network.lanes[lanes[-1]].successors:
+        lanes.append(int(rng.choice(network.lanes[lanes[-1]].successors)))
+    return tuple(lanes)
+
+
+def lane_path(
+    network: RoadNetwork, lanes: tuple[int, ...], sway: Sway, change: LaneChange | None = None
+) -> Path:
+    """The path along a sequence of lanes, each of which follows the one before.
+
+    Args:
+        network: The roads.
+        lanes: Lane indices in order; with a lane change the lane that is left is followed by its neighbour.
+        sway: How the driver strays from the centre.
+        change: The lane change, if there is one.
+    """
+    pieces, spans, at = [], [], 0.0
+    for place, lane in enumerate(lanes):
+        if change is not None and place == change.section + 1:
+            continue
+        curve = network.lanes[lane].curve
+        if change is not None and place == change.section:
+            curve, crossing = _changed(curve, network.lanes[lanes[place + 1]].curve, change)
+            length = float(curve.arc_m[-1])
+            spans += [
+                _span(network, lane, at, length, until_m=at + crossing[1]),
+                _span(network, lanes[place + 1], at, length, from_m=at + crossing[0]),
+            ]
+        else:
+            length = network.lanes[lane].length_m
+            spans.append(LaneSpan(lane, at, 1.0))
+        pieces.append(curve)
+        at += length
+    middle = joined(*pieces) if len(pieces) > 1 else pieces[0]
+    return _finished(network, resampled(sway.applied(middle), STEP_M), at, spans)
+
+
+def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
+    return LaneSpan(lane, at, length / network.lanes[lane].length_m, **when)
+
+
+def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
+    """From curve ``a`` to the parallel ``b`` by a quintic step; also where both lanes begin and cease to matter."""
+    count = max(len(a.xy), len(b.xy))
+    a, b = (resampled(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
+    arc = a.arc_m
+    t = np.clip((arc - change.begin_m) / change.length_m, 0.0, 1.0)[:, None]
+    weight = t**3 * (10 - 15 * t + 6 * t**2)
+    xy = a.xy + weight * (b.xy - a.xy)
+    rate = np.gradient(xy, axis=0)
+    heading = a.heading + _turned(np.arctan2(rate[:, 1], rate[:, 0]) - a.heading)
+    # The ends are exactly those of the lanes: a one-sided difference would bend the joint.
+    heading[0], heading[-1] = (
+        a.heading[0],
+        b.heading[-1] + 2 * math.pi * round((a.heading[-1] - b.heading[-1]) / (2 * math.pi)),
+    )
+    end = change.begin_m + change.length_m
+    return Curve(xy, heading), (max(0.0, change.begin_m - 15.0), end - 0.3 * change.length_m)
+
+
+def _turned(angle: Float64[np.ndarray, " point"]) -> Float64[np.ndarray, " point"]:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
+    """Adds curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
+    stretch = float(curve.arc_m[-1]) / length
+    step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
+    spans = [
+        replace(
+            span,
+            begin_m=span.begin_m * stretch,
+            scale=span.scale * stretch,
+            from_m=span.from_m * stretch,
+            until_m=span.until_m * stretch,
+        )
+        for span in spans
+    ]
+    at = step * np.arange(len(curve.xy))
+    lane = np.full((len(at), SLOTS), _NOWHERE)
+    lane_m = np.zeros((len(at), SLOTS))
+    used = np.zeros(len(at), int)
+    limit = np.full(len(at), math.inf)
+    for span in spans:
+        size = span.scale * network.lanes[span.lane].length_m
+        # Samples beyond the last lane's end by rounding still belong to it.
+        inside = (at >= span.begin_m - 1e-6) & (at < span.begin_m + size - 1e-6)
+        inside |= (span is spans[-1]) & (at >= span.begin_m)
+        limit[inside] = np.minimum(limit[inside], network.lanes[span.lane].limit_mps)
+        inside &= (at >= span.from_m) & (at <= span.until_m)
+        along = np.maximum(at - span.begin_m, 0.0) / span.scale
+        for name, here in _sharing(network, span.lane, along):
+            chosen = np.flatnonzero(inside & here & (used < SLOTS))
+            lane[chosen, used[chosen]] = name
+            lane_m[chosen, used[chosen]] = along[chosen]
+            used[chosen] += 1
+    window = max(1, round(_CURVATURE_WINDOW_M / step))
+    rate = np.gradient(curve.heading, step)
+    padded = np.pad(rate, (window // 2, window - 1 - window // 2), mode="edge")
+    curvature = np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
+    return Path(curve, step, curvature, limit, tuple(spans), lane, lane_m)
+
+
+def _sharing(
+    network: RoadNetwork, lane: int, along: Float64[np.ndarray, " point"]
+) -> list[tuple[int, np.ndarray]]:
+    """The lanes that a vehicle on ``lane`` occupies too: those that leave the same lane, while still close."""
+    result = [(lane, np.ones(len(along), bool))]
+    for (a, b), shared in network.shared_m.items():
+        if a == lane:
+            # Half a vehicle's length longer: its tail is in the way after its centre has left.
+            result.append((b, along < shared + 2.5))
+    return result
+
+
+@dataclass(frozen=True)
+class Sway:
+    """How a driver strays from the lane's centre: a few slow waves, m, 1/m and rad."""
+
+    amplitude_m: tuple[float, ...] = ()
+    wave_per_m: tuple[float, ...] = ()
+    phase: tuple[float, ...] = ()
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, largest_m: float) -> Sway:
+        """Two waves 60 to 160 m long whose amplitudes add up to at most ``largest_m``."""
+        share = rng.uniform(0.2, 0.5, size=2) * largest_m
+        waves = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
+        phases = rng.uniform(0.0, 2 * math.pi, size=2)
+        return cls(tuple(share.tolist()), tuple(waves.tolist()), tuple(phases.tolist()))
+
+    def applied(self, curve: Curve) -> Curve:
+        """The curve that is really driven; its heading is its own tangent (to first order in the straying)."""
+        if not self.amplitude_m:
+            return curve
+        arc = curve.arc_m[:, None]
+        amplitude, wave = np.array(self.amplitude_m), np.array(self.wave_per_m)
+        angle = wave * arc + np.array(self.phase)
+        aside = np.sum(amplitude * np.sin(angle), axis=1)
+        slope = np.sum(amplitude * wave * np.cos(angle), axis=1)
+        normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
+        stretch = 1.0 - aside * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
+        return Curve(curve.xy + aside[:, None] * normal, curve.heading + np.arctan2(slope, stretch))

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from drivax.synthetic.curves import (
+    STEP_M,
+    Curve,
+    Pose,
+    connected,
+    from_curvature,
+    joined,
+    quintic,
+    resampled,
+    straight,
+    turn,
+    winding,
+)
+
+
+def tangent_error(curve: Curve) -> float:
+    """Largest difference between stored headings (mean of two samples) and the directions of the chords, rad."""
+    chord = np.arctan2(*np.diff(curve.xy, axis=0).T[::-1])
+    middle = (curve.heading[1:] + curve.heading[:-1]) / 2
+    return float(np.abs((chord - middle + math.pi) % (2 * math.pi) - math.pi).max())
+
+
+def test_constant_curvature_is_a_circle():
+    curve = from_curvature(np.full(201, 0.05), 0.1, Pose(3.0, -2.0, 0.7))
+    centre = np.array([3.0 - 20 * math.sin(0.7), -2.0 + 20 * math.cos(0.7)])
+    assert np.hypot(*(curve.xy - centre).T) == pytest.approx(20.0, abs=1e-3)
+    assert curve.heading[-1] == pytest.approx(0.7 + 20.0 * 0.05)
+
+
+@pytest.mark.parametrize("angle", [-2.0, -math.pi / 2, -0.5, 0.4, 1.2, math.pi / 2, 1.9])
+def test_a_turn_ends_one_tangent_beyond_the_corner(angle):
+    start = Pose(1.0, 2.0, 0.3)
+    curve = turn(start, angle, 12.0)
+    corner = start.ahead(12.0)
+    end = Pose(corner.x, corner.y, 0.3 + angle).ahead(12.0)
+    assert np.hypot(curve.end.x - end.x, curve.end.y - end.y) < 0.01
+    assert curve.end.heading == pytest.approx(end.heading, abs=1e-3)
+    assert tangent_error(curve) < 0.005
+    steps = np.diff(curve.arc_m)
+    assert steps.max() <= STEP_M + 1e-6 and np.ptp(steps) < 0.01
+
+
+@pytest.mark.parametrize("end", [Pose(30.0, 12.0, 1.3), Pose(14.0, -25.0, -1.7), Pose(40.0, 2.0, 0.2)])
+def test_connected_poses_meet_and_bend_smoothly(end):
+    curve = connected(Pose(0.0, 0.0, 0.0), end)
+    assert np.hypot(*curve.xy[0]) < 1e-6
+    assert np.hypot(curve.end.x - end.x, curve.end.y - end.y) < 0.01
+    assert curve.end.heading == pytest.approx(end.heading, abs=2e-3)
+    assert tangent_error(curve) < 0.01
+    # No kink: neighbouring headings differ by what a radius of 6 m needs at most.
+    assert np.abs(np.diff(curve.heading)).max() < STEP_M / 6
+
+
+def test_poses_that_one_bend_cannot_join_are_refused():
+    with pytest.raises(ValueError, match="one bend"):
+        connected(Pose(0.0, 0.0, 0.0), Pose(-10.0, 5.0, math.pi / 2))
+
+
+def test_a_quintic_begins_and_ends_straight():
+    curve = quintic(Pose(0.0, 0.0, 0.0), Pose(60.0, 3.5, 0.0))
+    lateral = curve.xy[:, 1]
+    t = curve.xy[:, 0] / 60
+    assert np.allclose(lateral, 3.5 * (10 * t**3 - 15 * t**4 + 6 * t**5), atol=0.02)
+    curvature = np.gradient(curve.heading, curve.arc_m)
+    assert abs(curvature[0]) < 1e-3 and abs(curvature[-1]) < 1e-3
+    # Peak curvature of the quintic step: 10 / sqrt(3) * height / length^2.
+    assert np.abs(curvature).max() == pytest.approx(10 / math.sqrt(3) * 3.5 / 3600, rel=0.05)
+
+
+def test_joining_keeps_one_point_per_joint_and_unwraps():
+    a = straight(Pose(0.0, 0.0, 3.1), 5.0)
+    b = straight(Pose(a.end.x, a.end.y, 3.1 - 2 * math.pi), 5.0)
+    both = joined(a, b)
+    assert len(both.xy) == len(a.xy) + len(b.xy) - 1
+    assert np.ptp(both.heading) < 1e-9
+    assert both.arc_m[-1] == pytest.approx(10.0)
+
+
+def test_shifting_and_reversing():
+    curve = from_curvature(np.full(101, 0.02), 0.5, Pose(0.0, 0.0, 0.0))
+    left = curve.shifted(3.0)
+    assert np.hypot(*(left.xy - curve.xy).T) == pytest.approx(3.0)
+    assert left.arc_m[-1] == pytest.approx(50.0 * (1 - 3 * 0.02), rel=1e-3)
+    back = left.reversed()
+    assert np.array_equal(back.xy[0], left.xy[-1])
+    assert math.cos(back.heading[0] - left.heading[-1]) == pytest.approx(-1.0)
+
+
+def test_resampling_keeps_ends_and_spacing():
+    curve = resampled(from_curvature(np.full(77, 0.03), 0.33, Pose(0.0, 0.0, 1.0)), 0.5)
+    steps = np.diff(curve.arc_m)
+    assert np.ptp(steps) < 1e-3 and abs(steps.mean() - 0.5) < 0.01
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_winding_roads_respect_their_limits(seed):
+    rng = np.random.default_rng(seed)
+    curve = winding(rng, 400.0, max_curvature=1 / 35, max_turn=2.0, start=Pose(0.0, 0.0, 0.0))
+    assert np.ptp(curve.heading) <= 2.0 + 1e-9
+    assert np.abs(np.diff(curve.heading)).max() <= STEP_M / 35 + 1e-9
+    assert curve.arc_m[-1] == pytest.approx(400.0, abs=0.6)
+    # It bends both ways somewhere in five draws, and never jumps in curvature.
+    assert np.abs(np.diff(curve.heading, 2)).max() < STEP_M**2 * (2 / 35) / 35 * 1.01

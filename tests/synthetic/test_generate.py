@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivax.cli.generate import Generate, run, summary
+from drivax.errors import UsageError
+from drivax.scenario.schema import Flag
+from drivax.scenario.store import ScenarioSet
+from drivax.synthetic.generate import FamilyCount, GeneratedSet, Generation, generate
+
+SCENARIOS = 7
+
+
+@pytest.fixture(scope="module")
+def one_worker(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sets") / "one"
+    progress = []
+    result = generate(path, SCENARIOS, 5, progress=lambda done, total: progress.append((done, total)))
+    return path, result, progress
+
+
+def test_any_number_of_workers_writes_the_same_bytes(one_worker, tmp_path):
+    path, result, _ = one_worker
+    two = generate(tmp_path / "two", SCENARIOS, 5, Generation(workers=2))
+    files = sorted(file.name for file in path.iterdir())
+    assert files == sorted(file.name for file in (tmp_path / "two").iterdir())
+    for name in files:
+        assert (path / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), name
+    assert two.families == result.families
+
+
+def test_counts_and_progress(one_worker):
+    _, result, progress = one_worker
+    assert progress == [(done, SCENARIOS) for done in range(1, SCENARIOS + 1)]
+    assert result.scenarios == SCENARIOS == sum(count.kept for count in result.families.values())
+    assert FamilyCount(3, {"a": 1, "b": 2}).rejection_rate == 0.5
+
+
+def test_the_set_is_what_was_asked_for(one_worker):
+    path, result, _ = one_worker
+    scenarios = ScenarioSet.open(path)
+    assert len(scenarios) == SCENARIOS
+    families = [entry["tags"]["family"] for entry in scenarios.entries]
+    assert {name: families.count(name) for name in families} == {
+        k: c.kept for k, c in result.families.items()
+    }
+    for index, entry in enumerate(scenarios.entries):
+        scenario = scenarios[index]
+        assert entry["tags"]["domain"] == "grid" and entry["tags"]["dataset"] == "drivax"
+        assert entry["overflow"] == {}
+        wanted = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
+        assert wanted in scenario.has and Flag.NO_FUTURE not in scenario.has
+        assert (Flag.LIGHTS in scenario.has) == (families[index] == "signalised_junction")
+        # The route leads along the way that the expert drives, and on.
+        n = int(scenario.route_points[0])
+        route = scenario.route_xy[0, :n]
+        ego = scenario.agent_xy[:, 0]
+        gap = np.sqrt(np.min(np.sum((ego[:, None] - route) ** 2, axis=-1), axis=1))
+        assert gap.max() < 3.0
+        assert np.median(gap) < 0.8
+        assert n - 1 >= scenario.log_progress[-1] + 49.0
+
+
+def test_a_longer_set_begins_like_a_shorter_one(one_worker, tmp_path):
+    path, *_ = one_worker
+    generate(tmp_path / "three", 3, 5)
+    long, short = ScenarioSet.open(path), ScenarioSet.open(tmp_path / "three")
+    for i in range(3):
+        assert long[i].id == short[i].id
+        assert long[i].record.tobytes() == short[i].record.tobytes()
+
+
+def test_audit_findings_are_stored(tmp_path):
+    calls = []
+
+    def audit(scenarios):
+        calls.append(len(scenarios))
+        return [{"collision": False, "agents": int(s.agent_valid[10].sum())} for s in scenarios]
+
+    generate(tmp_path / "set", 2, 1, audit=audit)
+    scenarios = ScenarioSet.open(tmp_path / "set")
+    assert calls == [2]
+    for index, entry in enumerate(scenarios.entries):
+        assert entry["audit"]["agents"] == int(scenarios[index].agent_valid[10].sum())
+
+
+def test_what_cannot_be_meant_is_refused(tmp_path):
+    for arguments, text in (
+        ((0, 0), "scenarios is 0; use 1 or more"),
+        ((1, -1), "seed is -1; use 0 or more"),
+        ((1, 0, Generation(workers=0)), "workers is 0; use 1 or more"),
+        ((1, 0, Generation(capacity="tiny")), "no capacity 'tiny'; use one of default, large"),
+    ):
+        with pytest.raises(UsageError, match=text):
+            generate(tmp_path / "set", *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_left_behind_when_it_fails_half_way(tmp_path):
+    def broken(scenarios):
+        raise RuntimeError("audit broke")
+
+    with pytest.raises(RuntimeError, match="audit broke"):
+        generate(tmp_path / "set", 1, 0, audit=broken)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_prints_rate_and_rejections(tmp_path, capsys):
+    out = tmp_path / "set"
+    assert run(Generate(out, scenarios=2, seed=2, workers=1)) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith(f"{out}: 2 scenarios in ") and "/s)" in printed[0]
+    assert all("of draws rejected" in line for line in printed[1:]) and len(printed) > 1
+    with pytest.raises(UsageError, match="--overwrite"):
+        run(Generate(out, scenarios=1, workers=1))
+    assert run(Generate(out, scenarios=1, workers=1, overwrite=True)) == 0
+    assert len(ScenarioSet.open(out)) == 1
+
+
+def test_the_summary_by_hand(tmp_path):
+    counts = {"curved_road": FamilyCount(30, {"ego_collides": 2}), "x": FamilyCount(10, {})}
+    text = summary(GeneratedSet(tmp_path, 40, 4.0, counts))
+    assert text.splitlines() == [
+        f"{tmp_path}: 40 scenarios in 4.0 s (10.0/s)",
+        "  curved_road      30 kept,  6.25% of draws rejected (ego_collides 2)",
+        "  x                10 kept,  0.00% of draws rejected",
+    ]

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, Flag, LightState
+from drivax.synthetic.events import EventKind
+from drivax.synthetic.world import WorldConfig, generate_one, generate_recording
+
+from .oracles import box_corners, shared_area, winding_number
+
+COUNT = 20
+RED = (LightState.ARROW_STOP, LightState.STOP)
+
+
+@cache
+def drawn(index, config=WorldConfig()):  # noqa: B008  (a frozen record)
+    return generate_one(3, index, config)
+
+
+def fields_of(recording):
+    """Everything in a recording as one flat list of comparable values."""
+    tracks = [getattr(recording.tracks, f.name).tobytes() for f in dataclasses.fields(recording.tracks)]
+    lights = [
+        (light.lane_id, light.stop_point.tobytes(), light.states.tobytes()) for light in recording.lights
+    ]
+    features = [(f.feature_id, f.kind, f.points.tobytes(), f.successors) for f in recording.features]
+    return [recording.scenario_id, tracks, lights, features, recording.route_lanes, recording.events]
+
+
+def test_a_seed_and_an_index_are_a_recording():
+    again = generate_recording(3, 1)
+    assert fields_of(again) == fields_of(drawn(1).recording)
+    assert fields_of(generate_recording(4, 1)) != fields_of(again)
+    assert fields_of(drawn(2).recording)[1] != fields_of(again)[1]
+
+
+@pytest.mark.parametrize("index", range(COUNT))
+def test_nobody_ever_overlaps(index):
+    tracks = drawn(index).recording.tracks
+    for t in range(0, STEPS, 3):
+        present = np.flatnonzero(tracks.valid[:, t])
+        corners = {
+            i: box_corners(tracks.xy[i, t], tracks.heading[i, t], *tracks.size[i, t, :2]) for i in present
+        }
+        for i in present:
+            for j in present[present > i]:
+                if np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0:
+                    assert shared_area(corners[i], corners[j]) == 0.0, (i, j, t)
+
+
+@pytest.mark.parametrize("index", range(COUNT))
+def test_the_expert_stays_on_the_road(index):
+    recording = drawn(index).recording
+    tracks = recording.tracks
+    rings = [f.points[:-1, :2] for f in recording.features if f.kind in EDGE_KINDS]
+    assert tracks.valid[0].all()
+    for t in range(0, STEPS, 6):
+        for corner in box_corners(tracks.xy[0, t], tracks.heading[0, t], *tracks.size[0, t, :2]):
+            assert sum(winding_number(corner, ring) for ring in rings) == 1
+
+
+@pytest.mark.parametrize("index", range(COUNT))
+def test_nobody_runs_a_red_light(index):
+    recording = drawn(index).recording
+    tracks = recording.tracks
+    lanes = {f.feature_id: f for f in recording.features}
+    for light in recording.lights:
+        points = lanes[light.lane_id].points[:, :2]
+        along = (points[1] - points[0]) / np.hypot(*(points[1] - points[0]))
+        for row in range(len(tracks.xy)):
+            ahead = np.stack([np.cos(tracks.heading[row]), np.sin(tracks.heading[row])], axis=-1)
+            front = tracks.xy[row] + ahead * tracks.size[row, :, :1] / 2 - light.stop_point[:2]
+            past, aside = front @ along, np.abs(front @ np.array([-along[1], along[0]]))
+            for t in range(STEPS - 1):
+                crossed = past[t] <= 0 < past[t + 1] and aside[t] < 1.6 and ahead[t] @ along > 0.7
+                if crossed and tracks.valid[row, t : t + 2].all():
+                    assert not (light.states[t] in RED and light.states[t + 1] in RED), (row, t)
+
+
+@pytest.mark.parametrize("index", range(COUNT))
+def test_motion_is_that_of_a_bicycle_at_the_box_centre(index):
+    tracks = drawn(index).recording.tracks
+    for row in range(len(tracks.xy)):
+        ok = tracks.valid[row]
+        xy, heading = tracks.xy[row, ok], np.unwrap(tracks.heading[row, ok])
+        speed = np.hypot(*tracks.velocity[row, ok].T)
+        along = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        assert np.allclose(tracks.velocity[row, ok], speed[:, None] * along, atol=1e-9)
+        # One step of the dynamics: the mean speed along the mean heading.
+        mean = (heading[1:] + heading[:-1]) / 2
+        d = (speed[1:] + speed[:-1]) * 0.05
+        step = d[:, None] * np.stack([np.cos(mean), np.sin(mean)], axis=-1)
+        assert np.abs(np.diff(xy, axis=0) - step).max(initial=0.0) < 0.03
+        turned = np.abs(np.diff(heading))
+        assert np.all(turned <= 0.3 * np.maximum(d, 0.0) + 1e-3)
+
+
+def test_the_expert_drives_gently_and_makes_way():
+    hardest, turning, moved = [], [], []
+    for index in range(COUNT):
+        tracks = drawn(index).recording.tracks
+        speed = np.hypot(*tracks.velocity[0].T)
+        if not drawn(index).recording.events:
+            hardest.append(np.diff(speed).min() / 0.1)
+        rate = np.diff(np.unwrap(tracks.heading[0])) / 0.1
+        turning.append(np.abs(rate * speed[1:]).max())
+        moved.append(np.hypot(*np.diff(tracks.xy[0], axis=0).T).sum())
+    assert min(hardest) > -4.05
+    assert max(turning) < 4.89
+    assert min(moved) > 5.0
+    assert np.median(moved) > 40.0
+
+
+def test_driving_on_as_before_is_not_enough():
+    """Constant speed and heading leaves the road or meets somebody in well over half of the scenarios."""
+    failed = 0
+    for index in range(COUNT):
+        recording = drawn(index).recording
+        tracks = recording.tracks
+        rings = [f.points[:-1, :2] for f in recording.features if f.kind in EDGE_KINDS]
+        for t in range(CURRENT_STEP, STEPS, 5):
+            xy = tracks.xy[0, CURRENT_STEP] + tracks.velocity[0, CURRENT_STEP] * (t - CURRENT_STEP) * 0.1
+            box = box_corners(xy, tracks.heading[0, CURRENT_STEP], *tracks.size[0, 0, :2])
+            off = any(sum(winding_number(c, ring) for ring in rings) != 1 for c in box)
+            hit = any(
+                shared_area(box, box_corners(tracks.xy[i, t], tracks.heading[i, t], *tracks.size[i, t, :2]))
+                > 0
+                for i in np.flatnonzero(tracks.valid[:, t])[1:]
+                if np.hypot(*(tracks.xy[i, t] - xy)) < 10.0
+            )
+            if off or hit:
+                failed += 1
+                break
+    assert failed > 0.55 * COUNT
+
+
+def test_recordings_are_complete():
+    families = set()
+    for index in range(COUNT):
+        one = drawn(index)
+        recording, tracks = one.recording, one.recording.tracks
+        families.add(one.family)
+        assert recording.dataset == "drivax" and recording.current_step == CURRENT_STEP
+        assert recording.scenario_id == recording.segment == f"w1-s3-{index:06d}-{one.family}"
+        assert one.tags["family"] == one.family and one.tags["domain"] == "grid"
+        assert np.allclose(np.diff(recording.timestamps_s), 0.1)
+        assert tracks.xy.shape == (len(tracks.kind), STEPS, 2) and tracks.valid.any(axis=1).all()
+        assert np.all(np.abs(tracks.heading) <= np.pi)
+        assert not tracks.xy[~tracks.valid].any() and not tracks.size[~tracks.valid].any()
+        assert len(set(tracks.track_id)) == len(tracks.track_id)
+        ids = {f.feature_id: f for f in recording.features}
+        for a, b in pairwise(recording.route_lanes):
+            beside = ids[a].left_neighbours + ids[a].right_neighbours
+            assert b in ids[a].successors + beside
+        assert (
+            (Flag.LIGHTS in recording.flags)
+            == (one.family == "signalised_junction")
+            == bool(recording.lights)
+        )
+        for light in recording.lights:
+            assert np.array_equal(light.stop_point, ids[light.lane_id].points[0])
+    assert families == {"curved_road", "signalised_junction"}
+
+
+def test_events_happen_as_labelled():
+    config = WorldConfig(event_rate=1.0)
+    labelled = 0
+    for index in range(12):
+        one = drawn(index, config)
+        for event in one.recording.events:
+            labelled += 1
+            assert event.kind == EventKind.LEAD_BRAKES and one.tags["event"] == "lead_brakes"
+            tracks = one.recording.tracks
+            (actor,) = np.flatnonzero(tracks.track_id == event.actors[0])
+            speed = np.hypot(*tracks.velocity[actor].T)
+            assert CURRENT_STEP < event.start < event.end < STEPS
+            assert np.diff(speed)[event.start : event.end].min() < -0.24 or speed[event.end] == 0.0
+    assert labelled >= 3
+    assert not drawn(0, WorldConfig(event_rate=0.0)).recording.events
+
+
+def test_negative_seeds_are_refused():
+    with pytest.raises(UsageError, match="must not be negative; choose 0 or more"):
+        generate_recording(-1, 0)
+
+
+def test_the_world_needs_no_jax():
+    code = (
+        "import sys, drivax.synthetic.generate as g;"
+        "g.generate_one(0, 0, g.WorldConfig()); print('jax' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
