@@ -19,7 +19,8 @@ Finding = dict[str, float | int | bool | None]
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
     """``dataset``, ``scenario_id`` and ``segment`` of scenarios, as tables carry them."""
     return [
-        {"dataset": _text(s, "dataset"), "scenario_id": s.id, "segment": _text(s, "segment")} for s in scenarios
+        {"dataset": _text(s, "dataset"), "scenario_id": s.id, "segment": _text(s, "segment")}
+        for s in scenarios
     ]
 
 

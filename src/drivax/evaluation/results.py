@@ -56,8 +56,8 @@ class Results:
     def summary(self) -> dict[str, Any]:
         """Mean and 95 % interval of every metric, as ``summary.json`` holds them.
 
-        Rates have Wilson's interval over the effective number of segments; other means a bootstrap over segments. A metric that is defined nowhere has
-        null mean and n 0.
+        Rates have Wilson's interval over the effective number of segments, other means a bootstrap over segments. A
+        metric that is defined nowhere has null mean and n 0.
         """
         clusters = np.array([row["segment"] for row in self.scenarios])
         table = {}
@@ -88,12 +88,14 @@ class Results:
             writer.writeheader()
             writer.writerows(self.rows())
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n")
+        arrays = {f"{name}_step": self.events[name].astype(np.int16) for name in EVENTS}
         np.savez_compressed(
             folder / "trajectories.npz",
+            allow_pickle=False,
             scenario_id=np.array([row["scenario_id"] for row in self.scenarios]),
             ego=self.motion.astype(np.float32),
             start=np.full(len(self), self.start, np.int32),
-            **{f"{name}_step": self.events[name].astype(np.int16) for name in EVENTS},
+            **arrays,
         )
 
 
@@ -114,5 +116,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """The summary of an evaluation's run folder."""
     file = folder / "summary.json"
     if not file.is_file():
-        raise DataError("is missing: not a finished evaluation", file=file, cure="run `drivax evaluate` again")
+        raise DataError(
+            "is missing: not a finished evaluation", file=file, cure="run `drivax evaluate` again"
+        )
     return json.loads(file.read_text())

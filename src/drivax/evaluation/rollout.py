@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,13 +15,13 @@ from drivax.metrics.scores import Value
 from drivax.planners.planner import Planner
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Episodes:
     """What a batch of episodes came to.
 
@@ -33,9 +33,9 @@ class Episodes:
     """
 
     metrics: dict[str, Value]
-    events: dict[str, Int[Array, " B"]]
-    motion: Float[Array, "B steps 4"]
-    offroad_steps: Int[Array, " B"]
+    events: dict[str, Int[Array, "*batch"]]
+    motion: Float[Array, "*batch steps 4"]
+    offroad_steps: Int[Array, "*batch"]
 
 
 def judging(task: Task) -> Task:

@@ -1,0 +1,84 @@
+"""Colours of maps, agents and lights, the same in pictures and in the player.
+
+The hues are those of Okabe and Ito, Color Universal Design, 2008, told apart with any kind of colour vision; what
+matters has a shape of its own besides (the ego's arrow, crosses at failures, thick bars for red lights).
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from drivax.scenario.schema import AgentKind, LightState, RoadKind
+
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+
+#: Colours of lines in charts, in order.
+SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
+
+LIGHT = MappingProxyType(
+    {
+        "ground": "#f4f5f7", "ink": "#1b1f24", "edge": "#3b424b", "lane": "#b9c2cd", "line": "#9aa5b1",
+        "bike": "#8fc7b5", "crosswalk": "#dfe4ea", "outline": "#1b1f24", "ego": PURPLE, "route": PURPLE,
+        "log": "#5b6570", "vehicle": SKY, "pedestrian": YELLOW, "cyclist": ORANGE, "other": "#9aa5b1",
+        "parked": "#c6ccd3", "red": VERMILLION, "amber": ORANGE, "green": GREEN, "unknown": "#8b949e",
+        "stop": VERMILLION, "mark": VERMILLION,
+    }
+)  # fmt: skip
+DARK = MappingProxyType(
+    {
+        "ground": "#15191e", "ink": "#e8ecf0", "edge": "#aab4bf", "lane": "#3d4651", "line": "#56616d",
+        "bike": "#2c5c4e", "crosswalk": "#262d35", "outline": "#0b0d10", "ego": PURPLE, "route": PURPLE,
+        "log": "#9aa5b1", "vehicle": SKY, "pedestrian": YELLOW, "cyclist": ORANGE, "other": "#77818c",
+        "parked": "#4a535d", "red": VERMILLION, "amber": ORANGE, "green": GREEN, "unknown": "#8b949e",
+        "stop": VERMILLION, "mark": VERMILLION,
+    }
+)  # fmt: skip
+THEMES = MappingProxyType({"light": LIGHT, "dark": DARK})
+
+#: What the legend lists: name of the colour and words.
+LEGEND = (
+    ("ego", "ego"), ("log", "ego as logged"), ("route", "route"), ("vehicle", "vehicle"), ("parked", "standing still"),
+    ("pedestrian", "pedestrian"), ("cyclist", "cyclist"), ("other", "other"), ("red", "red light"),
+    ("amber", "amber"), ("green", "green"), ("mark", "first collision, off-road or red light"),
+)  # fmt: skip
+
+
+def agent_colour(kind: int) -> str:
+    """Name of the colour of an agent of this kind."""
+    names = {
+        AgentKind.VEHICLE: "vehicle",
+        AgentKind.PEDESTRIAN: "pedestrian",
+        AgentKind.CYCLIST: "cyclist",
+        AgentKind.STATIC: "parked",
+    }
+    return names.get(AgentKind(kind), "other")
+
+
+def light_colour(state: int) -> str:
+    """Name of the colour of a light in this state; a light that nobody observed has the unknown one."""
+    names = {
+        LightState.ARROW_STOP: "red",
+        LightState.STOP: "red",
+        LightState.FLASHING_STOP: "red",
+        LightState.ARROW_CAUTION: "amber",
+        LightState.CAUTION: "amber",
+        LightState.FLASHING_CAUTION: "amber",
+        LightState.ARROW_GO: "green",
+        LightState.GO: "green",
+    }
+    return names.get(LightState(state), "unknown")
+
+
+def road_layer(kind: int) -> str:
+    """Layer in which a map feature of this kind is drawn: lane, bike, line, edge, crosswalk or other."""
+    road = RoadKind(kind)
+    if road in (RoadKind.LANE_UNDEFINED, RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE):
+        return "lane"
+    if road is RoadKind.LANE_BIKE:
+        return "bike"
+    if road in (RoadKind.EDGE_UNKNOWN, RoadKind.EDGE_BOUNDARY, RoadKind.EDGE_MEDIAN):
+        return "edge"
+    if road in (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY):
+        return "crosswalk"
+    return "line"

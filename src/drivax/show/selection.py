@@ -1,0 +1,117 @@
+"""Which episodes a report shows: the policy's failures first, each kind in turn, then some successes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivax.show.comparison import comparable
+from drivax.show.runs import Evaluation
+
+#: Kinds of failure, gravest first: (words, metric, value that means failure).
+FAILURES = (
+    ("at-fault collision", "at_fault_collision", 1.0),
+    ("collision", "collision", 1.0),
+    ("off-road", "offroad", 1.0),
+    ("red light", "red_light", 1.0),
+    ("left the map", "left_map", 1.0),
+    ("goal not reached", "reached_goal", 0.0),
+)
+#: Share of the shown episodes that successes get where there are failures enough.
+_SUCCESS_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One episode to show.
+
+    Attributes:
+        dataset, scenario_id: The scenario.
+        rows: Episode of that scenario in each run, None where the run lacks it.
+        outcome: What happened to the policy: a kind of failure, or ``success``.
+    """
+
+    dataset: str
+    scenario_id: str
+    rows: tuple[int | None, ...]
+    outcome: str
+
+
+def outcome(run: Evaluation, row: int) -> str:
+    """The gravest kind of failure of an episode, ``success``, or ``unjudged`` where nothing is defined."""
+    judged = False
+    for words, metric, bad in FAILURES:
+        value = _value(run, metric, row)
+        judged |= not np.isnan(value)
+        if value == bad:
+            return words
+    return "success" if judged else "unjudged"
+
+
+def choose(runs: Sequence[Evaluation], count: int) -> list[Choice]:
+    """Pick episodes of the last run: failures of every kind in turn, worst score first, and some successes.
+
+    Among equally bad failures those come first that another planner drove well; among successes those where
+    others failed, so that the picture tells planners apart.
+    """
+    choices = [_choice(runs, places) for places in _places(runs)]
+    groups: dict[str, list[Choice]] = {}
+    for choice in sorted(choices, key=lambda choice: _rank(runs, choice)):
+        groups.setdefault(choice.outcome, []).append(choice)
+    successes = groups.pop("success", [])
+    failures = _in_turn([groups[kind] for kind in _kinds(groups)])
+    wanted = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
+    picked = failures[:wanted] + successes[: count - min(wanted, len(failures))]
+    return picked[:count]
+
+
+def _kinds(groups: dict[str, list[Choice]]) -> list[str]:
+    order = [words for words, _, _ in FAILURES]
+    return sorted(groups, key=lambda kind: order.index(kind) if kind in order else len(order))
+
+
+def _in_turn(groups: list[list[Choice]]) -> list[Choice]:
+    """One of each group, then the second of each, and so on."""
+    longest = max(map(len, groups), default=0)
+    return [group[place] for place in range(longest) for group in groups if place < len(group)]
+
+
+def _rank(runs: Sequence[Evaluation], choice: Choice) -> tuple[float, int, str]:
+    """Order within a kind: worst score first, then where the others did the opposite, then by scenario id."""
+    succeeded = choice.outcome == "success"
+    score = 0.0 if succeeded else _value(runs[-1], "vmax_score", choice.rows[-1] or 0)
+    others = [
+        outcome(run, row) == "success"
+        for run, row in zip(runs[:-1], choice.rows[:-1], strict=True)
+        if row is not None
+    ]
+    return (1.0 if np.isnan(score) else score), sum(good == succeeded for good in others), choice.scenario_id
+
+
+def _choice(runs: Sequence[Evaluation], rows: tuple[int | None, ...]) -> Choice:
+    policy, row = runs[-1], rows[-1] or 0
+    keys = policy.keys
+    return Choice(keys["dataset"][row], keys["scenario_id"][row], rows, outcome(policy, row))
+
+
+def _places(runs: Sequence[Evaluation]) -> list[tuple[int | None, ...]]:
+    """Row of every scenario of the last run in each run; None where a run lacks it or is not comparable."""
+    policy = runs[-1]
+    others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
+    return [(*(rows.get(key) for rows in others), row) for key, row in _first_rows(policy).items()]
+
+
+def _first_rows(run: Evaluation) -> dict[tuple[str, str], int]:
+    """(data set, scenario id) -> first episode of that scenario whose trajectory is stored."""
+    rows: dict[tuple[str, str], int] = {}
+    for row, (key, dataset) in enumerate(zip(run.occurrences, run.keys["dataset"], strict=True)):
+        if key in run.trajectories.rows:
+            rows.setdefault((dataset, key[0]), row)
+    return rows
+
+
+def _value(run: Evaluation, metric: str, row: int) -> float:
+    """A metric of an episode; NaN where it is undefined or missing."""
+    return float(run.metrics[metric][row]) if metric in run.metrics else float("nan")

@@ -1,0 +1,142 @@
+"""Tables of a report as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+from drivax.evaluation.statistics import Interval
+from drivax.show.comparison import Difference, comparable, difference, summarise
+from drivax.show.glossary import ARROWS, Note, note
+from drivax.show.runs import Evaluation
+
+#: Sign and words of a verdict; the sign repeats in shape what the colour says.
+_VERDICTS = {
+    "better": ("▲", "better"),
+    "worse": ("▼", "worse"),
+    "unclear": ("", "unclear"),
+    "same": ("=", "same"),
+    "none": ("", ""),
+}
+
+
+def planner_table(runs: Sequence[Evaluation], metrics: Sequence[str]) -> str:
+    """Planners in rows, metrics in columns: mean, interval and number of episodes in each cell."""
+    cells = {(run.name, metric): summarise(run, metric) for run in runs for metric in metrics}
+    best = {metric: _best([cells[run.name, metric] for run in runs], note(metric)) for metric in metrics}
+    head = "".join(_heading(metric) for metric in metrics)
+    rows = []
+    for run in runs:
+        row = "".join(_cell(cells[run.name, m], note(m), best[m]) for m in metrics)
+        rows.append(f"<tr>{_planner(run)}{row}</tr>")
+    return _scrolling(f"<thead><tr><th scope=col>planner</th>{head}</tr></thead>", "".join(rows), "planners")
+
+
+def difference_table(policy: Evaluation, others: Sequence[Evaluation], metrics: Sequence[str]) -> str:
+    """Metrics in rows, other planners in columns: the policy minus the other, paired by scenario."""
+    head = "".join(f"<th scope=col>against {escape(other.name)}</th>" for other in others)
+    rows = []
+    for metric in metrics:
+        cells = "".join(_difference_cell(policy, other, metric) for other in others)
+        rows.append(f"<tr>{_heading(metric, scope='row')}{cells}</tr>")
+    return _scrolling(
+        f"<thead><tr><th scope=col>metric</th>{head}</tr></thead>", "".join(rows), "differences"
+    )
+
+
+def explanations(metrics: Sequence[str]) -> str:
+    """A list that explains each metric in one line; metrics without an explanation are left out."""
+    known = [(note(metric), metric) for metric in metrics if note(metric).explanation]
+    items = "".join(
+        f"<div><dt>{escape(entry.label)} {ARROWS[entry.better]}</dt><dd>{escape(entry.explanation)}</dd></div>"
+        for entry, _ in known
+    )
+    return f"<dl class=metrics>{items}</dl>"
+
+
+def number(value: float | None, unit: str, signed: bool = False) -> str:
+    """A number as tables print it: rates in percent with one digit, shares with three, the rest with three figures."""
+    if value is None:
+        return "–"
+    sign = "+" if signed else ""
+    if unit == "rate":
+        text = f"{100 * value:{sign}.1f}"
+    elif unit == "share":
+        text = f"{value:{sign}.3f}"
+    else:
+        digits = 2 if abs(value) < 10 else 1 if abs(value) < 1000 else 0
+        text = f"{value:{sign}.{digits}f}"
+    if not any(digit in text for digit in "123456789"):
+        text = text.lstrip("+-")
+    return text.replace("-", "−")
+
+
+def percent(unit: str) -> str:
+    """The sign behind a mean: percent for rates."""
+    return " %" if unit == "rate" else ""
+
+
+def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
+    """The interval in words: ``low–high``, or ``low to high`` where signs would be confused with the dash.
+
+    A bootstrap of values that are all alike has no width; the words say so instead of claiming certainty.
+    """
+    if interval.low is None or interval.high is None:
+        return "no interval" if interval.n else ""
+    if interval.low == interval.high:
+        return "all alike"
+    low, high = number(interval.low, unit, signed), number(interval.high, unit, signed)
+    between = " to " if signed or "−" in low + high else "–"
+    return f"{low}{between}{high}"
+
+
+def _planner(run: Evaluation) -> str:
+    name = escape(run.name).replace("_", "_<wbr>")
+    return f"<th scope=row>{name}<small>{run.episodes} episodes, {escape(run.traffic)} traffic</small></th>"
+
+
+def _heading(metric: str, scope: str = "col") -> str:
+    entry = note(metric)
+    title = escape(entry.explanation or metric)
+    arrow = {"up": "more is better", "down": "less is better", "none": ""}[entry.better]
+    mark = f'<abbr title="{arrow}">{ARROWS[entry.better]}</abbr>' if arrow else ""
+    return f'<th scope={scope} title="{title}">{escape(entry.label)} {mark}</th>'
+
+
+def _cell(interval: Interval, entry: Note, best: float | None) -> str:
+    if interval.mean is None:
+        return '<td class=undefined title="undefined in every episode">–<small>n 0</small></td>'
+    mark = " class=best" if best is not None and interval.mean == best else ""
+    mean = number(interval.mean, entry.unit) + percent(entry.unit)
+    return f"<td{mark}><b>{mean}</b><small>{bounds(interval, entry.unit)}</small><small>n {interval.n}</small></td>"
+
+
+def _best(intervals: Sequence[Interval], entry: Note) -> float | None:
+    """The best mean of a column, where there is a direction and a choice."""
+    means = [interval.mean for interval in intervals if interval.mean is not None]
+    if entry.better == "none" or len(means) < 2 or min(means) == max(means):
+        return None
+    return max(means) if entry.better == "up" else min(means)
+
+
+def _difference_cell(policy: Evaluation, other: Evaluation, metric: str) -> str:
+    if not comparable(policy, other):
+        return "<td class=undefined>other scenarios or traffic</td>"
+    found: Difference = difference(policy, other, metric)
+    if found.interval.mean is None:
+        return '<td class=undefined title="no scenario where both are defined">–<small>n 0</small></td>'
+    unit = note(metric).unit
+    points = " points" if unit == "rate" else ""
+    sign, words = _VERDICTS[found.verdict]
+    return (
+        f"<td class={found.verdict}><b>{number(found.interval.mean, unit, signed=True)}{points}</b>"
+        f"<em>{sign} {words}</em><small>{bounds(found.interval, unit, signed=True)}, n {found.interval.n}</small></td>"
+    )
+
+
+def _scrolling(head: str, body: str, name: str) -> str:
+    """A table that scrolls sideways by itself on narrow screens."""
+    return (
+        f'<div class=scroll tabindex=0 role=region aria-label="{name}"><table class={name}>{head}'
+        f"<tbody>{body}</tbody></table></div>"
+    )

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from drivax.errors import UsageError
+from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap, rate, wilson
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 1), (1, 1), (0, 12), (5, 12), (12, 12), (173, 256)])
+@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
+def test_wilson_is_scipys(successes, n, confidence):
+    expected = scipy.stats.binomtest(successes, n).proportion_ci(confidence, method="wilson")
+    found = wilson(successes, n, confidence)
+    assert found.mean == successes / n and found.n == n
+    assert found.low == pytest.approx(expected.low, abs=1e-12)
+    assert found.high == pytest.approx(expected.high, abs=1e-12)
+
+
+def test_wilson_by_hand():
+    # z = 1: p = 1/2, n = 3: centre 1/2, half = (1 / (1 + 1/3)) sqrt(1/12 + 1/36) = 3/4 * 1/3 = 1/4.
+    one_sigma = math.erf(1 / math.sqrt(2))
+    found = wilson(1.5, 3, one_sigma)
+    assert (found.low, found.high) == pytest.approx((0.25, 0.75), abs=1e-12)
+
+
+def test_nothing_defined_is_nothing():
+    nothing = Interval(None, None, None, 0)
+    assert wilson(0, 0) == nothing
+    assert rate([None, float("nan")]) == nothing
+    assert bootstrap_mean([], seed=0) == nothing
+    assert bootstrap_mean([None, None], ["a", "b"], seed=0) == nothing
+    assert paired_bootstrap([1.0, None], [None, 2.0], seed=0) == nothing
+    assert nothing.as_dict() == {"mean": None, "low": None, "high": None, "n": 0}
+
+
+def test_rate_of_independent_episodes_is_wilson():
+    values = [1, 0, None, 1, 1, float("nan"), 0]
+    assert rate(values) == wilson(3, 5)
+    assert rate(values, list("abcdefg")) == wilson(3, 5)
+    assert rate([True, False, True]) == wilson(2, 3)
+
+
+def test_rate_of_clusters_by_hand():
+    # Two clusters of two, totals 2 and 0, p = 1/2: variance 2/1 * (1 + 1) / 16 = 1/4; binomial 1/16; deff 4.
+    found = rate([1, 1, 0, 0], ["a", "a", "b", "b"])
+    expected = wilson(0.5, 1)
+    assert (found.mean, found.n) == (0.5, 4)
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+    # Totals 1 and 1: no spread between clusters, so no better than independent.
+    balanced = rate([1, 0, 1, 0], ["a", "a", "b", "b"])
+    assert (balanced.low, balanced.high) == pytest.approx((wilson(2, 4).low, wilson(2, 4).high))
+
+
+def test_rate_where_all_agree_counts_clusters():
+    found = rate([0] * 12, ["a"] * 6 + ["b"] * 6)
+    assert (found.mean, found.low, found.n) == (0.0, 0.0, 12)
+    assert found.high == pytest.approx(wilson(0, 2).high)
+
+
+def test_bootstrap_is_the_exact_distribution_of_a_small_sample():
+    # All 27 equally likely resamples of three values; the percentile bounds of 40,000 draws must be theirs.
+    values = np.array([0.0, 1.0, 5.0])
+    means = sorted(float(np.mean(draw)) for draw in itertools.product(values, repeat=3))
+    found = bootstrap_mean(values, confidence=0.8, resamples=40_000, seed=3)
+    assert found.mean == 2.0 and found.n == 3
+    assert found.low == pytest.approx(np.quantile(means, 0.1, method="inverted_cdf"))
+    assert found.high == pytest.approx(np.quantile(means, 0.9, method="inverted_cdf"))
+
+
+def test_cluster_bootstrap_is_the_exact_distribution_of_whole_clusters():
+    values, labels = [0.0, 0.0, 0.0, 4.0, 10.0], ["a", "a", "a", "b", "c"]
+    totals = {"a": (0.0, 3), "b": (4.0, 1), "c": (10.0, 1)}
+    means = sorted(
+        sum(totals[c][0] for c in draw) / sum(totals[c][1] for c in draw)
+        for draw in itertools.product("abc", repeat=3)
+    )
+    found = bootstrap_mean(values, labels, confidence=0.9, resamples=40_000, seed=1)
+    assert found.mean == pytest.approx(2.8)
+    assert found.low == pytest.approx(np.quantile(means, 0.05, method="inverted_cdf"))
+    assert found.high == pytest.approx(np.quantile(means, 0.95, method="inverted_cdf"))
+
+
+def test_bootstrap_agrees_with_scipy():
+    values = np.random.default_rng(5).gamma(2.0, 1.0, 80)
+    expected = scipy.stats.bootstrap(
+        (values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
+    ).confidence_interval
+    found = bootstrap_mean(values, resamples=20_000, seed=0)
+    width = expected.high - expected.low
+    assert found.low == pytest.approx(expected.low, abs=0.03 * width)
+    assert found.high == pytest.approx(expected.high, abs=0.03 * width)
+
+
+def test_pairs_agree_with_scipy_and_need_both():
+    rng = np.random.default_rng(6)
+    scene = rng.normal(0, 5, 60)
+    a, b = scene + rng.normal(0.5, 1, 60), scene + rng.normal(0, 1, 60)
+    expected = scipy.stats.bootstrap(
+        (a, b),
+        lambda x, y, axis: np.mean(x - y, axis=axis),
+        paired=True,
+        method="percentile",
+        n_resamples=20_000,
+        rng=np.random.default_rng(2),
+    ).confidence_interval
+    found = paired_bootstrap([*a, 3.0, None], [*b, None, 9.0], resamples=20_000, seed=0)
+    assert found.n == 60 and found.mean == pytest.approx(float(np.mean(a - b)))
+    width = expected.high - expected.low
+    assert found.low == pytest.approx(expected.low, abs=0.03 * width)
+    assert found.high == pytest.approx(expected.high, abs=0.03 * width)
+    apart = bootstrap_mean(a, seed=0)
+    assert found.high - found.low < (apart.high - apart.low) / 2, (
+        "pairing removes the spread between scenarios"
+    )
+
+
+def test_a_single_cluster_has_no_interval():
+    assert bootstrap_mean([1.0, 2.0], ["a", "a"], seed=0) == Interval(1.5, None, None, 2)
+    assert bootstrap_mean([7.0], seed=0) == Interval(7.0, None, None, 1)
+
+
+def test_undefined_episodes_take_their_cluster_along():
+    assert bootstrap_mean([1.0, None, 3.0], ["a", "b", "c"], seed=4) == bootstrap_mean([1.0, 3.0], seed=4)
+
+
+def test_seeds_repeat_and_chunks_do_not_matter(monkeypatch):
+    values = np.random.default_rng(0).normal(size=40)
+    first = bootstrap_mean(values, seed=1)
+    assert first == bootstrap_mean(values, seed=1) != bootstrap_mean(values, seed=2)
+    monkeypatch.setattr("drivax.evaluation.statistics._CHUNK", 400)
+    chunked = bootstrap_mean(values, seed=1)
+    assert (chunked.low, chunked.high) == pytest.approx((first.low, first.high), abs=0.02)
+
+
+def test_coverage_of_clustered_data():
+    """95 % intervals of clustered data cover the truth; ignoring the clusters covers it far too seldom."""
+    rng = np.random.default_rng(11)
+    clusters, size, trials, truth = 40, 5, 300, 0.7
+    labels = np.repeat(np.arange(clusters), size)
+    hits = {"rate": 0, "mean": 0, "naive": 0}
+    for trial in range(trials):
+        p = rng.beta(truth * 1.5, (1 - truth) * 1.5, clusters)
+        values = (rng.random((clusters, size)) < p[:, None]).astype(float).ravel()
+        for name, found in (
+            ("rate", rate(values, labels)),
+            ("mean", bootstrap_mean(values, labels, resamples=600, seed=trial)),
+            ("naive", rate(values)),
+        ):
+            hits[name] += found.low <= truth <= found.high
+    share = {name: count / trials for name, count in hits.items()}
+    # Binomial standard error of a coverage of 0.95 in 300 trials: 0.0126.
+    assert 0.91 <= share["rate"] <= 0.985 and 0.90 <= share["mean"] <= 0.985
+    assert share["naive"] < 0.85
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: wilson(3, 2),
+        lambda: wilson(-1, 2),
+        lambda: wilson(1, 2, 1.0),
+        lambda: rate([0.5, 1]),
+        lambda: bootstrap_mean([1.0, 2.0], ["a"], seed=0),
+        lambda: bootstrap_mean([1.0, math.inf], seed=0),
+        lambda: bootstrap_mean([1.0, 2.0], resamples=0, seed=0),
+        lambda: bootstrap_mean([1.0, 2.0], confidence=0.0, seed=0),
+        lambda: paired_bootstrap([1.0], [1.0, 2.0], seed=0),
+    ],
+)
+def test_the_impossible_is_refused_in_one_line(call):
+    with pytest.raises(UsageError) as caught:
+        call()
+    assert "\n" not in str(caught.value) and caught.value.cure
