@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -12,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.metrics.episode import episode_metrics
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import SimState
@@ -23,8 +23,7 @@ ROLLOUT_METRICS = (
 )  # fmt: skip
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Environments:
     """A batch of environments between two collections.
 
@@ -39,8 +38,7 @@ class Environments:
     observation: dict[str, Array]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Rollout:
     """Experience ``[time, batch]``. ``alive`` is false for the steps that only reset; mask them out.
 

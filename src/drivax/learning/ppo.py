@@ -17,6 +17,7 @@ from drivax.networks.encoders import group_spec
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
 
 
@@ -56,8 +57,7 @@ class PpoConfig:
         return self.environments * self.unroll
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class PpoState:
     """Everything that a run needs to continue: networks, optimiser, environments, key and step."""
 

@@ -7,16 +7,15 @@ the whole episode (tests).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.angles import wrap
+from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 
 #: Samples of a comfort window, and how many trailing steps are judged at once when an episode ends.
@@ -58,8 +57,7 @@ def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarr
     return np.linalg.pinv(powers)[derivative] * factorial
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class ComfortSteps:
     """The last eight steps of a window, oldest first: whether each is comfortable, and what was measured."""
 

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.comfort import TAIL, judge_comfort
 from drivax.metrics.scores import Value, nuplan_score, vmax_score
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import TTC_HORIZON_S
 from drivax.simulator.types import Facts, SimState
@@ -58,8 +58,7 @@ _NEVER = 32767
 _DIRECTION_STEPS = 10
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Episode:
     """Accumulators of one episode; one entry per step value.
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.scenario.record import record
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+
+@record
 class Value:
     """A metric's value and whether it is defined; an undefined value is never read as a number."""
 

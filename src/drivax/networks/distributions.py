@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from drivax.scenario.record import record
+
 _MIN_SCALE, _MAX_SCALE = 1e-3, 2.0
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class SquashedGaussian:
     """``tanh`` of a diagonal Gaussian.
 

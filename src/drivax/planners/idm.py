@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.geometry.angles import wrap
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import route_ahead
+from drivax.scenario.record import record, static
 from drivax.scenario.schema import LightState
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import SimState, Situation
@@ -26,15 +25,14 @@ _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
 _YELLOW_BRAKING_MPS2 = 3.0
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class IdmPlanner:
     """A rule-based driver; uses the situation's truth, not observations."""
 
-    actions: ActionSpace = field(default_factory=ActionSpace, metadata={"static": True})
-    parameters: IdmParameters = field(default_factory=IdmParameters, metadata={"static": True})
-    name: str = field(default="idm", metadata={"static": True})
-    replays: bool = field(default=False, metadata={"static": True})
+    actions: ActionSpace = static(default=ActionSpace())
+    parameters: IdmParameters = static(default=IdmParameters())
+    name: str = static(default="idm")
+    replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
         """Nothing to carry."""

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record, static
 from drivax.simulator.types import SimState, Situation
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class NetworkPlanner:
     """Acts by the policy's mode, or by a sample.
 
@@ -27,10 +25,10 @@ class NetworkPlanner:
     """
 
     parameters: Any
-    graph: Any = field(metadata={"static": True})
-    name: str = field(default="policy", metadata={"static": True})
-    samples: bool = field(default=False, metadata={"static": True})
-    replays: bool = field(default=False, metadata={"static": True})
+    graph: Any = static()
+    name: str = static(default="policy")
+    samples: bool = static(default=False)
+    replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
         """Nothing to carry."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.record import record, static
 from drivax.simulator.dynamics import follow
 from drivax.simulator.types import Scene, SimState, Situation
 from drivax.tasks.actions import ActionSpace
@@ -35,13 +34,12 @@ def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Flo
     return actions.action(*command, bank.agent_box[scene.index, scene.slot, 0])
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Expert:
     """The log. ``expert`` replays it exactly; ``expert_actions`` drives it through the dynamics."""
 
-    actions: ActionSpace = field(default_factory=ActionSpace, metadata={"static": True})
-    replays: bool = field(default=True, metadata={"static": True})
+    actions: ActionSpace = static(default=ActionSpace())
+    replays: bool = static(default=True)
 
     @property
     def name(self) -> str:
@@ -65,13 +63,12 @@ class Expert:
         return jnp.clip(expert_action(bank, state.scene, self.actions), -1.0, 1.0), carry
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class ConstantVelocity:
     """Keeps speed and heading."""
 
-    name: str = field(default="constant_velocity", metadata={"static": True})
-    replays: bool = field(default=False, metadata={"static": True})
+    name: str = static(default="constant_velocity")
+    replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
         """Nothing to carry."""

@@ -8,7 +8,6 @@ segments feature-major (a grid query is three contiguous reads per feature).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError, DrivaxError
+from drivax.scenario.record import record, static
 from drivax.scenario.schema import Flag, RoadKind, Scenario
 
 #: Lane width where the source gives none, m.
@@ -29,8 +29,7 @@ ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range
 ROAD_X, ROAD_Y, ROAD_DX, ROAD_DY, ROAD_LENGTH, ROAD_KIND, ROAD_LIMIT, ROAD_CURVATURE = range(8)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class ScenarioBank:
     """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, P parked ones, G grid cells a side.
 
@@ -73,10 +72,10 @@ class ScenarioBank:
     road: Float[Array, "N O 8"]
     road_rows: Int[Array, " N"]
     flags: UInt[Array, " N"]
-    cell_m: float = field(metadata={"static": True})
-    edge_run: int = field(metadata={"static": True})
-    lane_run: int = field(metadata={"static": True})
-    long_ego: bool = field(metadata={"static": True})
+    cell_m: float = static()
+    edge_run: int = static()
+    lane_run: int = static()
+    long_ego: bool = static()
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -114,7 +113,7 @@ def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
     return np.stack([scenario.record[name] for scenario in scenarios])
 
 
-def _used(mask: np.ndarray[Any, Any], multiple: int = 8) -> int:
+def _used(mask: Any, multiple: int = 8) -> int:
     """How many columns of ``mask [N, columns]`` are used, rounded up; trailing padding is cut."""
     used = np.flatnonzero(mask.any(0))
     return 0 if used.size == 0 else min(mask.shape[1], -(-(int(used[-1]) + 1) // multiple) * multiple)

@@ -7,14 +7,13 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import wrap
 from drivax.scenario.bank import DEFAULT_LANE_WIDTH_M, ScenarioBank
+from drivax.scenario.record import record
 
 EDGE_CUTOFF_M = 3.0
 LANE_CUTOFF_M = 4.0
@@ -37,7 +36,12 @@ def _runs(
     start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int, index: Int[Array, ""],
     cell: Int[Array, 2], grid: int,
 ) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
-    """The rows of the 3 x 3 cells around ``cell``: three contiguous reads of fixed length, and which rows count."""
+    """The rows of the 3 x 3 cells around ``cell``: three contiguous reads of fixed length, and which rows count.
+
+    A grid of one cell is read whole (``scenario.exhaustive``).
+    """
+    if grid == 1:
+        return rows[index], jnp.arange(rows.shape[2]) < start[index, 1]
     features, inside = [], []
     for below in (-1, 0, 1):
         first = (cell[1] + below) * grid + cell[0] - 1
@@ -85,8 +89,7 @@ def left_of_edges(
     return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class LaneHits:
     """What the lanes around a box say about it; booleans and distances of its centre unless said otherwise.
 
@@ -192,8 +195,7 @@ def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2])
     return (xy < box[:2]).any() | (xy > box[2:]).any()
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class RouteHit:
     """Projection on the route: arc length, signed lateral distance (left positive), m; heading cosine and sine."""
 

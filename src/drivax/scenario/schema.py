@@ -180,7 +180,7 @@ class Light:
     """A traffic light as it concerns one lane."""
 
     lane_id: int
-    stop_point: Float64[np.ndarray, "3"]
+    stop_point: Float64[np.ndarray, " 3"]
     states: Int8[np.ndarray, " time"]
 
 

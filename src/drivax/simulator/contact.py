@@ -78,7 +78,7 @@ def judge_contacts(
         Whether any fresh contact is the agent's fault, and the type of the nearest one.
     """
     me = frame.box[slot]
-    ahead, left, cos, sin = relative(frame, slot)
+    ahead, left, cos, _ = relative(frame, slot)
     bearing = jnp.arctan2(jnp.abs(left), ahead + REAR_AXLE * me[LENGTH])
     behind = bearing > 5 * jnp.pi / 6
     # The front bumper as a thin box.

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-import jax
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import LaneHits, RouteHit
+from drivax.scenario.record import record
 
 #: Rows of recent motion that a scene carries: the 15-sample comfort window needs one more speed than accelerations.
 HISTORY = 16
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Scene:
     """All that an observation depends on beside the bank; what a replay stores.
 
@@ -41,8 +39,7 @@ class Scene:
     traffic: Any
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Frame:
     """Everyone at one step: the A moving slots of the bank, then its P parked ones.
 
@@ -61,8 +58,7 @@ class Frame:
     kind: Int[Array, "*batch S"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Facts:
     """What was measured at one pose, as scalars; kept in the state. Units in names; definitions in the semantics.
 
@@ -96,8 +92,7 @@ class Facts:
     jerk_mps3: Float[Array, "*batch"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Surroundings:
     """What was found around a pose; arrays, never carried from step to step."""
 
@@ -106,8 +101,7 @@ class Surroundings:
     route: RouteHit
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Situation:
     """A scene, measured."""
 
@@ -116,8 +110,7 @@ class Situation:
     surroundings: Surroundings
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class SimState:
     """State of one driven agent in one scenario.
 
@@ -138,8 +131,7 @@ class SimState:
     start: Int[Array, "*batch"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class Transition:
     """One step. ``after`` is the state that the step led to, never a reset state.
 
@@ -178,6 +170,7 @@ class Traffic(Protocol):
         ...
 
 
+@runtime_checkable
 class Task(Protocol):
     """What makes it a learning problem; satisfied by ``tasks.Task``, which the simulator never imports."""
 

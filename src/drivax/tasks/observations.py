@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.angles import rotate
 from drivax.scenario.bank import ROUTE_LIMIT, ScenarioBank
 from drivax.scenario.queries import route_ahead
+from drivax.scenario.record import record
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, LightState
 from drivax.simulator.types import HISTORY, Frame, Scene
 
@@ -78,8 +79,7 @@ def observe(
     return result | _lights(config, bank, scene, view) | _route(config, bank, scene, view)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@record
 class _View:
     """The ego frame."""
 

@@ -1,0 +1,267 @@
+"""Polylines: arc length, simplification, cutting, resampling and projection, for many polylines at once.
+
+A set of polylines is one array of points and one array of row starts (:class:`Polylines`), so that a whole map is
+handled without a Python loop over its features. Arc length is measured in the plane (x, y); a third coordinate is
+carried along. numpy only: this runs when scenarios are written, not when they are simulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Polylines:
+    """Concatenated polylines.
+
+    Attributes:
+        points: Points of all polylines, one after the other, metres.
+        start: Index of the first point of each polyline, and the number of points at the end.
+        arc: Arc length of every point from the start of its own polyline, metres.
+    """
+
+    points: Float[Array, "point dim"]
+    start: Int[Array, " polyline_plus_1"]
+    arc: Float[Array, " point"]
+
+    @classmethod
+    def of(cls, lines: Sequence[Float[Array, "_ dim"]], dim: int = 3) -> Polylines:
+        """Joins separate polylines; ``dim`` names the width where there are none."""
+        counts = np.array([len(line) for line in lines], dtype=np.int64)
+        points = np.concatenate(list(lines)) if len(lines) else np.zeros((0, dim))
+        start = np.concatenate(([0], np.cumsum(counts)))
+        return cls(points, start, arc_lengths(points, start))
+
+    @property
+    def count(self) -> int:
+        """Number of polylines."""
+        return len(self.start) - 1
+
+    @cached_property
+    def row(self) -> Int[Array, " point"]:
+        """Polyline of every point."""
+        return np.repeat(np.arange(self.count), np.diff(self.start))
+
+    @cached_property
+    def length(self) -> Float[Array, " polyline"]:
+        """Length of every polyline in the plane, metres."""
+        if self.count == 0:
+            return np.zeros(0)
+        return np.where(np.diff(self.start) > 0, self.arc[np.maximum(self.start[1:] - 1, 0)], 0.0)
+
+    @cached_property
+    def _base(self) -> Float[Array, " polyline_plus_1"]:
+        """Offset of every polyline on one axis that holds all of them, one metre apart."""
+        return np.concatenate(([0.0], np.cumsum(self.length + 1.0)))
+
+    @cached_property
+    def _key(self) -> Float[Array, " point"]:
+        """Position of every point on that axis."""
+        return self.arc + self._base[self.row]
+
+    def locate(self, row: Array, s: Array) -> tuple[Int[Array, "*query"], Float[Array, "*query"]]:
+        """Point index and fraction of the segment that holds arc length ``s`` of polyline ``row``.
+
+        Every polyline needs two points. Arc lengths beyond an end give fractions outside [0, 1] of the first or
+        the last segment: evaluation there continues straight on.
+        """
+        wanted = np.clip(s, 0.0, self.length[row]) + self._base[row]
+        index = np.searchsorted(self._key, wanted, side="right") - 1
+        index = np.clip(index, self.start[row], self.start[row + 1] - 2)
+        span = self.arc[index + 1] - self.arc[index]
+        return index, (s - self.arc[index]) / np.where(span > 0.0, span, 1.0)
+
+    def at(self, row: Array, s: Array) -> Float[Array, "*query dim"]:
+        """Points at arc lengths ``s`` of polylines ``row`` (straight on beyond the ends)."""
+        row, s = np.broadcast_arrays(np.asarray(row), np.asarray(s, dtype=np.float64))
+        index, fraction = self.locate(row, s)
+        return self.points[index] + fraction[..., None] * (self.points[index + 1] - self.points[index])
+
+    def heading(self, row: Array, s: Array, span_m: float = 1.0) -> Float[Array, "*query"]:
+        """Heading at arc lengths ``s``: of the chord from half a span behind to half a span ahead, radians.
+
+        The chord stays inside the polyline; one shorter than the span is measured from end to end.
+        """
+        row, s = np.broadcast_arrays(np.asarray(row), np.asarray(s, dtype=np.float64))
+        longest = self.length[row]
+        begin = np.clip(s - span_m / 2, 0.0, np.maximum(longest - span_m, 0.0))
+        chord = self.at(row, np.minimum(begin + span_m, longest)) - self.at(row, begin)
+        return np.arctan2(chord[..., 1], chord[..., 0])
+
+
+def arc_lengths(
+    points: Float[Array, "point dim"], start: Int[Array, " polyline_plus_1"] | None = None
+) -> Float[Array, " point"]:
+    """Arc length in the plane of every point from the first point of its polyline, metres.
+
+    Args:
+        points: Points of one polyline, or of several one after the other.
+        start: First point of each polyline and the number of points; None for a single polyline.
+    """
+    if len(points) == 0:
+        return np.zeros(0)
+    step = np.hypot(*np.diff(points[:, :2], axis=0).T)
+    total = np.concatenate(([0.0], np.cumsum(step)))
+    if start is None:
+        return total
+    counts = np.diff(start)
+    return total - np.repeat(total[start[:-1][counts > 0]], counts[counts > 0])
+
+
+def point_to_segment(
+    point: Float[Array, "*#batch dim"], a: Float[Array, "*#batch dim"], b: Float[Array, "*#batch dim"]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Distance from points to segments, and the fraction in [0, 1] of the nearest point; broadcasts.
+
+    All need at least one leading axis; the last one holds the coordinates (any number of them).
+    """
+    along, to_point = b - a, point - a
+    square = np.einsum("...i,...i->...", along, along)
+    dot = np.einsum("...i,...i->...", to_point, along)
+    fraction = np.clip(dot / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
+    offset = to_point - fraction[..., None] * along
+    return np.sqrt(np.einsum("...i,...i->...", offset, offset)), fraction
+
+
+def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
+    """Which points to keep so that no dropped point is further than the tolerance from what remains.
+
+    Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
+    between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
+    segment, so closed rings (first point = last point) work.
+
+    Args:
+        lines: The polylines.
+        tolerance_m: Largest distance, metres.
+        z_weight: Weight of the third coordinate in the distance; 0 ignores it.
+    """
+    axes = [np.ascontiguousarray(lines.points[:, i]) for i in (0, 1)]
+    if z_weight > 0.0 and lines.points.shape[1] > 2:
+        axes.append(z_weight * lines.points[:, 2])
+    keep = np.zeros(len(lines.points), dtype=bool)
+    filled = np.diff(lines.start) > 0
+    keep[lines.start[:-1][filled]] = True
+    keep[lines.start[1:][filled] - 1] = True
+    inside = np.flatnonzero(~keep)  # interior points of intervals that may still have to be split
+    while len(inside):
+        kept = np.flatnonzero(keep)
+        interval = np.searchsorted(kept, inside)
+        distance = _chord_distance(axes, inside, kept[interval - 1], kept[interval])
+        first = np.flatnonzero(np.diff(interval, prepend=-1))
+        farthest = np.maximum.reduceat(distance, first)
+        count = np.diff(first, append=len(inside))
+        split = farthest > tolerance_m
+        active = np.repeat(split, count)
+        at_peak = active & (distance == np.repeat(farthest, count))
+        peak = np.flatnonzero(at_peak)
+        _, earliest = np.unique(interval[peak], return_index=True)
+        keep[inside[peak[earliest]]] = True
+        inside = inside[active]
+        inside = inside[~keep[inside]]
+    return keep
+
+
+def _chord_distance(axes: Sequence[Array], point: Array, a: Array, b: Array) -> Float[Array, " point"]:
+    """Distance of points to the segments a-b, all given as indices; coordinate by coordinate, which is faster."""
+    along = [axis[b] - axis[a] for axis in axes]
+    offset = [axis[point] - axis[a] for axis in axes]
+    square = sum(u * u for u in along)
+    fraction = sum(u * w for u, w in zip(along, offset, strict=True)) / np.where(square > 0.0, square, 1.0)
+    fraction = np.minimum(np.maximum(fraction, 0.0), 1.0)
+    return np.sqrt(sum((w - fraction * u) ** 2 for u, w in zip(along, offset, strict=True)))
+
+
+def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
+    """Into how many equal pieces to cut segments so that none is longer than ``longest_m``; at least one."""
+    return np.maximum(np.ceil(length / longest_m - 1e-9), 1).astype(np.int64)
+
+
+def resample(
+    points: Float[Array, "point dim"], spacing_m: float, most: int | None = None
+) -> tuple[Float[Array, "sample dim"], Int[Array, " sample"]]:
+    """Points every ``spacing_m`` of arc length from the first point on; the rest at the end is dropped.
+
+    Args:
+        points: A polyline of at least two points.
+        spacing_m: Distance along the polyline, metres.
+        most: At most this many samples.
+
+    Returns:
+        The samples, and for each the index of the point at or before it.
+    """
+    arc = arc_lengths(points)
+    s = np.arange(int(np.floor(arc[-1] / spacing_m + 1e-6)) + 1)[:most] * spacing_m
+    index = np.clip(np.searchsorted(arc, s + 1e-9, side="right") - 1, 0, len(points) - 2)
+    span = arc[index + 1] - arc[index]
+    fraction = np.clip((s - arc[index]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
+    return points[index] + fraction[:, None] * (points[index + 1] - points[index]), index
+
+
+def headings(points: Float[Array, "point dim"]) -> Float[Array, " point"]:
+    """Heading at every point of a polyline by central differences, one-sided at the ends, radians."""
+    xy = points[:, :2]
+    ahead = np.concatenate((xy[1:], xy[-1:]))
+    behind = np.concatenate((xy[:1], xy[:-1]))
+    return np.arctan2(*(ahead - behind).T[::-1])
+
+
+def project(
+    points: Float[Array, "point dim"], xy: Float[Array, "query 2"]
+) -> tuple[Float[Array, " query"], Float[Array, " query"]]:
+    """Nearest point of a polyline: its arc length and its distance, metres."""
+    line = points[:, :2]
+    arc = arc_lengths(points)
+    distance, fraction = point_to_segment(xy[:, None], line[None, :-1], line[None, 1:])
+    best = distance.argmin(axis=1)
+    rows = np.arange(len(xy))
+    s = arc[best] + fraction[rows, best] * (arc[best + 1] - arc[best])
+    return s, distance[rows, best]
+
+
+def project_monotone(
+    points: Float[Array, "point dim"],
+    xy: Float[Array, "query 2"],
+    window_m: Float[Array, " query"],
+    first_window_m: float = np.inf,
+) -> Float[Array, " query"]:
+    """Arc lengths of successive positions along a polyline that never run backwards nor jump to another branch.
+
+    ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
+    position is searched in ``[0, first_window_m]``.
+
+    Args:
+        points: Polyline of at least two points.
+        xy: Positions in order of time.
+        window_m: How far ahead each position may be of the one before, metres; the first entry is not used.
+        first_window_m: How far along the polyline the first position may be, metres.
+    """
+    line, arc = points[:, :2], arc_lengths(points)
+    step = np.diff(line, axis=0)
+    square = np.maximum((step * step).sum(axis=1), 1e-12)
+    span = np.diff(arc)
+    result = np.zeros(len(xy))
+    low, high = 0.0, min(first_window_m, arc[-1])
+    for k in range(len(xy)):
+        if k > 0:
+            low, high = result[k - 1], min(result[k - 1] + window_m[k], arc[-1])
+        i = max(int(arc.searchsorted(low, side="right")) - 1, 0)
+        j = max(int(arc.searchsorted(high, side="left")), i + 1)
+        offset = xy[k] - line[i:j][: len(span) - i]
+        if not len(offset):
+            result[k] = low
+            continue
+        fraction = (offset * step[i:j]).sum(axis=1) / square[i:j]
+        foot = np.minimum(np.maximum(fraction * span[i:j], low - arc[i:j]), high - arc[i:j])
+        foot = np.minimum(np.maximum(foot, 0.0), span[i:j])
+        apart = offset - (foot / np.maximum(span[i:j], 1e-12))[:, None] * step[i:j]
+        nearest = (apart * apart).sum(axis=1).argmin()
+        result[k] = arc[i + nearest] + foot[nearest]
+    return result

@@ -1,0 +1,220 @@
+"""The uniform grid over a scenario's map: which segments lie near a place, without a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int8
+
+from drivax.errors import DataError
+from drivax.scenario.schema import Capacity
+from drivax.scenario.segments import Segments, path_distance
+
+Array = np.ndarray[Any, Any]
+
+EDGE_BLOCK, LANE_BLOCK, REST_BLOCK = 0, 1, 2
+#: Missing an edge this near to the logged ego would make off-road tests wrong: the scenario is refused.
+UNSAFE_M = 20.0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A square of ``side`` x ``side`` cells, row-major: cell index = iy * side + ix.
+
+    Guarantee: every segment of at most 4 m within ``cell_m`` - 2 m of a query lies in the 3 x 3 block of cells
+    around the query, because its midpoint is at most 2 m from its nearest point.
+    """
+
+    origin: Float[Array, 2]
+    cell_m: float
+    side: int
+
+    @classmethod
+    def around(cls, xy: Float[Array, "point 2"], path: Float[Array, "step 2"], capacity: Capacity) -> Grid:
+        """The grid centred on these points, or on the ego's log where they do not fit into the square."""
+        size = capacity.grid * capacity.cell_m
+        points = xy if len(xy) and np.all(np.ptp(xy, axis=0) < size) else path
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        origin = (centre - size / 2).astype(np.float32).astype(np.float64)
+        return cls(origin, capacity.cell_m, capacity.grid)
+
+    def column_row(self, xy: Float[Array, "point 2"]) -> Int[Array, "point 2"]:
+        """Column and row of the cell of each point; may lie outside the square."""
+        return np.floor((xy - self.origin) / self.cell_m).astype(np.int64)
+
+    def contains(self, xy: Float[Array, "point 2"]) -> Bool[Array, " point"]:
+        """Whether points lie in the square."""
+        cell = self.column_row(xy)
+        return np.all((cell >= 0) & (cell < self.side), axis=1)
+
+    def cell(self, xy: Float[Array, "point 2"]) -> Int[Array, " point"]:
+        """Row-major cell index of points inside the square."""
+        cell = self.column_row(xy)
+        return cell[:, 1] * self.side + cell[:, 0]
+
+    def runs(self, counts: Int[Array, " cell"]) -> Int[Array, "row column"]:
+        """Number of entries in the run of three neighbouring cells of a row, centred on each cell."""
+        table = np.pad(counts.reshape(self.side, self.side), ((0, 0), (1, 1)))
+        return table[:, :-2] + table[:, 1:-1] + table[:, 2:]
+
+    def crowded(self, cell: Int[Array, " entry"], far: Float[Array, " entry"], cap: int) -> Array:
+        """Entries to drop so that no run of three cells is longer than ``cap``: the farthest of crowded runs.
+
+        Args:
+            cell: Cell index of every entry.
+            far: Distance of every entry from the ego's log, metres.
+            cap: Longest run.
+        """
+        dropped = np.zeros(len(cell), dtype=bool)
+        while True:
+            counts = np.bincount(cell[~dropped], minlength=self.side**2)
+            runs = self.runs(counts)
+            row, column = np.unravel_index(runs.argmax(), runs.shape)
+            excess = runs[row, column] - cap
+            if excess <= 0:
+                return np.flatnonzero(dropped)
+            near = np.abs(cell % self.side - column) <= 1
+            members = np.flatnonzero(~dropped & (cell // self.side == row) & near)
+            dropped[members[np.argsort(far[members], kind="stable")[-excess:]]] = True
+
+    def starts(self, cell: Int[Array, " entry"], offset: int) -> Int[Array, " cell_plus_1"]:
+        """CSR row starts of entries sorted by cell, ``offset`` added."""
+        counts = np.bincount(cell, minlength=self.side**2)
+        return np.concatenate(([0], np.cumsum(counts))) + offset
+
+
+@dataclass(frozen=True)
+class GridSegments:
+    """Segments in storage order with their grid.
+
+    Attributes:
+        segments: Sorted: edges by cell, car lanes by cell, the rest in order of the source.
+        blocks: 0, end of the edges, end of the lanes, end of the rest.
+        edge_start: CSR starts of the edges, absolute segment indices.
+        lane_start: CSR starts of the car lanes, absolute segment indices.
+        overflow: What did not fit, by name.
+    """
+
+    grid: Grid
+    segments: Segments
+    blocks: Int[Array, 4]
+    edge_start: Int[Array, " cell_plus_1"]
+    lane_start: Int[Array, " cell_plus_1"]
+    overflow: dict[str, int]
+
+
+def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity) -> GridSegments:
+    """Sorts segments into the grid and drops what fits neither the square, the table nor a query's runs.
+
+    Args:
+        segments: The segments of the cropped map.
+        path: A few points along the ego's log; what is farthest from it is dropped first.
+        capacity: Padded sizes.
+
+    Raises:
+        DataError: Road edges near the ego's log would have to be dropped.
+    """
+    middle = segments.middle
+    grid = Grid.around(middle, path, capacity)
+    far = path_distance(middle, path)
+    keep = grid.contains(middle)
+    if keep.sum() > capacity.segments:
+        inside = np.flatnonzero(keep)
+        keep[inside[np.argsort(far[inside], kind="stable")[capacity.segments :]]] = False
+    overflow = {"segments": int((~keep).sum())}
+    block = segments.block
+    for name, number, cap in (
+        ("edge_run", EDGE_BLOCK, capacity.edge_run),
+        ("lane_run", LANE_BLOCK, capacity.lane_run),
+    ):
+        rows = np.flatnonzero(keep & (block == number))
+        drop = rows[grid.crowded(grid.cell(middle[rows]), far[rows], cap)]
+        keep[drop] = False
+        overflow[name] = len(drop)
+    _refuse_unsafe(~keep & (block == EDGE_BLOCK), far, capacity)
+    rows = np.flatnonzero(keep)
+    cell = grid.cell(middle[rows])
+    sort_key = block[rows] * grid.side**2 + np.where(block[rows] == REST_BLOCK, 0, cell)
+    order = np.argsort(sort_key, kind="stable")
+    rows, cell = rows[order], cell[order]
+    ends = np.searchsorted(block[rows], [0, 1, 2, 3])
+    return GridSegments(
+        grid=grid,
+        segments=segments.take(rows),
+        blocks=ends,
+        edge_start=grid.starts(cell[: ends[1]], 0),
+        lane_start=grid.starts(cell[ends[1] : ends[2]], int(ends[1])),
+        overflow={name: count for name, count in overflow.items() if count},
+    )
+
+
+def _refuse_unsafe(
+    dropped: Bool[Array, " segment"], far: Float[Array, " segment"], capacity: Capacity
+) -> None:
+    """Raises where an edge next to the ego's log did not fit."""
+    lost = int((dropped & (far < UNSAFE_M)).sum())
+    if lost:
+        raise DataError(
+            f"{lost} road-edge segments within {UNSAFE_M:.0f} m of the ego's log do not fit capacity"
+            f" {capacity.name!r}",
+            cure="convert with a larger capacity",
+        )
+
+
+def cell_sides(grid: Grid, edges: Segments, rings_closed: bool) -> Int8[Array, " cell"]:
+    """Which cells far from every edge are drivable: 1 drivable, -1 not, 0 unknown.
+
+    No edge crosses a cell whose 3 x 3 block holds none, so for closed rings the whole cell lies on one side, and
+    the winding number of its centre says on which: rings run with the drivable side on their left (outer rings
+    counter-clockwise, islands clockwise), so it takes one value on the road and one lower off it. Crossings of the
+    line through the cell centres of a row are counted from the right (Sunday's winding number, 2001).
+
+    Args:
+        grid: The grid.
+        edges: All road-edge segments, also those that were cropped away.
+        rings_closed: Whether every road edge is a closed ring; where not, every side is unknown.
+    """
+    side = np.zeros(grid.side**2, dtype=np.int8)
+    if not rings_closed or not len(edges):
+        return side
+    winding = _winding_at_centres(grid, edges)
+    low, high = min(winding.min(), 0), max(winding.max(), 0)
+    if low < 0 < high:
+        return side  # rings contradict each other
+    drivable = winding > 0 if high > 0 else winding == 0
+    corner = np.concatenate((edges.a[:, :2], edges.b[:, :2]))
+    centre = grid.origin + (np.arange(grid.side)[:, None] + 0.5) * grid.cell_m
+    within = (centre >= corner.min(axis=0)) & (centre <= corner.max(axis=0))
+    known = (within[None, :, 0] & within[:, None, 1]) & ~_near_edge(grid, edges)
+    side.reshape(grid.side, grid.side)[known] = np.where(drivable[known], 1, -1)
+    return side
+
+
+def _winding_at_centres(grid: Grid, edges: Segments) -> Int[Array, "row column"]:
+    """Winding number of the edges around the centre of every cell."""
+    scaled_a = (edges.a[:, :2] - grid.origin) / grid.cell_m - 0.5
+    scaled_b = (edges.b[:, :2] - grid.origin) / grid.cell_m - 0.5
+    row_a, row_b = np.floor(scaled_a[:, 1]), np.floor(scaled_b[:, 1])
+    crossing = np.flatnonzero(row_a != row_b)  # a segment is shorter than a cell: one row line at most
+    line = np.maximum(row_a, row_b)[crossing]
+    a, b = scaled_a[crossing], scaled_b[crossing]
+    x = a[:, 0] + (line - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    up = np.where(row_b[crossing] > row_a[crossing], 1, -1)
+    last = np.clip(np.ceil(x) - 1, -1, grid.side - 1).astype(np.int64)  # last column left of the crossing
+    seen = (line >= 0) & (line < grid.side) & (last >= 0)
+    table = np.zeros((grid.side, grid.side), dtype=np.int64)
+    np.add.at(table, (line[seen].astype(np.int64), last[seen]), up[seen])
+    return np.cumsum(table[:, ::-1], axis=1)[:, ::-1]
+
+
+def _near_edge(grid: Grid, edges: Segments) -> Bool[Array, "row column"]:
+    """Cells whose 3 x 3 block holds the midpoint of an edge segment."""
+    cell = grid.column_row(edges.middle) + 1
+    padded = np.zeros((grid.side + 2, grid.side + 2), dtype=bool)
+    near_square = np.all((cell >= 0) & (cell < grid.side + 2), axis=1)
+    padded[cell[near_square, 1], cell[near_square, 0]] = True
+    size = grid.side
+    shifts = [padded[dy : dy + size, dx : dx + size] for dy in range(3) for dx in range(3)]
+    return np.logical_or.reduce(shifts)

@@ -1,0 +1,48 @@
+"""Data records: frozen dataclasses that are pytrees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, cast, TypeVar, dataclass_transform
+
+import jax
+
+Record = TypeVar("Record")
+
+
+def static(*, default: Any = MISSING) -> Any:
+    """A field that is part of the pytree's structure: hashable, compared when a program is compiled."""
+    return (
+        field(metadata={"static": True})
+        if default is ...
+        else field(default=default, metadata={"static": True})
+    )
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field, static))
+def record(cls: type[Record]) -> type[Record]:
+    """Makes a class a frozen dataclass and a pytree.
+
+    Rebuilding one from its leaves bypasses ``__init__``: transformations put other things than arrays into leaves, and
+    a constructor that checks shapes would refuse them.
+    """
+    made = dataclass(frozen=True)(cls)
+    leaves = tuple(f.name for f in fields(cast(Any, made)) if not f.metadata.get("static"))
+    statics = tuple(f.name for f in fields(cast(Any, made)) if f.metadata.get("static"))
+
+    def flatten(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        return tuple(getattr(value, n) for n in leaves), tuple(getattr(value, n) for n in statics)
+
+    def flatten_with_keys(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        keyed = tuple((jax.tree_util.GetAttrKey(n), getattr(value, n)) for n in leaves)
+        return keyed, tuple(getattr(value, n) for n in statics)
+
+    def unflatten(aux: tuple[Any, ...], children: Iterable[Any]) -> Any:
+        value = object.__new__(made)
+        for name, child in (*zip(leaves, children, strict=True), *zip(statics, aux, strict=True)):
+            object.__setattr__(value, name, child)
+        return value
+
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    return made

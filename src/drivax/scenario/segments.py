@@ -1,0 +1,178 @@
+"""Map features cut into the short straight segments that every map query reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from drivax.geometry.polylines import Polylines, arc_lengths, cut_counts, simplify
+from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, MapFeature, RoadKind
+
+Array = np.ndarray[Any, Any]
+
+#: Longest segment; the grid's guarantee holds for 4 m, the rest is room for rounding to float32.
+LONGEST_M = 3.99
+TOLERANCE_M = 0.05
+#: 20 cm of height count as much as 5 cm in the plane.
+Z_WEIGHT = 0.25
+#: A ring is closed where its last point is this near to its first.
+CLOSED_M = 0.05
+
+
+@dataclass(frozen=True)
+class RoadLines:
+    """All drawn map features as polylines in the local frame: split at clipping gaps, polygons closed.
+
+    Attributes:
+        lines: The polylines; ``lines.arc`` is measured per polyline.
+        feature: Row of the source feature of each polyline.
+        kind: Road kind of each polyline.
+        closed: Whether a polyline is a closed ring.
+        arc: Arc length of every point along its source feature (gaps included), metres.
+    """
+
+    lines: Polylines
+    feature: Int[Array, " polyline"]
+    kind: Int[Array, " polyline"]
+    closed: Bool[Array, " polyline"]
+    arc: Float[Array, " point"]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Straight pieces of at most 4 m, in the local frame, float64.
+
+    Attributes:
+        a: Start points.
+        b: End points.
+        kind: Road kind.
+        polyline: Row of the polyline that it is cut from.
+        feature: Row of the source feature.
+        start_m: Arc length at ``a`` along the source feature.
+        span_m: Arc length between ``a`` and ``b`` along the source feature.
+    """
+
+    a: Float[Array, "segment 3"]
+    b: Float[Array, "segment 3"]
+    kind: Int[Array, " segment"]
+    polyline: Int[Array, " segment"]
+    feature: Int[Array, " segment"]
+    start_m: Float[Array, " segment"]
+    span_m: Float[Array, " segment"]
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def take(self, rows: Array) -> Segments:
+        """The segments in these rows (indices or a mask)."""
+        return Segments(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
+
+    @property
+    def middle(self) -> Float[Array, "segment 2"]:
+        """Midpoints in the plane as the stored float32 end points give them."""
+        ends = self.a[:, :2].astype(np.float32), self.b[:, :2].astype(np.float32)
+        return ((ends[0] + ends[1]) * np.float32(0.5)).astype(np.float64)
+
+    @property
+    def block(self) -> Int[Array, " segment"]:
+        """Storage block: 0 road edge, 1 car lane, 2 the rest."""
+        is_edge = np.isin(self.kind, EDGE_KINDS)
+        return np.where(is_edge, 0, np.where(np.isin(self.kind, CAR_LANE_KINDS), 1, 2))
+
+
+def road_lines(
+    features: Sequence[MapFeature], origin: Float[Array, 3], split_gap_m: float | None
+) -> RoadLines:
+    """Features of two or more points as polylines in the local frame.
+
+    Args:
+        features: The source's map features; stop signs have no line and are left out.
+        origin: Origin of the local frame in the source's frame, metres.
+        split_gap_m: Cut where neighbouring points are further apart than this; None: never. Polygons stay whole.
+    """
+    rows = [i for i, f in enumerate(features) if f.kind != RoadKind.STOP_SIGN and len(f.points) >= 2]
+    whole = Polylines.of([_outline(features[i]) for i in rows])
+    kind = np.array([features[i].kind for i in rows], dtype=np.int64)
+    points = whole.points - origin if len(whole.points) else whole.points
+    breaks = np.zeros(len(points), dtype=bool)
+    breaks[whole.start[:-1]] = True
+    if split_gap_m is not None and len(points):
+        step = np.hypot(*np.diff(points[:, :2], axis=0, prepend=points[:1, :2]).T)
+        breaks |= (step > split_gap_m) & ~np.isin(kind, POLYGON_KINDS)[whole.row]
+    source = whole.row
+    lines, keep = _long_enough(points, np.flatnonzero(breaks))
+    row = source[keep][lines.start[:-1]]
+    first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
+    closed = (np.hypot(*(last - first)[:, :2].T) <= CLOSED_M) & (np.diff(lines.start) >= 4)
+    lines.points[lines.start[1:][closed] - 1] = first[closed]
+    return RoadLines(lines, np.array(rows, dtype=np.int64)[row], kind[row], closed, whole.arc[keep])
+
+
+def _outline(feature: MapFeature) -> Array:
+    """Points of a feature; a polygon gets its first point again at the end."""
+    points = np.asarray(feature.points, dtype=np.float64)
+    if feature.kind in POLYGON_KINDS and np.any(points[0] != points[-1]):
+        return np.concatenate((points, points[:1]))
+    return points
+
+
+def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
+    """Polylines that begin at these points, without those of one point or of no length."""
+    start = np.concatenate((begin, [len(points)])).astype(np.int64)
+    counts = np.diff(start)
+    arc = arc_lengths(points, start)
+    long = (counts >= 2) & (arc[start[1:] - 1] > 1e-3) if len(points) else counts >= 2
+    keep = np.repeat(long, counts)
+    kept_start = np.concatenate(([0], np.cumsum(counts[long]))).astype(np.int64)
+    return Polylines(points[keep], kept_start, arc[keep]), keep
+
+
+def cut(roads: RoadLines) -> Segments:
+    """Cuts polylines into segments: simplified to 5 cm, then no segment longer than 4 m, order kept."""
+    keep = simplify(roads.lines, TOLERANCE_M, Z_WEIGHT)
+    points, arc, line = roads.lines.points[keep], roads.arc[keep], roads.lines.row[keep]
+    inner = line[1:] == line[:-1]
+    a, b = points[:-1][inner], points[1:][inner]
+    s, span, line = arc[:-1][inner], np.diff(arc)[inner], line[:-1][inner]
+    pieces = cut_counts(np.hypot(*(b - a)[:, :2].T), LONGEST_M)
+    owner = np.repeat(np.arange(len(a)), pieces)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    low, high = number / pieces[owner], (number + 1) / pieces[owner]
+    step = (b - a)[owner]
+    return Segments(
+        a=a[owner] + low[:, None] * step,
+        b=np.where((number + 1 == pieces[owner])[:, None], b[owner], a[owner] + high[:, None] * step),
+        kind=roads.kind[line[owner]],
+        polyline=line[owner],
+        feature=roads.feature[line[owner]],
+        start_m=s[owner] + low * span[owner],
+        span_m=span[owner] / pieces[owner],
+    )
+
+
+def path_distance(xy: Float[Array, "point 2"], path: Float[Array, "step 2"]) -> Float[Array, " point"]:
+    """Distance of points from the nearest of a few points along the ego's log, metres."""
+    best = np.full(len(xy), np.inf)
+    for x, y in path:
+        np.minimum(best, np.hypot(xy[:, 0] - x, xy[:, 1] - y), out=best)
+    return best
+
+
+def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array, "kept 2"]:
+    """First and last point of a trajectory and those about ``spacing_m`` apart between them."""
+    bin_number = np.floor(arc_lengths(xy) / spacing_m)
+    keep = np.diff(bin_number, prepend=-1.0) > 0
+    keep[-1] = True
+    return xy[keep]
+
+
+def inside_box(
+    xy: Float[Array, "point 2"], path: Float[Array, "step 2"], margin_m: float
+) -> Bool[Array, " point"]:
+    """Whether points lie in the axis-aligned box of a trajectory, widened by a margin."""
+    low, high = path.min(axis=0) - margin_m, path.max(axis=0) + margin_m
+    return np.all((xy >= low) & (xy <= high), axis=1)

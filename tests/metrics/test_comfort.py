@@ -1,0 +1,64 @@
+"""Comfort equals SciPy's filter over the whole episode."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+
+from drivax.metrics.comfort import TAIL, WINDOW, judge_comfort, tail_operator
+
+
+@pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2)])
+def test_tail_operator_is_scipys_filter(window, order, derivative):
+    signal = np.random.default_rng(0).normal(size=60)
+    whole = savgol_filter(signal, window, order, deriv=derivative)
+    for end in (40, 50):
+        tail = tail_operator(window, order, derivative) @ signal[end - WINDOW : end]
+        cut = savgol_filter(signal[:end], window, order, deriv=derivative)
+        np.testing.assert_allclose(tail, cut[-TAIL:], atol=1e-9)
+        np.testing.assert_allclose(tail[0], whole[end - TAIL], atol=1e-9)
+
+
+def histories(speed, heading):
+    """The 16-row history at every step of a long signal."""
+    motion = np.stack([0 * speed, 0 * speed, heading, speed], -1).astype(np.float32)
+    return np.stack([motion[t - 15 : t + 1] for t in range(15, len(speed))])
+
+
+def test_judgement_equals_limits_on_scipys_signals():
+    rng = np.random.default_rng(3)
+    t = np.arange(120) * 0.1
+    speed = 8 + 2.0 * np.sin(0.9 * t) + 0.4 * np.sin(5.1 * t)
+    heading = 0.5 * np.sin(0.8 * t) + 0.02 * rng.normal(size=t.size).cumsum()
+    judged = jax.vmap(judge_comfort)(jnp.asarray(histories(speed, heading)))
+    a = np.diff(speed) / 0.1
+    lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / 0.1
+    smooth = savgol_filter(a, 8, 2)
+    fine = (smooth >= -4.05) & (smooth <= 2.40)
+    fine &= np.abs(savgol_filter(lateral, 8, 2)) <= 4.89
+    fine &= np.abs(savgol_filter(a, 15, 2, deriv=1, delta=0.1)) <= 4.13
+    fine &= np.abs(savgol_filter(np.hypot(a, lateral), 15, 2, deriv=1, delta=0.1)) <= 8.37
+    # The filters of the running version see accelerations from step 1 on, and headings from the same step.
+    turn = heading[1:]
+    fine &= np.abs(savgol_filter(turn, 15, 2, deriv=1, delta=0.1)) <= 0.95
+    fine &= np.abs(savgol_filter(turn, 15, 3, deriv=2, delta=0.1)) <= 1.93
+    # History at step t judges step t - 7; the last one judges eight steps at once.
+    running = np.concatenate([np.asarray(judged.comfortable[:-1, 0]), np.asarray(judged.comfortable[-1])])
+    expected = fine[7:]
+    assert 0.2 < expected.mean() < 0.98
+    np.testing.assert_array_equal(running, expected)
+
+
+def test_lateral_acceleration_can_fail():
+    # 10 m/s at 0.5 rad/s is 5 m/s2: over the limit of 4.89.
+    heading = np.arange(16) * 0.05
+    judged = judge_comfort(jnp.asarray(histories(np.full(16, 10.0), heading)[0]))
+    assert not bool(judged.comfortable.any())
+    np.testing.assert_allclose(judged.lateral_mps2, 5.0, rtol=1e-3)
+
+
+def test_a_heading_that_wraps_is_no_discomfort():
+    heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 16) + np.pi) % (2 * np.pi) - np.pi
+    judged = judge_comfort(jnp.asarray(histories(np.full(16, 5.0), heading)[0]))
+    assert bool(judged.comfortable.all())

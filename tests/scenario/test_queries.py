@@ -1,0 +1,163 @@
+"""The grid answers what brute force answers, on generated maps; signs and lanes answer what numpy in float64 says."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.exhaustive import without_grid
+from drivax.scenario.queries import (
+    EDGE_CUTOFF_M,
+    around_lanes,
+    left_of_edges,
+    light_crossing,
+    offroad_distance,
+    project_on_route,
+    route_ahead,
+)
+from drivax.synthetic.world import generate_recording
+from scenes import bank_of, car, line, straight_road
+
+
+@pytest.fixture(scope="module")
+def scenarios():
+    return [assemble(generate_recording(5, i)) for i in range(4)]
+
+
+def poses(scenario, count, rng):
+    """Random poses near the map: a point of a segment, shifted by up to 9 m."""
+    used = int(scenario.segment_blocks[3])
+    pick = rng.integers(0, used, count)
+    xy = scenario.segment_a[pick, :2] + rng.uniform(-9, 9, (count, 2))
+    return xy.astype(np.float32), rng.uniform(-np.pi, np.pi, count).astype(np.float32)
+
+
+def corners_of(xy, heading):
+    local = np.array([[2.4, 1], [2.4, -1], [-2.4, -1], [-2.4, 1]])
+    cos, sin = np.cos(heading), np.sin(heading)
+    turn = np.stack([np.stack([cos, sin], -1), np.stack([-sin, cos], -1)], -2)
+    return (xy[:, None] + local @ turn).astype(np.float32)
+
+
+def look(bank, index, xy, heading):
+    def one(p, h, points):
+        direction = jnp.stack([jnp.cos(h), jnp.sin(h)])
+        z = jnp.zeros(())
+        lanes = around_lanes(bank, index, p, direction, points, z)
+        distance, known = left_of_edges(bank, index, p, points, z)
+        off = offroad_distance(bank, index, p, points, lanes.points_near, z)
+        return lanes, jnp.where(known, distance, 0.0), known, off
+
+    return jax.jit(jax.vmap(one))(xy, heading, jnp.asarray(corners_of(np.asarray(xy), np.asarray(heading))))
+
+
+def test_grid_equals_brute_force(scenarios):
+    bank = ScenarioBank.from_scenarios(scenarios)
+    whole = without_grid(bank)
+    rng = np.random.default_rng(0)
+    for row, scenario in enumerate(scenarios):
+        xy, heading = (jnp.asarray(part) for part in poses(scenario, 300, rng))
+        grid, brute = (look(b, jnp.asarray(row), xy, heading) for b in (bank, whole))
+        assert np.asarray(grid[2]).any()
+        np.testing.assert_array_equal(grid[2], brute[2])
+        np.testing.assert_allclose(grid[1], brute[1], atol=1e-5)
+        # The lanes of LaneHits that depend on distance are exact within the cut-off; all of its fields must agree.
+        for name in ("near", "points_near", "on_corridor", "wrong_way", "limit", "lane", "leaving_lane"):
+            np.testing.assert_array_equal(getattr(grid[0], name), getattr(brute[0], name), err_msg=name)
+        near = np.asarray(grid[0].near)
+        np.testing.assert_array_equal(
+            np.asarray(grid[0].straddling)[near], np.asarray(brute[0].straddling)[near]
+        )
+
+
+def test_edge_distance_against_float64(scenarios):
+    scenario = scenarios[0]
+    bank = ScenarioBank.from_scenarios([scenario])
+    xy, heading = poses(scenario, 200, np.random.default_rng(1))
+    _, distance, known, _ = look(bank, jnp.asarray(0), jnp.asarray(xy), jnp.asarray(heading))
+    edges = int(scenario.segment_blocks[1])
+    a, b = (scenario.record[f"segment_{end}"][:edges, :2].astype(np.float64) for end in "ab")
+    for points, found, near in zip(
+        corners_of(xy, heading), np.asarray(distance), np.asarray(known), strict=True
+    ):
+        for point, value, is_near in zip(points, found, near, strict=True):
+            t = np.clip(((point - a) * (b - a)).sum(1) / ((b - a) ** 2).sum(1), 0, 1)
+            nearest = np.linalg.norm(point - a - t[:, None] * (b - a), axis=1).min()
+            if abs(nearest - EDGE_CUTOFF_M) < 1e-3:
+                continue
+            assert is_near == (nearest <= EDGE_CUTOFF_M)
+            if is_near:
+                assert abs(value) == pytest.approx(nearest, abs=2e-3)
+
+
+def test_side_of_a_sharp_vertex():
+    # A wedge of road, drivable to the left of (0,0) -> (10,0) -> (0,4): outside its tip both lines disagree.
+    recording = straight_road([car(0, 0, 0, 5)])
+    from dataclasses import replace
+
+    from drivax.scenario.schema import MapFeature, RoadKind
+
+    wedge = MapFeature(9, RoadKind.EDGE_MEDIAN, line((20, 30), (30, 30), (20, 34), (20, 30)))
+    bank = bank_of(replace(recording, features=(*recording.features, wedge)))
+    tips = jnp.array([[31.0, 30.5], [31.0, 29.8], [28.0, 30.3], [22.0, 31.0], [19.0, 31.0], [25.0, 29.0]])
+    expected = [False, False, True, True, False, False]
+    side = jax.jit(lambda tip: left_of_edges(bank, jnp.asarray(0), tip, tip[None], jnp.zeros(())))
+    for tip, inside in zip(tips, expected, strict=True):
+        distance, known = side(tip)
+        assert bool(known[0])
+        assert bool(distance[0] > 0) == inside, tip
+
+
+def test_another_level_is_ignored():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)]))
+    point = jnp.array([[0.0, -3.0]])
+    below, known = left_of_edges(bank, jnp.asarray(0), point[0], point, jnp.asarray(0.0))
+    assert bool(known[0]) and float(below[0]) == pytest.approx(-1.15, abs=1e-3)
+    assert not bool(left_of_edges(bank, jnp.asarray(0), point[0], point, jnp.asarray(5.0))[1][0])
+
+
+def test_lanes_of_a_two_lane_road():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)]))
+
+    def at(x, y, heading):
+        xy = jnp.array([x, y], jnp.float32)
+        box = jnp.asarray(corners_of(np.array([[x, y]]), np.array([heading]))[0])
+        return around_lanes(
+            bank, jnp.asarray(0), xy, jnp.array([np.cos(heading), np.sin(heading)]), box, jnp.zeros(())
+        )
+
+    inside = at(0, 0.2, 0.0)
+    assert bool(inside.near) and bool(inside.on_corridor) and not bool(inside.straddling)
+    assert float(inside.offset) == pytest.approx(0.2, abs=1e-4)
+    assert float(inside.limit) == pytest.approx(13.4)
+    backwards = at(0, 0.2, np.pi)
+    assert bool(backwards.wrong_way) and float(backwards.limit) == -1.0
+    between = at(
+        0, 1.85, 0.0
+    )  # across the line between both lanes: in no lane wholly, yet beside the road of neither
+    assert not bool(between.straddling) and bool(between.leaving_lane)
+    edge = at(0, -1.5, 0.0)  # right corners 2.5 m from the right lane's centre
+    assert bool(edge.straddling)
+
+
+def test_route_projection_and_lookahead():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)]))
+    index = jnp.asarray(0)
+    start = bank.log_progress[0, 10]
+    hit = project_on_route(bank, index, jnp.array([7.3, 1.1]), start)
+    assert float(hit.along_m - start) == pytest.approx(7.3, abs=1e-3)
+    assert float(hit.lateral_m) == pytest.approx(1.1, abs=1e-3)
+    rows, there = route_ahead(bank, index, start, jnp.array([5.0, 10.5, 1000.0]))
+    np.testing.assert_allclose(rows[:2, :2], [[5, 0], [10.5, 0]], atol=1e-2)
+    assert there.tolist() == [True, True, False]
+
+
+def test_stop_line_is_finite():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)], light=4))
+    through, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]))
+    beside, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 3.0]), jnp.array([41.0, 3.0]))
+    back, before = light_crossing(bank, jnp.asarray(0), jnp.array([41.0, 0.5]), jnp.array([39.0, 0.5]))
+    assert bool(through[0]) and not bool(beside[0]) and not bool(back[0])
+    assert float(before[0]) == pytest.approx(1.0, abs=1e-3)

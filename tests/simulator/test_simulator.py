@@ -1,0 +1,208 @@
+"""The simulator as a whole: log replay, resets, groups, invariance, sizes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import RED, bank_of, car, moved, straight_road
+
+from drivax.evaluation.rollout import drive, judging
+from drivax.planners.idm import IdmPlanner
+from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.observations import PRESETS
+from drivax.tasks.task import Task
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Simulator(judging(Task()))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return ScenarioBank.from_scenarios([assemble(generate_recording(7, i)) for i in range(6)])
+
+
+def episodes(simulator, planner, bank, **options):
+    keys = jax.random.split(jax.random.key(0), len(bank))
+    return drive(simulator, planner, bank, jnp.arange(len(bank)), keys, **options)
+
+
+def metric(result, name):
+    value = result.metrics[name]
+    return np.where(value.defined, value.value, np.nan)
+
+
+def test_the_exact_expert_is_clean_and_never_diverges(simulator, world):
+    result = episodes(simulator, Expert(), world)
+    for name, expected in (("accuracy", 1.0), ("success", 1.0), ("collision", 0.0), ("offroad", 0.0)):
+        np.testing.assert_array_equal(metric(result, name), expected)
+    np.testing.assert_allclose(metric(result, "fde"), 0.0, atol=1e-5)
+    np.testing.assert_allclose(metric(result, "progress_ratio"), 1.0, atol=1e-3)
+
+
+def test_the_driven_expert_follows_the_log(simulator, world):
+    assert metric(episodes(simulator, Expert(replays=False), world), "fde").max() < 0.2
+
+
+def test_a_state_is_small(simulator, world):
+    state = jax.eval_shape(lambda b: simulator.reset(b, 0), world)
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+    facts = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.facts))
+    scene = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.scene))
+    assert size <= 4096 and facts <= 256 and scene <= 300
+
+
+def test_collision_with_a_stopped_car(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 10), car(30, 0, 0, 0)]))
+    result = episodes(simulator, ConstantVelocity(), bank)
+    # 30 m between centres less one length of 4.8 m at 10 m/s: contact after 2.52 s, first seen at step 36.
+    assert metric(result, "collision")[0] == 1.0 and metric(result, "at_fault_collision")[0] == 1.0
+    assert int(result.events["collision"][0]) == 36
+    assert metric(result, "collision_type")[0] == 6.0
+    assert metric(result, "min_ttc")[0] == 0.0 and metric(result, "accuracy")[0] == 0.0
+
+
+def test_an_agent_that_overlaps_at_the_start_is_ignored_until_it_parts(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 5), car(1, 0.5, 0, 5)]))
+    result = episodes(simulator, ConstantVelocity(), bank)
+    assert metric(result, "collision")[0] == 0.0 and metric(result, "min_ttc")[0] == 5.0
+
+
+def test_an_agent_that_appears_on_top_of_ego_is_ignored(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 5), car(1, 0.5, 0, 5, steps=range(40, 91))]))
+    assert metric(episodes(simulator, ConstantVelocity(), bank), "collision")[0] == 0.0
+
+
+def test_leaving_the_road(simulator):
+    # The log drives straight; a heading of 3 deg leads off the right edge, 1.85 m away.
+    bank = bank_of(straight_road([car(0, 0, np.deg2rad(-3), 10)]))
+    result = episodes(simulator, ConstantVelocity(), bank)
+    assert metric(result, "offroad")[0] == 1.0
+    # The front right corner is 0.3 m beyond the edge when 10 t sin(3 deg) + 1.0 cos + 2.4 sin = 2.15 m: 2 s.
+    corner = 1.0 * np.cos(np.deg2rad(3)) + 2.4 * np.sin(np.deg2rad(3))
+    steps = int(np.ceil((1.85 + 0.3 - corner) / (10 * np.sin(np.deg2rad(3))) / 0.1))
+    assert int(result.events["offroad"][0]) == 10 + steps
+
+
+def test_running_a_red_light(simulator):
+    red = bank_of(straight_road([car(0, 0, 0, 10)], light=RED))
+    result = episodes(simulator, ConstantVelocity(), red)
+    # The front bumper, 2.4 m ahead of the centre, passes x = 40 at 3.76 s.
+    assert metric(result, "red_light")[0] == 1.0
+    assert int(result.events["red_light"][0]) == 10 + 38
+    green = bank_of(straight_road([car(0, 0, 0, 10)], light=6))
+    assert metric(episodes(simulator, ConstantVelocity(), green), "red_light")[0] == 0.0
+    turned = np.full(91, RED)
+    turned[47:] = 6  # green one step before the bumper reaches the line
+    late = bank_of(straight_road([car(0, 0, 0, 10)], light=turned))
+    assert metric(episodes(simulator, ConstantVelocity(), late), "red_light")[0] == 0.0
+
+
+def test_idm_stops_for_red_and_behind_a_standing_car(simulator):
+    red = episodes(simulator, IdmPlanner(), bank_of(straight_road([car(0, 0, 0, 10)], light=RED)))
+    front = np.asarray(red.motion)[0, -1, 0] + 2.4
+    assert metric(red, "red_light")[0] == 0.0 and 35.0 < front < 40.0
+    queue = episodes(simulator, IdmPlanner(), bank_of(straight_road([car(0, 0, 0, 10), car(50, 0, 0, 0)])))
+    gap = 50 - 2.4 - (np.asarray(queue.motion)[0, -1, 0] + 2.4)
+    assert metric(queue, "collision")[0] == 0.0 and 1.0 < gap < 6.0
+
+
+def test_metrics_without_lights_are_undefined(simulator):
+    from dataclasses import replace
+
+    from drivax.scenario.schema import Flag
+
+    recording = straight_road([car(0, 0, 0, 5)])
+    bank = bank_of(replace(recording, flags=recording.flags & ~Flag.LIGHTS))
+    result = episodes(simulator, Expert(), bank)
+    assert np.isnan(metric(result, "red_light")[0]) and np.isnan(metric(result, "vmax_score")[0])
+    assert metric(result, "vmax_score_partial")[0] == pytest.approx(1.0, abs=1e-4)
+    assert metric(result, "nuplan_score")[0] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_shift_and_rotation_change_nothing(simulator):
+    cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, np.pi, 3)]
+    here = straight_road(cars, light=RED)
+    one, other = (episodes(simulator, IdmPlanner(), bank_of(r)) for r in (here, moved(here, 2.1, 4000.0, -7000.0)))
+    for name in one.metrics:
+        np.testing.assert_allclose(metric(one, name), metric(other, name), rtol=2e-3, atol=2e-2, err_msg=name)
+
+
+def test_order_and_padding_of_agents_change_nothing(simulator):
+    cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, 0, 3)]
+    plain = bank_of(straight_road(cars))
+    mixed = bank_of(straight_road([cars[i] for i in (0, 3, 1, 2)]))
+    padded = ScenarioBank.from_scenarios(
+        [assemble(straight_road(cars)), assemble(straight_road([*cars, *[car(180 + 9 * i, 3.7, 0, 4) for i in range(12)]]))]
+    )
+    base = episodes(simulator, ConstantVelocity(), plain)
+    for bank in (mixed, padded):
+        other = episodes(simulator, ConstantVelocity(), bank)
+        for name in base.metrics:
+            np.testing.assert_allclose(metric(base, name)[0], metric(other, name)[0], rtol=1e-5, err_msg=name)
+
+
+def test_step_or_begin_is_step_or_reset(world):
+    simulator = Simulator(Task())
+    reset, step, either = (jax.jit(f) for f in (simulator.reset, simulator.step, simulator.step_or_begin))
+    state = reset(world, 1)
+    action = jnp.array([0.2, 0.05])
+    plain, _ = step(world, state, action)
+    same, _ = either(world, state, action, jnp.asarray(False), 3)
+    fresh, transition = either(world, plain, action, jnp.asarray(True), 3)
+    for a, b in ((plain, same), (reset(world, 3), fresh)):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), a, b)
+    assert not bool(transition.terminated) and not bool(transition.truncated)
+
+
+def test_two_driven_agents_see_each_other(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 0, 0, 8)]))
+    # The one in front brakes fully, the one behind keeps its speed.
+    actions = jnp.array([[0.0, 0.0], [-1.0, 0.0]])
+
+    @jax.jit
+    def together(bank):
+        pair = jax.vmap(lambda slot: simulator.reset(bank, 0, 10, slot))(jnp.array([0, 1]))
+        return jax.lax.fori_loop(0, 30, lambda _, s: simulator.step_together(bank, s, actions)[0], pair)
+
+    @jax.jit
+    def by_itself(bank):
+        state = simulator.reset(bank, 0, 10, 0)
+        return jax.lax.fori_loop(0, 30, lambda _, s: simulator.step(bank, s, actions[0])[0], state)
+
+    assert together(bank).facts.collision.all()
+    assert not bool(by_itself(bank).facts.collision)
+
+
+def test_other_vehicles_as_ego_replay_cleanly(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 3.7, 0, 9)]))
+    result = episodes(simulator, Expert(), bank, slot=1)
+    assert metric(result, "fde")[0] < 1e-4 and metric(result, "distance")[0] == pytest.approx(72.0, abs=0.1)
+
+
+def test_vmap_is_a_loop(simulator, world):
+    action = jnp.array([0.3, -0.1])
+    rows = jnp.array([0, 2, 5])
+    many = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(world, rows)
+    batch, _ = jax.jit(jax.vmap(simulator.step, in_axes=(None, 0, None)))(world, many, action)
+    one = jax.jit(lambda row: simulator.step(world, simulator.reset(world, row), action)[0])
+    for place, row in enumerate(rows):
+        single = one(row)
+        part = jax.tree.map(lambda leaf, place=place: leaf[place], batch)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-4), single, part)
+
+
+def test_jit_changes_nothing():
+    simulator = Simulator(Task(observation=PRESETS["minimal"]))
+    bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 0, 0, 8)], light=RED))
+    state = jax.jit(simulator.reset)(bank, 0)
+    action = jnp.array([0.3, -0.1])
+    compiled, _ = jax.jit(simulator.step)(bank, state, action)
+    with jax.disable_jit():
+        plain, _ = simulator.step(bank, state, action)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-4), plain, compiled)
