@@ -63,7 +63,12 @@ def straight_road(cars, light=None, light_x=40.0, limit=13.4, begin=-150.0, end=
     features = [
         MapFeature(1, RoadKind.LANE_SURFACE, line((begin, 0), (light_x, 0)), limit, LANE_M, (3,), (), (2,)),
         MapFeature(
-            2, RoadKind.LANE_SURFACE, line((begin, LANE_M), (end, LANE_M)), limit, LANE_M, right_neighbours=(1, 3)
+            2,
+            RoadKind.LANE_SURFACE,
+            line((begin, LANE_M), (end, LANE_M)),
+            limit,
+            LANE_M,
+            right_neighbours=(1, 3),
         ),
         MapFeature(3, RoadKind.LANE_SURFACE, line((light_x, 0), (end, 0)), limit, LANE_M, (), (1,), (2,)),
         MapFeature(
@@ -113,7 +118,8 @@ def moved(recording, angle, dx, dy):
         heading=np.where(old.valid, (old.heading + angle + np.pi) % (2 * np.pi) - np.pi, 0.0),
     )
     features = tuple(
-        replace(f, points=np.concatenate([place(f.points[:, :2]), f.points[:, 2:]], 1)) for f in recording.features
+        replace(f, points=np.concatenate([place(f.points[:, :2]), f.points[:, 2:]], 1))
+        for f in recording.features
     )
     lights = tuple(
         replace(li, stop_point=np.array([*place(li.stop_point[None, :2])[0], li.stop_point[2]]))

@@ -103,7 +103,12 @@ def frame_at(bank: Bank, scene: Scene, back: int, cast: Scene) -> jax.Array:
     """Everyone ``back`` steps ago, [A, 6]; ``cast`` stacks the scenes of all driven agents [K]."""
     log = bank.agents[scene.index, scene.step - back]
     if not isinstance(scene.traffic, tuple):
-        log = log.at[:, 0].set(scene.traffic[H - 1 - back, :, 0]).at[:, 4].set(scene.traffic[H - 1 - back, :, 1])
+        log = (
+            log.at[:, 0]
+            .set(scene.traffic[H - 1 - back, :, 0])
+            .at[:, 4]
+            .set(scene.traffic[H - 1 - back, :, 1])
+        )
     return log.at[cast.slot].set(jax.vmap(row)(cast.history[:, H - 1 - back]))
 
 
@@ -120,7 +125,9 @@ def offroad(bank: Bank, index: jax.Array, xy: jax.Array) -> jax.Array:
     return jnp.abs(xy[1]) > 6.0
 
 
-def measure(bank: Bank, scene: Scene, contacts: jax.Array, frame: jax.Array) -> tuple[Facts, jax.Array, Scene]:
+def measure(
+    bank: Bank, scene: Scene, contacts: jax.Array, frame: jax.Array
+) -> tuple[Facts, jax.Array, Scene]:
     me, size = frame[scene.slot], bank.size[scene.index]
     others = jnp.arange(A) != scene.slot
     hit = overlap(box(me, size[scene.slot])[None], box(frame, size)) & (frame[:, 5] > 0) & others
@@ -144,7 +151,9 @@ def traffic_step(scene: Scene, frame: jax.Array) -> Any:
         return ()
     x, v = scene.traffic[-1, :, 0], scene.traffic[-1, :, 1]
     ahead = frame[None, :, 0] - x[:, None]
-    ahead = jnp.where((ahead > 0.1) & (jnp.abs(frame[None, :, 1] - frame[:, None, 1]) < 2), ahead - 4.8, jnp.inf)
+    ahead = jnp.where(
+        (ahead > 0.1) & (jnp.abs(frame[None, :, 1] - frame[:, None, 1]) < 2), ahead - 4.8, jnp.inf
+    )
     leader = jnp.argmin(ahead, 1)
     a = idm_acceleration(v, jnp.full(A, 12.0), ahead.min(1), frame[leader, 4], IdmParameters())
     after = jnp.maximum(v + a * DT, 0)
@@ -164,16 +173,25 @@ def scene_from_log(bank: Bank, index: Any, step: Any, slot: Any, reactive: bool)
 
 def reset(bank: Bank, index: Any, slot: Any = 0, step: Any = START, reactive: bool = False) -> State:
     scene = scene_from_log(bank, index, step, slot, reactive)
-    facts, contacts, scene = measure(bank, scene, jnp.full(A, 3, jnp.int8), frame_at(bank, scene, 0, alone(scene)))
+    facts, contacts, scene = measure(
+        bank, scene, jnp.full(A, 3, jnp.int8), frame_at(bank, scene, 0, alone(scene))
+    )
     return State(scene, facts, contacts, scene.step)
 
 
 def move(bank: Bank, state: State, action: jax.Array, motion: jax.Array | None, cast: Scene) -> State:
     scene = state.scene
     now = bicycle(scene.history[-1], action) if motion is None else motion
-    return replace(state, scene=replace(
-        scene, step=scene.step + 1, history=jnp.concatenate([scene.history[1:], now[None]]), action=action,
-        traffic=traffic_step(scene, frame_at(bank, scene, 0, cast))))
+    return replace(
+        state,
+        scene=replace(
+            scene,
+            step=scene.step + 1,
+            history=jnp.concatenate([scene.history[1:], now[None]]),
+            action=action,
+            traffic=traffic_step(scene, frame_at(bank, scene, 0, cast)),
+        ),
+    )
 
 
 def settle(bank: Bank, before: State, moved: State, cast: Scene) -> Transition:
@@ -220,7 +238,9 @@ def reset_where(bank: Bank, key: jax.Array, t: Transition, reactive: bool) -> St
 # --- the six uses ---------------------------------------------------------------------------------------------------
 def net(key: jax.Array, *sizes: int) -> list[jax.Array]:
     keys = jax.random.split(key, len(sizes))
-    return [jax.random.normal(k, (a, b)) / np.sqrt(a) for k, a, b in zip(keys, sizes, sizes[1:], strict=False)]
+    return [
+        jax.random.normal(k, (a, b)) / np.sqrt(a) for k, a, b in zip(keys, sizes, sizes[1:], strict=False)
+    ]
 
 
 def apply(w: list[jax.Array], x: jax.Array) -> jax.Array:
@@ -242,7 +262,9 @@ def sac_update(bank: Bank, w: dict[str, Any], replay: Transition, rows: jax.Arra
     return {**w, "critic": jax.tree.map(lambda p, g: p - 1e-2 * g, w["critic"], grad)}, value
 
 
-def collect(bank: Bank, policy: list[jax.Array], states: State, key: jax.Array, steps: int, reactive: bool) -> Any:
+def collect(
+    bank: Bank, policy: list[jax.Array], states: State, key: jax.Array, steps: int, reactive: bool
+) -> Any:
     def one(carry: tuple[State, jax.Array], _: None) -> Any:
         states, key = carry
         key, act_key, reset_key = jax.random.split(key, 3)
@@ -259,7 +281,11 @@ def main() -> None:
     bank = toy_bank(key)
     batch = jax.vmap(lambda i: reset(bank, i))(jnp.arange(32))
     dim = observe(bank, jax.tree.map(lambda leaf: leaf[0], batch.scene)).shape[0]
-    w = {"policy": net(key, dim, 32, 2), "critic": net(key, dim + 2, 32, 1), "target": net(key, dim + 2, 32, 1)}
+    w = {
+        "policy": net(key, dim, 32, 2),
+        "critic": net(key, dim + 2, 32, 1),
+        "target": net(key, dim + 2, 32, 1),
+    }
 
     # 1 PPO-style collection: resets inside, truncation bootstraps the final state because ``after`` is never a reset.
     (_, _), rollout = jax.jit(partial(collect, steps=100, reactive=False))(bank, w["policy"], batch, key)
@@ -286,8 +312,9 @@ def main() -> None:
     assert float(gap) < 1e-4, gap
 
     # 4 PDM: hypothetical poses are rows of numbers, tested by the same queries: 15 proposals x 40 steps, no state.
-    poses = jax.vmap(lambda k: jax.lax.scan(lambda m, _: (bicycle(m, k),) * 2, driven.scene.history[-1], None, 40)[1])(
-        jax.random.uniform(key, (15, 2), minval=-1, maxval=1))
+    poses = jax.vmap(
+        lambda k: jax.lax.scan(lambda m, _: (bicycle(m, k),) * 2, driven.scene.history[-1], None, 40)[1]
+    )(jax.random.uniform(key, (15, 2), minval=-1, maxval=1))
     off = jax.vmap(jax.vmap(lambda p: offroad(bank, driven.scene.index, p[:2])))(poses)
     assert off.shape == (15, 40) and bool(off.any()) and not bool(off.all())
 
@@ -309,7 +336,9 @@ def main() -> None:
     seen = frame_at(bank, jax.tree.map(lambda leaf: leaf[0], pair.scene), 0, pair.scene)
     assert float(jnp.abs(seen[2, 0] - pair.scene.history[1, -1, 0])) < 1e-5
     assert float(bank.agents[5, 20, 2, 0] - seen[2, 0]) > 2.0
-    print(f"replayed scene: {stored} B; stored observation: {4 * dim} B; critic loss {losses[0]:.3f} -> {losses[-1]:.4f}")
+    print(
+        f"replayed scene: {stored} B; stored observation: {4 * dim} B; critic loss {losses[0]:.3f} -> {losses[-1]:.4f}"
+    )
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class DrivaxError(Exception):
@@ -29,7 +30,11 @@ class DrivaxError(Exception):
         self.file = None if file is None else Path(file)
         self.record = record
         self.cure = cure
-        super().__init__(problem, file, record, cure)
+        super().__init__(problem)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Worker processes send errors back; the default would call __init__ with positional arguments.
+        return type(self), (self.problem,), {"file": self.file, "record": self.record, "cure": self.cure}
 
     def __str__(self) -> str:
         place = "" if self.file is None else f"{self.file}: "

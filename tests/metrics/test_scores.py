@@ -52,7 +52,9 @@ def test_an_undefined_input_makes_the_score_partial():
 @given(st.lists(st.floats(-2, 3), min_size=len(PERFECT), max_size=len(PERFECT)), st.booleans())
 def test_scores_stay_in_the_unit_interval(numbers, crashed):
     raw = dict(zip(PERFECT, numbers, strict=True))
-    gates = {name: min(max(round(raw[name]), 0), 1) for name in ("at_fault_collision", "offroad", "red_light")}
+    gates = {
+        name: min(max(round(raw[name]), 0), 1) for name in ("at_fault_collision", "offroad", "red_light")
+    }
     gates |= {name: min(max(round(2 * raw[name]) / 2, 0.0), 1.0) for name in ("making_progress", "direction")}
     for score in (nuplan_score, vmax_score):
         result = float(score(values(**(raw | gates)))[0].value)

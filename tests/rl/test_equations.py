@@ -51,7 +51,10 @@ def test_advantages_by_hand():
 
 @pytest.mark.parametrize(
     ("ratio", "advantage", "loss", "slope"),
-    [(1.1, 2.0, -2.2, True), (1.5, 2.0, -2.4, False), (0.5, 2.0, -1.0, True), (0.5, -2.0, 1.6, False), (1.5, -2.0, 3.0, True)],
+    [
+        (1.1, 2.0, -2.2, True), (1.5, 2.0, -2.4, False), (0.5, 2.0, -1.0, True), (0.5, -2.0, 1.6, False),
+        (1.5, -2.0, 3.0, True),
+    ],
 )  # fmt: skip
 def test_clipped_surrogate(ratio, advantage, loss, slope):
     def of(log_prob):

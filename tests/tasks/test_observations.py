@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import RED, bank_of, car, moved, straight_road
 
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import PRESETS, ObservationConfig
 from drivax.tasks.task import Task
+from scenes import RED, bank_of, car, moved, straight_road
 
 
 def look(bank, preset="optimal", step=10):

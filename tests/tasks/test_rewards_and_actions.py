@@ -1,17 +1,18 @@
 """Reward terms on hand-made facts; action spaces there and back."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import bank_of, car, straight_road
 
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
 from drivax.tasks.rewards import PRESETS, RewardConfig
 from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def measured():
 
 
 def reward(config, before, now, around):
-    return {k: float(v) for k, v in Task(reward_config=config).reward(before, now, around).items()}
+    return {k: float(v) for k, v in Task(rewards=config).reward(before, now, around).items()}
 
 
 def test_navigation_by_hand(measured):
@@ -52,7 +53,7 @@ def test_behaviour_by_hand(measured):
 
 def test_presets_include_those_before_them():
     names = ["safety", "navigation", "behaviour"]
-    for less, more in zip(names, names[1:], strict=False):
+    for less, more in pairwise(names):
         assert PRESETS[less].items() <= PRESETS[more].items()
     assert RewardConfig(preset="safety", progress=0.5).weights() == {**PRESETS["safety"], "progress": 0.5}
 

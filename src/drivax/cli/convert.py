@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from drivax.datasets.convert import Conversion, Converted, Progress, convert
+from drivax.datasets.convert import Conversion, Converted, convert
+from drivax.evaluation.audit import audit
+from drivax.tracking.progress import Progress
 
 _SHOWN = 20
-_LINE_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,12 @@ def run(args: Convert) -> int:
         strict=args.strict,
         overwrite=args.overwrite,
     )
-    with _progress() as progress:
-        result = convert(args.src, args.out, options, progress)
+    with Progress("converting", "files") as bar:
+
+        def report(done: int, files: int, scenarios: int) -> None:
+            bar.update(done, f"{scenarios:,} scenarios", files)
+
+        result = convert(args.src, args.out, options, report, audit)
     print(summary(result))
     for bad in result.skipped[:_SHOWN]:
         print(f"skipped {bad.error()}", file=sys.stderr)
@@ -86,48 +88,3 @@ def summary(result: Converted) -> str:
 def counted(number: int, noun: str) -> str:
     """A number with its noun, in the plural where it must be."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A bar with rate and time left on a terminal, a line every ten seconds elsewhere."""
-    if not sys.stderr.isatty():
-        yield _lines()
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("files"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[scenarios]:,} scenarios, {task.fields[rate]:.1f}/s"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None, scenarios=0, rate=0.0)
-        begin = time.monotonic()
-
-        def report(done: int, files: int, scenarios: int) -> None:
-            rate = scenarios / max(time.monotonic() - begin, 1e-3)
-            bar.update(task, completed=done, total=files, scenarios=scenarios, rate=rate)
-
-        yield report
-
-
-def _lines() -> Progress:
-    begin = last = time.monotonic()
-
-    def report(done: int, files: int, scenarios: int) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last < _LINE_EVERY_S:
-            return
-        last = now
-        left = f", {(now - begin) / done * (files - done):.0f} s left" if done else ""
-        rate = scenarios / (now - begin)
-        print(
-            f"{done} of {files} files, {scenarios} scenarios, {rate:.1f}/s{left}", file=sys.stderr, flush=True
-        )
-
-    return report

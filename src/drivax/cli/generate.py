@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import os
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from drivax.synthetic.generate import GeneratedSet, Generation, Progress, generate
-
-_LINE_EVERY_S = 10.0
+from drivax.evaluation.audit import audit
+from drivax.synthetic.generate import GeneratedSet, Generation, generate
+from drivax.tracking.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -49,8 +45,15 @@ def run(args: Generate) -> int:
         capacity=args.capacity,
         overwrite=args.overwrite,
     )
-    with _progress() as progress:
-        result = generate(args.out, args.scenarios, args.seed, options, progress)
+    with Progress("generating", "scenarios") as bar:
+        result = generate(
+            args.out,
+            args.scenarios,
+            args.seed,
+            options,
+            lambda done, total: bar.update(done, total=total),
+            audit,
+        )
     print(summary(result))
     return 0
 
@@ -65,48 +68,3 @@ def summary(result: GeneratedSet) -> str:
         line = f"  {name:<{width}}  {count.kept:>6,} kept, {count.rejection_rate:6.2%} of draws rejected"
         lines.append(line + (f" ({causes})" if causes else ""))
     return "\n".join(lines)
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A bar with rate and time left on a terminal, a line every ten seconds elsewhere."""
-    if not sys.stderr.isatty():
-        yield _lines()
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("scenarios"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:.1f}/s"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None, rate=0.0)
-        begin = time.monotonic()
-
-        def report(done: int, scenarios: int) -> None:
-            rate = done / max(time.monotonic() - begin, 1e-3)
-            bar.update(task, completed=done, total=scenarios, rate=rate)
-
-        yield report
-
-
-def _lines() -> Progress:
-    begin = last = time.monotonic()
-
-    def report(done: int, scenarios: int) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last < _LINE_EVERY_S:
-            return
-        last = now
-        rate = done / (now - begin)
-        left = (scenarios - done) / rate
-        print(
-            f"{done} of {scenarios} scenarios, {rate:.1f}/s, {left:.0f} s left", file=sys.stderr, flush=True
-        )
-
-    return report

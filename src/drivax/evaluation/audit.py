@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drivax.evaluation.results import Results
-from drivax.evaluation.runner import evaluate
+from drivax.evaluation.runner import BATCH, evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import Flag, Scenario
@@ -33,10 +33,17 @@ def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
     usable = [scenario for scenario in scenarios if Flag.NO_FUTURE not in scenario.has]
     if not usable:
         return [{} for _ in scenarios]
-    bank = ScenarioBank.from_scenarios(usable)
-    results = evaluate(Expert(), bank, scenario_names(usable))
-    findings = iter(_findings(results))
+    findings = iter(
+        [row for first in range(0, len(usable), BATCH) for row in _replay(usable[first : first + BATCH])]
+    )
     return [{} if Flag.NO_FUTURE in scenario.has else next(findings) for scenario in scenarios]
+
+
+def _replay(scenarios: Sequence[Scenario]) -> list[Finding]:
+    """Findings of one batch. It is filled up and not trimmed, so that one compiled program serves every batch."""
+    filled = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
+    bank = ScenarioBank.from_scenarios(filled, trim=False)
+    return _findings(evaluate(Expert(), bank, scenario_names(filled)))[: len(scenarios)]
 
 
 def _findings(results: Results) -> list[Finding]:

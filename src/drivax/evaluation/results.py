@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from drivax.errors import DataError
-from drivax.evaluation.statistics import Interval, bootstrap_mean, rate
+from drivax.errors import DataError, UsageError
+from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap, rate
 from drivax.metrics.episode import EVENTS, METRICS
 
 #: Columns of ``episodes.csv`` before the metrics.
@@ -23,7 +23,7 @@ RATES = (
     "left_map", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal",
 )  # fmt: skip
 #: Codes and counts that no mean makes sense of.
-_NOT_SUMMARISED = ("collision_type", "steps")
+NOT_SUMMARISED = ("collision_type", "steps")
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Results:
         clusters = np.array([row["segment"] for row in self.scenarios])
         table = {}
         for name in METRICS:
-            if name in _NOT_SUMMARISED:
+            if name in NOT_SUMMARISED:
                 continue
             table[name] = interval_of(name, self.metrics[name], clusters).as_dict()
         return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
@@ -109,7 +109,20 @@ def interval_of(name: str, values: np.ndarray[Any, Any], clusters: np.ndarray[An
     """Mean and 95 % interval over the episodes that define the metric."""
     if name in RATES:
         return rate(values, clusters)
-    return bootstrap_mean(values, clusters, resamples=2_000, seed=0)
+    return bootstrap_mean(values, clusters, seed=0)
+
+
+def paired_differences(one: Results, other: Results, metric: str) -> Interval:
+    """Mean difference of a metric over the scenarios of both, ``one - other``, with its 95 % interval.
+
+    Raises:
+        UsageError: If they did not drive the same scenarios.
+    """
+    ids = [[row["scenario_id"] for row in result.scenarios] for result in (one, other)]
+    if ids[0] != ids[1]:
+        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
+    clusters = np.array([row["segment"] for row in one.scenarios])
+    return paired_bootstrap(one.metrics[metric], other.metrics[metric], clusters, seed=0)
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

@@ -46,12 +46,12 @@ class Rollout:
     """
 
     observation: dict[str, Array]
-    choice: Float[Array, "time batch 2"]
+    choice: Float[Array, "*time batch 2"]
     extra: dict[str, Array]
-    reward: Float[Array, "time batch"]
-    terminated: Bool[Array, "time batch"]
-    truncated: Bool[Array, "time batch"]
-    alive: Bool[Array, "time batch"]
+    reward: Float[Array, "*time batch"]
+    terminated: Bool[Array, "*time batch"]
+    truncated: Bool[Array, "*time batch"]
+    alive: Bool[Array, "*time batch"]
 
 
 #: From observations and a key to (choice before squashing, action in [-1, 1], what to remember).
@@ -69,24 +69,31 @@ def start_environments(simulator: Simulator, bank: ScenarioBank, key: Array, cou
 
 
 def collect(
-    simulator: Simulator, bank: ScenarioBank, environments: Environments, actor: Actor, key: Array, steps: int
+    simulator: Simulator,
+    bank: ScenarioBank,
+    environments: Environments,
+    actor: Actor,
+    key: Array,
+    steps: int,
+    latest_start: int = CURRENT_STEP,
 ) -> tuple[Environments, Rollout, dict[str, Array]]:
-    """Unrolls ``steps`` steps in every environment.
+    """Unrolls ``steps`` steps in every environment; episodes begin between step 10 and ``latest_start``.
 
     Returns:
         The environments afterwards, the experience, and sums of metrics over the episodes that ended, with
         ``"<name>"`` the sum and ``"<name>/n"`` the number of episodes that define it.
     """
     count = environments.over.shape[0]
-    step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
+    step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
     observe_all = jax.vmap(simulator.observe, in_axes=(None, 0))
 
     def one(carry: tuple[Environments, Array], _: None) -> tuple[Any, Any]:
         now, key = carry
-        key, act_key, index_key = jax.random.split(key, 3)
+        key, act_key, index_key, start_key = jax.random.split(key, 4)
         choice, action, extra = actor(now.observation, act_key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
-        state, transition = step_all(bank, now.state, action, now.over, index)
+        start = jax.random.randint(start_key, (count,), CURRENT_STEP, latest_start + 1)
+        state, transition = step_all(bank, now.state, action, now.over, index, start)
         row = Rollout(
             observation=now.observation,
             choice=choice,

@@ -29,6 +29,7 @@ class PpoConfig:
         network: Policy and value.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
+        latest_start: Episodes begin at a random step of the log between 10 and this one.
         epochs, minibatches: Passes over the experience, and updates per pass.
         learning_rate: Of Adam, falling linearly to a tenth over the run.
         gamma, lambda_: Discount, and mixing of advantages.
@@ -41,6 +42,7 @@ class PpoConfig:
     network: ActorCriticConfig = field(default_factory=ActorCriticConfig)
     environments: int = 256
     unroll: int = 64
+    latest_start: int = 10
     epochs: int = 4
     minibatches: int = 8
     learning_rate: float = 3e-4
@@ -114,7 +116,13 @@ class Ppo:
             return choice, jnp.tanh(choice), extra
 
         environments, rollout, totals = collect(
-            self.simulator, bank, state.environments, actor, collect_key, self.config.unroll
+            self.simulator,
+            bank,
+            state.environments,
+            actor,
+            collect_key,
+            self.config.unroll,
+            self.config.latest_start,
         )
         last = network.value(environments.observation)
         parameters, optimiser, losses = self._update(state, rollout, last, update_key)
@@ -156,7 +164,7 @@ class Ppo:
             part = jax.tree.map(lambda leaf: leaf[rows], batch)
             key = jax.random.fold_in(update_noise, rows[0])
             (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key)
-            logs["gradient_norm"] = optax.global_norm(gradient)
+            logs["gradient_norm"] = optax.tree.norm(gradient)
             change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
             return (optax.apply_updates(parameters, change), optimiser), logs
 

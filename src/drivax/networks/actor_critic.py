@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
@@ -12,8 +13,6 @@ from drivax.networks.distributions import SquashedGaussian
 from drivax.networks.encoders import Groups, GroupSpec, MlpConfig, MlpEncoder
 
 _ACTIONS = 2
-#: Standard deviation of an untrained policy before squashing, through softplus.
-_FIRST_SCALE = 0.5
 
 
 @dataclass(frozen=True)
@@ -23,10 +22,12 @@ class ActorCriticConfig:
     Attributes:
         encoder: The encoder; policy and value have one each.
         head: Hidden layers between embedding and output.
+        first_scale: Standard deviation of an untrained policy before squashing.
     """
 
     encoder: MlpConfig = field(default_factory=MlpConfig)
     head: tuple[int, ...] = (64,)
+    first_scale: float = 0.3
 
 
 class _Head(nnx.Module):
@@ -50,12 +51,12 @@ class Policy(nnx.Module):
     def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         self.encoder = MlpEncoder(config.encoder, spec, rngs)
         self.head = _Head(self.encoder.width, config.head, 2 * _ACTIONS, 0.01, rngs)
+        self.shift = math.log(math.expm1(config.first_scale))
 
     def __call__(self, groups: Groups) -> SquashedGaussian:
-        """The action distribution; near zero mean and standard deviation 0.5 before training."""
+        """The action distribution; near zero mean and the first standard deviation before training."""
         raw = self.head(self.encoder(groups))
-        shift = jnp.log(jnp.expm1(_FIRST_SCALE))
-        return SquashedGaussian.from_parameters(raw.at[..., _ACTIONS:].add(shift))
+        return SquashedGaussian.from_parameters(raw.at[..., _ACTIONS:].add(self.shift))
 
 
 class Value(nnx.Module):

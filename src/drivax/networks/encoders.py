@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -20,56 +21,84 @@ _ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "sil
 
 @dataclass(frozen=True)
 class MlpConfig:
-    """All groups flattened, side by side, through dense layers.
+    """All groups side by side through dense layers.
 
     Attributes:
-        hidden: Width of each layer; the last is the size of the embedding.
+        rows: Layers that the rows of each masked group share before a maximum over the rows, so that their order does
+            not matter; empty: the rows are flattened in their order.
+        hidden: Width of each layer behind; the last is the size of the embedding.
         activation: After every layer.
     """
 
     kind: Literal["mlp"] = "mlp"
+    rows: tuple[int, ...] = ()
     hidden: tuple[int, ...] = (256, 256)
     activation: Literal["relu", "tanh", "gelu", "silu"] = "relu"
 
 
 class MlpEncoder(nnx.Module):
-    """Flattens every group (masked rows are zero), appends the masks, and applies dense layers."""
+    """Flattens or pools every group (masked rows never matter), then applies dense layers."""
 
     def __init__(self, config: MlpConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
-        self.names = tuple(sorted(spec))
+        self.pools = bool(config.rows)
+        self.names = tuple(sorted(name for name in spec if not self._is_mask(name, spec)))
+        self.shapes = {name: tuple(spec[name]) for name in self.names}
         self.activation = config.activation
-        self.rank = len(spec[self.names[0]])
-        width = sum(_size(spec[name]) for name in self.names)
-        layers = []
-        for size in config.hidden:
-            layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
-            width = size
-        self.layers = nnx.List(layers)
-        self.width = width
+        width, shared = 0, {}
+        for name in self.names:
+            masked = f"{name}_mask" in spec
+            if masked and self.pools:
+                # One row is what the mask's first axis counts; times of one row go side by side with their masks.
+                one = math.prod(spec[name][1:]) + math.prod(spec[f"{name}_mask"][1:])
+                shared[name] = _layers(one, config.rows, rngs)
+                width += config.rows[-1]
+            else:
+                width += math.prod(spec[name]) + (math.prod(spec[f"{name}_mask"]) if masked else 0)
+        self.shared = nnx.Dict(shared)
+        self.layers = _layers(width, config.hidden, rngs)
+        self.width = config.hidden[-1]
+
+    @staticmethod
+    def _is_mask(name: str, spec: GroupSpec) -> bool:
+        return name.endswith("_mask") and name.removesuffix("_mask") in spec
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Encodes one observation or a batch of them."""
-        lead = groups[self.names[0]].ndim - self.rank
-        parts = []
-        for name in self.names:
-            value = groups[name].astype(jnp.float32)
-            mask = groups.get(f"{name}_mask")
-            if mask is not None:
-                value = jnp.where(mask[..., None], value, 0.0)
-            parts.append(value.reshape(*value.shape[:lead], -1))
-        x = jnp.concatenate(parts, axis=-1)
-        for layer in self.layers:
+        x = jnp.concatenate([self._part(name, groups) for name in self.names], axis=-1)
+        return self._dense(self.layers, x)
+
+    def _part(self, name: str, groups: Groups) -> Float[Array, "*batch part"]:
+        value, mask = groups[name].astype(jnp.float32), groups.get(f"{name}_mask")
+        lead = value.shape[: value.ndim - len(self.shapes[name])]
+        if mask is None:
+            return value.reshape(*lead, -1)
+        value = jnp.where(mask[..., None], value, 0.0)
+        if not self.pools:
+            return jnp.concatenate(
+                [value.reshape(*lead, -1), mask.reshape(*lead, -1).astype(jnp.float32)], axis=-1
+            )
+        rows = self.shapes[name][0]
+        there = mask.reshape(*lead, rows, -1)
+        row = jnp.concatenate([value.reshape(*lead, rows, -1), there.astype(jnp.float32)], axis=-1)
+        embedded = self._dense(self.shared[name], row)
+        # A row counts when any of its times does; no row at all embeds as zero.
+        counts = there.any(axis=-1, keepdims=True)
+        return jnp.max(embedded, axis=-2, initial=0.0, where=counts)
+
+    def _dense(self, layers: Any, x: Array) -> Array:
+        for layer in layers:
             x = _ACTIVATIONS[self.activation](layer(x))
         return x
 
 
-def group_spec(observation: Groups) -> dict[str, tuple[int, ...]]:
+def _layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
+    layers = []
+    for size in sizes:
+        layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
+        width = size
+    return nnx.List(layers)
+
+
+def group_spec(observation: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     """Shapes of the groups of one (unbatched) observation."""
     return {name: tuple(value.shape) for name, value in observation.items()}
-
-
-def _size(shape: tuple[int, ...]) -> int:
-    size = 1
-    for dimension in shape:
-        size *= dimension
-    return size

@@ -48,10 +48,10 @@ JITTER_S = 0.002
 STRIDE = 40
 #: Heights that differ by less are one level: the source has no elevation.
 FLAT_M = 0.01
-#: Flags that are decided here, whatever the reader said.
+#: Flags that are decided here, whatever the reader said. That lights are known is not among them: a source may know
+#: that there are none.
 MEASURED = (
-    Flag.LIGHTS
-    | Flag.LANE_GRAPH
+    Flag.LANE_GRAPH
     | Flag.SPEED_LIMITS
     | Flag.CHAINED_GRAPH
     | Flag.CLOSED_EDGES

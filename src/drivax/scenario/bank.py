@@ -91,8 +91,16 @@ class ScenarioBank:
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
 
     @classmethod
-    def from_scenarios(cls, scenarios: Iterable[Scenario], *, allow_no_future: bool = False) -> ScenarioBank:
+    def from_scenarios(
+        cls, scenarios: Iterable[Scenario], *, trim: bool = True, allow_no_future: bool = False
+    ) -> ScenarioBank:
         """Stacks scenarios of one capacity.
+
+        Args:
+            scenarios: All of one capacity.
+            trim: Cut padding that no scenario of the bank uses. Untrimmed banks of one capacity share one compiled
+                program; trimmed ones are smaller and faster.
+            allow_no_future: Accept test splits.
 
         Raises:
             DrivaxError: If there are none, or one has no future and ``allow_no_future`` is not set.
@@ -105,7 +113,7 @@ class ScenarioBank:
                 raise DataError(
                     "has no logged future (a test split)", record=scenario.id, cure="leave it out of the set"
                 )
-        arrays, static = _stack(kept)
+        arrays, static = _stack(kept, trim)
         return cls(**{name: jnp.asarray(value) for name, value in arrays.items()}, **static)
 
 
@@ -113,15 +121,19 @@ def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
     return np.stack([scenario.record[name] for scenario in scenarios])
 
 
-def _used(mask: Any, multiple: int = 8) -> int:
+def _used(mask: Any, trim: bool, multiple: int = 8) -> int:
     """How many columns of ``mask [N, columns]`` are used, rounded up; trailing padding is cut."""
+    if not trim:
+        return mask.shape[1]
     used = np.flatnonzero(mask.any(0))
     return 0 if used.size == 0 else min(mask.shape[1], -(-(int(used[-1]) + 1) // multiple) * multiple)
 
 
-def _stack(scenarios: Sequence[Scenario]) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
-    arrays = _stack_agents(scenarios) | _stack_routes(scenarios) | _stack_lights(scenarios)
-    maps, static = _stack_maps(scenarios)
+def _stack(
+    scenarios: Sequence[Scenario], trim: bool
+) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+    arrays = _stack_agents(scenarios, trim) | _stack_routes(scenarios) | _stack_lights(scenarios, trim)
+    maps, static = _stack_maps(scenarios, trim)
     reach = np.hypot(arrays["agent_box"][:, 0, 0], arrays["agent_box"][:, 0, 1]) / 2
     capacity = scenarios[0].capacity
     # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
@@ -129,9 +141,9 @@ def _stack(scenarios: Sequence[Scenario]) -> tuple[dict[str, np.ndarray[Any, Any
     return arrays | maps, static
 
 
-def _stack_agents(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_agents(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     valid = _column(scenarios, "agent_valid")
-    slots = max(1, _used(valid.any(1)))
+    slots = max(1, _used(valid.any(1), trim))
     heading = _column(scenarios, "agent_heading")
     agents = np.concatenate(
         [
@@ -147,7 +159,7 @@ def _stack_agents(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, An
     )[:, :, :slots]
     size, kind = _column(scenarios, "agent_size"), _column(scenarios, "agent_kind")
     parked_valid = _column(scenarios, "parked_valid")
-    places = _used(parked_valid.any(1))
+    places = _used(parked_valid.any(1), trim)
     parked_heading = _column(scenarios, "parked_heading")[..., None]
     parked = np.concatenate(
         [
@@ -192,7 +204,7 @@ def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, An
     }
 
 
-def _stack_lights(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     line, lane, state = (_column(scenarios, f"light_{name}") for name in ("line", "lane", "state"))
     route_lane = _column(scenarios, "route_lane")[:, 0]
     on_route = ((lane[:, :, None] == route_lane[:, None, :]) & (lane[:, :, None] >= 0)).any(-1)
@@ -200,20 +212,26 @@ def _stack_lights(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, An
         [line, *(_column(scenarios, f"light_{n}")[..., None] for n in ("z", "heading", "exit_heading"))], -1
     )
     light = np.concatenate([light, on_route[..., None]], -1, dtype=np.float32)
-    used = max(1, _used((state >= 0).any(1)))
+    used = max(1, _used((state >= 0).any(1), trim))
     return {"light_line": light[:, :used], "light_state": state[:, :, :used]}
 
 
-def _stack_maps(scenarios: Sequence[Scenario]) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+def _stack_maps(
+    scenarios: Sequence[Scenario], trim: bool
+) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
     blocks = _column(scenarios, "segment_blocks").astype(np.int64)
     edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
     grid = scenarios[0].capacity.grid
     grid_edge = _column(scenarios, "grid_edge").astype(np.int16)
     grid_lane = (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16)
-    edge_run, lane_run = _longest_run(grid_edge, grid), _longest_run(grid_lane, grid)
+    capacity = scenarios[0].capacity
+    edge_run = _longest_run(grid_edge, grid) if trim else capacity.edge_run
+    lane_run = _longest_run(grid_lane, grid) if trim else capacity.lane_run
+    edge_rows = int(edge_count.max()) if trim else capacity.segments
+    lane_rows = int(lane_count.max()) if trim else capacity.segments
     # A run is read whole, so every start must leave room for one behind it.
-    edges = np.full((len(scenarios), 5, int(edge_count.max()) + edge_run), 1e6, np.float32)
-    lanes = np.full((len(scenarios), 9, int(lane_count.max()) + lane_run), 1e6, np.float32)
+    edges = np.full((len(scenarios), 5, edge_rows + edge_run), 1e6, np.float32)
+    lanes = np.full((len(scenarios), 9, lane_rows + lane_run), 1e6, np.float32)
     box = np.zeros((len(scenarios), 4), np.float32)
     for row, scenario in enumerate(scenarios):
         e, n = int(edge_count[row]), int(lane_count[row])
@@ -224,7 +242,7 @@ def _stack_maps(scenarios: Sequence[Scenario]) -> tuple[dict[str, np.ndarray[Any
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
     rows = _column(scenarios, "road_rows").astype(np.int32)
-    used = max(1, int(rows.max()))
+    used = max(1, int(rows.max())) if trim else capacity.road_rows
     road = [_column(scenarios, "road_xy"), _column(scenarios, "road_direction")]
     road += [_column(scenarios, f"road_{n}")[..., None] for n in ("length", "kind", "limit", "curvature")]
     arrays = {

@@ -80,7 +80,8 @@ def trace(
     xyz = np.concatenate([part[0] for part in parts])
     label = np.concatenate([part[1] for part in parts])
     step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
-    keep = np.concatenate(([True], step > 0.01))
+    # Of two equal points the later one stays: what lies ahead of it belongs to its lane.
+    keep = np.concatenate((step > 0.01, [True]))
     return xyz[keep], label[keep]
 
 

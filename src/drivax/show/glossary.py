@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from drivax.evaluation.results import RATES
+from drivax.evaluation.results import NOT_SUMMARISED, RATES
 from drivax.metrics.episode import METRICS
 
 Direction = Literal["up", "down", "none"]
@@ -59,7 +59,7 @@ HEADLINE = (
     "progress_ratio", "ttc_ok", "comfortable", "vmax_score", "nuplan_score",
 )  # fmt: skip
 #: Codes and counts, of which no mean is shown.
-CODES = frozenset(("collision_type", "steps"))
+CODES = frozenset(NOT_SUMMARISED)
 ARROWS = MappingProxyType({"up": "↑", "down": "↓", "none": ""})
 _DIRECTIONS: dict[str, Direction] = {"high": "up", "low": "down", "-": "none"}
 

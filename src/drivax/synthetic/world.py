@@ -255,10 +255,10 @@ def _track_id(vehicle: int) -> int:
 def _recorded(scenario_id: str, cast: _Cast, motion: Motion, events: tuple[Event, ...]) -> Recording:
     network = cast.network
     times = np.arange(STEPS) * DT_S
-    flags = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.CLOSED_EDGES
+    # The world knows where there are no lights, so a road without them has its red-light metric defined.
+    flags = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.CLOSED_EDGES | Flag.LIGHTS
     lights: tuple[Light, ...] = ()
     if network.signals is not None:
-        flags |= Flag.LIGHTS
         colour, _ = network.signals.colours(times, len(network.lanes))
         lights = tuple(
             Light(

@@ -34,7 +34,7 @@ class Task:
 
     actions: ActionSpace = field(default_factory=ActionSpace)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    reward_config: RewardConfig = field(default_factory=RewardConfig)
+    rewards: RewardConfig = field(default_factory=RewardConfig)
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
 
     def motion(self, motion: Float[Array, 4], action: Float[Array, 2], length: Any) -> Float[Array, 4]:
@@ -49,7 +49,7 @@ class Task:
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Weighted terms by name."""
-        weights = self.reward_config.weights()
+        weights = self.rewards.weights()
         return {name: weight * TERMS[name](before, now, around) for name, weight in weights.items()}
 
     def ended(

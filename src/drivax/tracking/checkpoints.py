@@ -102,12 +102,13 @@ class Checkpoints:
         self._drop()
         return final
 
-    def restore(self, template: State, step: int | None = None) -> State:
-        """The stored state.
+    def restore(self, template: State, step: int | None = None, part: str = "") -> State:
+        """The stored state, or a part of it.
 
         Args:
             template: A state of the same structure (values do not matter; ``jax.ShapeDtypeStruct`` leaves will do).
             step: Which; None: the newest.
+            part: Path of a part of the state (``.parameters``), of which ``template`` then is.
 
         Raises:
             DataError: No such checkpoint, it is damaged, or it does not fit the template; names the first leaf.
@@ -117,11 +118,17 @@ class Checkpoints:
             if not steps:
                 raise DataError("there is no checkpoint", file=self.folder, cure="train without --resume")
             step = steps[-1]
-        leaves = self.about(step)["leaves"]
+        stored = self.about(step)["leaves"]
         path = self._path(step)
         wanted, structure = jax.tree_util.tree_flatten_with_path(template)
-        _compare(path, leaves, [(jax.tree_util.keystr(key), leaf) for key, leaf in wanted])
-        arrays = _load_arrays(path, leaves)
+        numbered = [(n, leaf) for n, leaf in enumerate(stored) if leaf["name"].startswith(part)]
+        _compare(
+            path,
+            [leaf for _, leaf in numbered],
+            [(part + jax.tree_util.keystr(key), leaf) for key, leaf in wanted],
+        )
+        everything = _load_arrays(path, stored)
+        arrays = [everything[number] for number, _ in numbered]
         values = [_rebuild(array, leaf) for array, (_, leaf) in zip(arrays, wanted, strict=True)]
         return jax.tree_util.tree_unflatten(structure, values)
 

@@ -66,7 +66,7 @@ class RunFolder:
             UsageError: ``path`` exists.
         """
         path = Path(path)
-        _refuse_existing(path, overwrite)
+        refuse_existing(path, overwrite)
         info = describe_run(data) | notes
         partial = path.parent / f".{path.name}.partial-{os.getpid()}"
         shutil.rmtree(partial, ignore_errors=True)
@@ -190,7 +190,12 @@ def write_text(file: Path, text: str) -> None:
     partial.replace(file)
 
 
-def _refuse_existing(path: Path, overwrite: bool) -> None:
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Refuses a folder that a run may not be written to, before any work is done.
+
+    Raises:
+        UsageError: It exists and is no run folder, or ``overwrite`` is not given.
+    """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not (path / RUN_FILE).is_file():

@@ -1,0 +1,93 @@
+"""What users call from Python: load a set, make a simulator, drive a planner, in one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivax.errors import UsageError
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.results import Results
+from drivax.evaluation.runner import evaluate as drive_all
+from drivax.learning.policies import load_policy
+from drivax.planners.catalogue import PLANNERS, make_planner
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import Scenario
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import LogTraffic
+from drivax.tasks.task import Task
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Scenarios in both forms: as they are stored, and on the device.
+
+    Attributes:
+        scenarios: The stored scenarios.
+        bank: The same, stacked on the device; an argument of everything that simulates.
+        names: ``dataset``, ``scenario_id`` and ``segment`` of each.
+    """
+
+    scenarios: Sequence[Scenario]
+    bank: ScenarioBank
+    names: Sequence[Mapping[str, str]]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def load(data: str | Path | Sequence[Scenario], limit: int | None = None) -> Loaded:
+    """Scenarios of a set, or of your own making, ready to simulate.
+
+    Args:
+        data: Folder of a scenario set, or scenarios.
+        limit: Only the first so many.
+    """
+    stored = ScenarioSet.open(data) if isinstance(data, str | Path) else data
+    scenarios = [stored[row] for row in range(len(stored) if limit is None else min(limit, len(stored)))]
+    return Loaded(scenarios, ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
+
+
+def make_simulator(task: Task | None = None) -> Simulator:
+    """A simulator of a task (the default one otherwise) in log traffic."""
+    return Simulator(task or Task(), LogTraffic())
+
+
+def evaluate(
+    planner: str | Path | Planner, data: str | Path | Loaded, *, task: Task | None = None, **options: Any
+) -> Results:
+    """Drives every scenario to the end of its log and measures it; writes nothing.
+
+    Args:
+        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), or a planner.
+        data: Folder of a scenario set, or what :func:`load` returned.
+        task: Action space and observation of a planner of your own.
+        options: ``start_step``, ``seed``, ``progress`` of ``evaluation.runner.evaluate``.
+    """
+    loaded = data if isinstance(data, Loaded) else load(data)
+    if isinstance(planner, str | Path):
+        planner, task = find_planner(str(planner), loaded.bank)
+    return drive_all(planner, loaded.bank, loaded.names, task=task, **options)
+
+
+def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
+    """The planner of a name or run folder, and the task that it was made for.
+
+    Raises:
+        UsageError: If there is neither such a planner nor such a folder.
+    """
+    if name in PLANNERS:
+        return make_planner(name), Task()
+    folder, _, step = name.partition("@")
+    if not Path(folder).is_dir():
+        raise UsageError(
+            f"there is no planner {name!r}",
+            cure=f"use {', '.join(PLANNERS)}, or the folder of a training run",
+        )
+    if step and not step.isdecimal():
+        raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")
+    return load_policy(folder, bank, step=int(step) if step else None, samples=sample)

@@ -1,0 +1,56 @@
+"""``drivax train``: train a planner from a configuration file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.learning.config import TrainConfig
+from drivax.learning.loop import train
+from drivax.scenario.store import ScenarioSet
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy with reinforcement learning.
+
+    CONFIG is a YAML file or the name of a preset; any of its settings can be given behind as --section.key VALUE.
+
+    Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
+    """
+
+    config: tyro.conf.Positional[str]
+    """YAML file, or name of a preset (demo)."""
+    data: Path
+    """Scenario set to train on."""
+    out: Path
+    """Run folder to write."""
+    validation: Path | None = None
+    """Scenario set that chooses the best checkpoint."""
+    resume: bool = False
+    """Continue the run in OUT from its newest checkpoint."""
+    overwrite: bool = False
+    """Replace OUT if it is a run folder."""
+
+
+def run(args: Train, overrides: Sequence[str] = ()) -> int:
+    """Train, then say where the run is."""
+    if args.resume and overrides:
+        raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(overrides))
+    config = settings.load(TrainConfig, args.config, list(overrides))
+    validation = None if args.validation is None else ScenarioSet.open(args.validation)
+    folder = train(
+        config,
+        ScenarioSet.open(args.data),
+        args.out,
+        validation=validation,
+        resume=args.resume,
+        overwrite=args.overwrite,
+    )
+    print(f"wrote {folder.path}")
+    return 0

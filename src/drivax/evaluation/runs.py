@@ -1,0 +1,98 @@
+"""An evaluation as a run folder, and its headline as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.results import Results
+from drivax.evaluation.runner import evaluate
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.store import ScenarioSet
+from drivax.tasks.task import Task
+from drivax.tracking.progress import Progress
+from drivax.tracking.runs import RunFolder, refuse_existing
+
+#: Columns of the headline, with their short names.
+HEADLINE = {
+    "success": "success", "accuracy": "accuracy", "at_fault_collision": "at fault", "collision": "collision",
+    "offroad": "off-road", "red_light": "red light", "progress_ratio": "progress", "comfortable": "comfort",
+    "vmax_score": "vmax",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What was evaluated; written as ``config.yaml``."""
+
+    planner: str
+    traffic: str = "log"
+    start_step: int = CURRENT_STEP
+    limit: int | None = None
+    seed: int = 0
+
+
+def run_evaluation(
+    config: EvaluationConfig,
+    planner: Planner,
+    data: ScenarioSet,
+    out: str | Path,
+    *,
+    bank: ScenarioBank | None = None,
+    task: Task | None = None,
+    overwrite: bool = False,
+) -> Results:
+    """Evaluates a planner on a set and writes the run folder.
+
+    Args:
+        config: Start step, seed and limit.
+        planner: The driver.
+        data: The scenarios; the first ``config.limit`` of them.
+        out: Run folder; it appears after the drive.
+        bank: The bank of these scenarios, where it exists already.
+        task: Action space and observation of the planner.
+        overwrite: Replace an existing run folder.
+    """
+    count = min(len(data), config.limit or len(data))
+    scenarios = [data[row] for row in range(count)]
+    bank = ScenarioBank.from_scenarios(scenarios) if bank is None else bank
+    refuse_existing(Path(out), overwrite)
+    with Progress(f"driving {planner.name}", "scenarios", count) as bar:
+        results = evaluate(
+            planner,
+            bank,
+            scenario_names(scenarios),
+            task=task,
+            start_step=config.start_step,
+            seed=config.seed,
+            progress=lambda done, total: bar.update(done),
+        )
+    folder = RunFolder.create(
+        out,
+        config,
+        data=[data],
+        overwrite=overwrite,
+        kind="evaluation",
+        planner=planner.name,
+        traffic=config.traffic,
+    )
+    results.write(folder.path)
+    return results
+
+
+def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
+    """Planners and their headline metrics as a table of at most 100 columns; empty where undefined."""
+    width = max(len("planner"), *(len(summary["planner"]) for summary in summaries))
+    lines = ["  ".join([f"{'planner':<{width}}", *(f"{short:>9}" for short in HEADLINE.values())])]
+    for summary in summaries:
+        cells = [f"{summary['planner']:<{width}}"]
+        for name in HEADLINE:
+            mean = summary["metrics"][name]["mean"]
+            cells.append(f"{'' if mean is None else f'{mean:.3f}':>9}")
+        lines.append("  ".join(cells))
+    return "\n".join(lines)

@@ -1,0 +1,163 @@
+"""The training loop: iterate on the device, log, validate, checkpoint, resume."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from drivax.errors import UsageError
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.runner import evaluate
+from drivax.learning.config import TrainConfig
+from drivax.learning.policies import policy_planner
+from drivax.learning.ppo import Ppo, PpoState
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.simulator import Simulator
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.progress import Progress
+from drivax.tracking.runs import RunFolder
+from drivax.tracking.sinks import MetricLog
+
+#: Metrics of a validation that are logged.
+_VALIDATION = ("success", "accuracy", "collision", "offroad", "red_light", "progress_ratio", "comfortable")
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out scenarios that checkpoints are chosen by."""
+
+    bank: ScenarioBank
+    names: Sequence[Mapping[str, str]]
+
+    @classmethod
+    def of(cls, data: ScenarioSet) -> Validation:
+        """From a scenario set."""
+        scenarios = list(data)
+        return cls(ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
+
+
+def train(
+    config: TrainConfig,
+    data: ScenarioSet,
+    out: str | Path,
+    *,
+    validation: ScenarioSet | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> RunFolder:
+    """Trains a policy and writes the run folder: config, metrics, checkpoints of the full state.
+
+    Args:
+        config: What to train.
+        data: Scenarios to train on; all of them are held on the device.
+        out: Run folder.
+        validation: Scenarios that choose the best checkpoint.
+        resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device.
+        overwrite: Replace an existing run folder.
+
+    Raises:
+        UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, or a resumed run was trained
+            on other data.
+    """
+    folder = _open(config, data, Path(out), resume, overwrite)
+    if resume:
+        config = folder.config(TrainConfig)
+    bank = ScenarioBank.from_scenarios(data)
+    ppo = Ppo(config.algorithm, Simulator(config.task), bank, config.iterations)
+    checkpoints = Checkpoints(folder.checkpoints)
+    state = _first_state(ppo, bank, config, checkpoints if resume else None)
+    held_out = None if validation is None else Validation.of(validation)
+    begin = int(state.iteration)
+    with (
+        MetricLog(folder.path, resume_step=_steps(config, begin) if resume else None) as log,
+        Progress("training", "steps", _steps(config, config.iterations)) as progress,
+    ):
+        progress.update(_steps(config, begin))
+        _iterate(config, ppo, bank, state, _Outputs(log, progress, checkpoints, held_out))
+    return folder
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    log: MetricLog
+    progress: Progress
+    checkpoints: Checkpoints
+    validation: Validation | None
+
+
+def _iterate(config: TrainConfig, ppo: Ppo, bank: ScenarioBank, state: PpoState, outputs: _Outputs) -> None:
+    step = jax.jit(ppo.iterate, donate_argnums=1)
+    for iteration in range(int(state.iteration) + 1, config.iterations + 1):
+        began = time.perf_counter()
+        state, raw = step(bank, state)
+        row = logged(jax.device_get(raw))
+        row["steps_per_second"] = config.algorithm.steps_per_iteration / (time.perf_counter() - began)
+        done = _steps(config, iteration)
+        last = iteration == config.iterations
+        due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
+        score = None
+        if due and outputs.validation is not None:
+            score, seen = validate(config, ppo, state, outputs.validation)
+            row |= seen
+        outputs.log.write(done, row)
+        note = f"success {row.get('rollout/success', float('nan')):.2f}"
+        outputs.progress.update(done, note)
+        if last or due or iteration % config.checkpoint_every == 0:
+            outputs.checkpoints.save(done, state, score)
+
+
+def validate(
+    config: TrainConfig, ppo: Ppo, state: PpoState, validation: Validation
+) -> tuple[float, dict[str, float]]:
+    """Closed-loop score of the policy's mode on held-out scenarios, and what to log."""
+    planner = policy_planner(ppo, state.parameters)
+    results = evaluate(planner, validation.bank, validation.names, task=config.task)
+    full, partial = results.metrics["vmax_score"], results.metrics["vmax_score_partial"]
+    score = float(np.nanmean(np.where(np.isfinite(full), full, partial)))
+    row = {"validation/score": score}
+    for name in _VALIDATION:
+        values = results.metrics[name]
+        if np.isfinite(values).any():
+            row[f"validation/{name}"] = float(np.nanmean(values))
+    return score, row
+
+
+def logged(raw: Mapping[str, Any]) -> dict[str, float]:
+    """Means to log from the sums of an iteration: metrics per episode that defines them, rewards per step."""
+    sums = {name.removeprefix("rollout/"): float(v) for name, v in raw.items() if name.startswith("rollout/")}
+    row = {name: float(value) for name, value in raw.items() if not name.startswith("rollout/")}
+    row["rollout/episodes"] = sums["episodes"]
+    for name, value in sums.items():
+        if name.startswith("reward/"):
+            row[name] = value / max(sums["steps"], 1.0)
+        elif sums.get(f"{name}/n", 0.0) > 0:
+            row[f"rollout/{name}"] = value / sums[f"{name}/n"]
+    return row
+
+
+def _steps(config: TrainConfig, iteration: int) -> int:
+    return iteration * config.algorithm.steps_per_iteration
+
+
+def _first_state(ppo: Ppo, bank: ScenarioBank, config: TrainConfig, stored: Checkpoints | None) -> PpoState:
+    if stored is not None and stored.steps():
+        template = jax.eval_shape(ppo.init, bank, jax.random.key(config.seed))
+        return stored.restore(template)
+    return jax.jit(ppo.init)(bank, jax.random.key(config.seed))
+
+
+def _open(config: TrainConfig, data: ScenarioSet, out: Path, resume: bool, overwrite: bool) -> RunFolder:
+    if not resume:
+        return RunFolder.create(out, config, data=[data], overwrite=overwrite, kind="training")
+    folder = RunFolder.open(out)
+    trained_on = [entry.get("hash") for entry in folder.info.get("data", [])]
+    if trained_on != [data.hash]:
+        raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")
+    return folder

@@ -1,0 +1,48 @@
+"""Trained policies as planners."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+from flax import nnx
+
+from drivax.learning.config import TrainConfig
+from drivax.learning.ppo import Ppo
+from drivax.planners.network import NetworkPlanner
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.task import Task
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.runs import RunFolder
+
+
+def policy_planner(ppo: Ppo, parameters: Any, name: str = "policy", samples: bool = False) -> NetworkPlanner:
+    """The policy of PPO parameters as a planner; the value network stays behind."""
+    graph, weights = nnx.split(ppo.network(parameters).policy)
+    return NetworkPlanner(weights, graph, name, samples)
+
+
+def load_policy(
+    run: str | Path, bank: ScenarioBank, *, step: int | None = None, samples: bool = False
+) -> tuple[NetworkPlanner, Task]:
+    """The policy of a training run, and the task that it was trained for.
+
+    Args:
+        run: Run folder of ``drivax train``.
+        bank: Any bank; only the shapes of its observations are looked at.
+        step: Which checkpoint; None: the best by validation score, or the newest without one.
+        samples: Whether to act by a sample instead of the mode.
+
+    Raises:
+        DataError: If the folder is no training run, or the checkpoint is missing or damaged.
+    """
+    folder = RunFolder.open(run)
+    config = folder.config(TrainConfig)
+    ppo = Ppo(config.algorithm, Simulator(config.task), bank, config.iterations)
+    checkpoints = Checkpoints(folder.checkpoints)
+    template = jax.eval_shape(lambda key: ppo.init(bank, key).parameters, jax.random.key(0))
+    chosen = checkpoints.best() if step is None else step
+    parameters = checkpoints.restore(template, chosen, part=".parameters")
+    return policy_planner(ppo, parameters, folder.path.name, samples), config.task

@@ -1,0 +1,121 @@
+"""The main job on the built-in world: generate, train, evaluate, report."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivax import settings
+from drivax.evaluation.audit import audit
+from drivax.evaluation.results import paired_differences
+from drivax.evaluation.runs import EvaluationConfig, format_summary, run_evaluation
+from drivax.learning.config import TrainConfig
+from drivax.learning.loop import train
+from drivax.learning.policies import load_policy
+from drivax.planners.catalogue import make_planner
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.show.report import write_report
+from drivax.synthetic.generate import Generation, generate
+from drivax.tasks.task import Task
+from drivax.tracking.progress import Progress
+
+#: Planners that the trained policy is compared with.
+REFERENCES = ("expert", "constant_velocity", "idm")
+#: Metrics that the demo compares in pairs.
+_COMPARED = ("success", "vmax_score")
+#: Training and held-out sets draw their maps from different seeds.
+_TRAINING_SEED, _HELD_OUT_SEED = 0, 1_000_000
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Sizes of the demo.
+
+    Attributes:
+        training, held_out: Numbers of scenarios.
+        preset: Training configuration.
+        overrides: Changes to it, as on the command line.
+        workers: Processes that generate.
+    """
+
+    training: int = 256
+    held_out: int = 128
+    preset: str = "demo"
+    overrides: tuple[str, ...] = ()
+    workers: int | None = None
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo made: the report, the table of planners, and paired differences to the policy."""
+
+    report: Path
+    summaries: list[dict[str, Any]]
+    differences: dict[str, dict[str, dict[str, float | int | None]]]
+
+    def text(self) -> str:
+        """The table, and one line per comparison."""
+        lines = [format_summary(self.summaries), ""]
+        for planner, metrics in self.differences.items():
+            for name, difference in metrics.items():
+                low, high = difference["low"], difference["high"]
+                lines.append(
+                    f"policy - {planner}: {name} {difference['mean']:+.3f} [{low:+.3f}, {high:+.3f}] "
+                    f"over {difference['n']} scenarios"
+                )
+        return "\n".join(lines)
+
+
+def run_demo(
+    out: Path, config: DemoConfig | None = None, say: Callable[[str], None] = lambda _: None
+) -> Demo:
+    """Generates both sets, trains, evaluates all planners and writes the report.
+
+    Args:
+        out: Folder for sets, runs and ``report.html``; what a former demo left there is replaced.
+        config: Sizes.
+        say: Called with a line before each stage.
+    """
+    config = config or DemoConfig()
+    out.mkdir(parents=True, exist_ok=True)
+    say(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
+    training = _scenarios(out / "sets" / "train", config.training, _TRAINING_SEED, config)
+    held_out = _scenarios(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
+    say("2/4  training PPO")
+    training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
+    run = train(training_config, training, out / "policy", overwrite=True).path
+    say("3/4  driving the held-out scenarios")
+    runs, results = [], {}
+    bank = ScenarioBank.from_scenarios(held_out)
+    planners: dict[str, tuple[Planner, Task | None]] = {
+        name: (make_planner(name), None) for name in REFERENCES
+    }
+    planners["policy"] = load_policy(run, bank)
+    for name, (planner, task) in planners.items():
+        folder = out / f"evaluation_{name}"
+        named = EvaluationConfig(planner=name if name in REFERENCES else str(run))
+        results[name] = run_evaluation(named, planner, held_out, folder, bank=bank, task=task, overwrite=True)
+        runs.append(folder)
+    say("4/4  writing the report")
+    report = write_report([run, *runs], out / "report.html", overwrite=True)
+    policy = results["policy"]
+    differences = {
+        name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _COMPARED}
+        for name in REFERENCES
+    }
+    return Demo(report, [result.summary() for result in results.values()], differences)
+
+
+def _scenarios(path: Path, count: int, seed: int, config: DemoConfig) -> ScenarioSet:
+    shutil.rmtree(path, ignore_errors=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    options = Generation(workers=config.workers or os.cpu_count() or 1)
+    with Progress("generating", "scenarios", count) as bar:
+        generate(path, count, seed, options, lambda done, total: bar.update(done), audit)
+    return ScenarioSet.open(path)
