@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.grid import Grid, arrange, cell_sides
+from drivax.scenario.grid import Grid, arrange
 from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.segments import cut, road_lines
 
@@ -110,63 +110,3 @@ def test_crowded_runs_are_thinned_and_counted_and_refused_near_the_log():
         arrange(segments, np.array([[295.0, 0.0]]), tight)
     runs = arranged.grid.runs(np.diff(arranged.edge_start))
     assert runs.max() == 10
-
-
-def ring(*corners, number=1):
-    return edge(number, line(*corners, corners[0], step=1.0))
-
-
-def sides_of(*features, closed=True):
-    segments = cut(road_lines(features, np.zeros(3), None))
-    grid = Grid.around(segments.middle, PATH, CAPACITY)
-    return grid, segments, cell_sides(grid, segments, closed)
-
-
-OUTER = ring((-150, -100), (150, -100), (150, 100), (-150, 100))
-ISLAND = ring((-60, -50), (-60, 50), (60, 50), (60, -50), number=2)  # clockwise: a block of houses
-
-
-def test_sides_of_a_ring_road_by_hand():
-    grid, _, side = sides_of(OUTER, ISLAND)
-
-    def at(x, y):
-        return side[grid.cell(np.array([[float(x), float(y)]]))[0]]
-
-    assert (at(-105, 0), at(105, 75), at(0, 0), at(35, -5)) == (1, 1, -1, -1)
-    assert (at(-150, 0), at(60, 0)) == (0, 0)  # an edge in the block
-    assert (at(250, 0), at(0, 250)) == (0, 0)  # beyond every edge
-
-
-@settings(max_examples=6)
-@given(st.integers(0, 10_000))
-def test_sides_agree_with_the_sign_of_the_nearest_edge_everywhere_in_the_cell(seed):
-    rng = np.random.default_rng(seed)
-    angle = np.linspace(0, 2 * np.pi, 25)[:-1]
-    outer = (140 + rng.uniform(-25, 25, 24))[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    inner = (60 + rng.uniform(-20, 20, 24))[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    grid, segments, side = sides_of(ring(*outer), ring(*inner[::-1], number=2))
-    known = np.flatnonzero(side)
-    assert len(known) > 20
-    for cell in known:
-        corner = grid.origin + grid.cell_m * np.array([cell % 64, cell // 64])
-        for dx, dy in ((0.5, 0.5), (0, 0), (0, 1), (1, 0), (1, 1)):
-            assert nearest_side(segments, corner + grid.cell_m * np.array([dx, dy])) == side[cell]
-
-
-def nearest_side(segments, xy) -> int:
-    """Sign by the nearest edge; of two equally near segments the one whose line is further away."""
-    a, b = segments.a[:, :2], segments.b[:, :2]
-    distance, _ = point_to_segment(xy[None], a, b)
-    tied = np.flatnonzero(distance < distance.min() + 1e-6)
-    step = (b - a)[tied]
-    cross = (step[:, 0] * (xy - a[tied])[:, 1] - step[:, 1] * (xy - a[tied])[:, 0]) / np.linalg.norm(
-        step, axis=1
-    )
-    return int(np.sign(cross[np.abs(cross).argmax()]))
-
-
-def test_sides_are_unknown_for_open_or_contradicting_edges():
-    assert not sides_of(OUTER, ISLAND, closed=False)[2].any()
-    same_place = ring((-60, -50), (-60, 50), (60, 50), (60, -50), number=3)
-    apart = ring((-120, -90), (-70, -90), (-70, -60), (-120, -60), number=4)
-    assert not sides_of(same_place, apart)[2].any()  # one says outside is road, the other that it is not

@@ -38,6 +38,8 @@ COMMANDS = {
     "generate": Command("drivax.cli.generate", "Generate", "scenarios of the built-in world -> scenario set"),
     "convert": Command("drivax.cli.convert", "Convert", "public data set -> scenario set"),
     "inspect": Command("drivax.cli.inspect", "Inspect", "what a scenario set holds, and whether it is sound"),
+    "view": Command("drivax.cli.view", "View", "one HTML page in which a scenario set can be browsed"),
+    "curate": Command("drivax.cli.curate", "Curate", "how critical each scenario is: scores for a set"),
     "train": Command(
         "drivax.cli.train", "Train", "train a planner from a configuration file", overrides=True
     ),

@@ -16,7 +16,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.agents import LocalTracks, extend, local_tracks, place
 from drivax.scenario.checks import check, step_seconds
 from drivax.scenario.filling import EVENT_ACTORS, Parts, fill
-from drivax.scenario.grid import GridSegments, arrange, cell_sides
+from drivax.scenario.grid import GridSegments, arrange
 from drivax.scenario.lanes import LaneGraph, LaneSegments, lane_graph, select
 from drivax.scenario.lights import place_lights, place_stops
 from drivax.scenario.roads import road_rows
@@ -38,6 +38,7 @@ from drivax.scenario.schema import (
     SourceCounts,
 )
 from drivax.scenario.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
+from drivax.scenario.sides import cell_sides
 
 Array = np.ndarray[Any, Any]
 
@@ -191,6 +192,7 @@ def _assemble(recording: Recording, capacity: Capacity) -> Scenario:
     keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
+    is_lane = np.isin(segments.kind, CAR_LANE_KINDS)
     is_edge, is_ring = np.isin(segments.kind, EDGE_KINDS), roads.closed[np.isin(roads.kind, EDGE_KINDS)]
     rings = len(is_ring) > 0 and bool(is_ring.all())
     stored_on = LaneSegments.of(segments, graph)
@@ -201,7 +203,7 @@ def _assemble(recording: Recording, capacity: Capacity) -> Scenario:
         graph=graph,
         routes=_renumber(routes, keep, whole.count),
         grid=grid,
-        sides=cell_sides(grid.grid, segments.take(is_edge), rings),
+        sides=cell_sides(grid.grid, segments.take(is_edge), segments.take(is_lane).middle, rings),
         roads=roads,
         polylines=polylines,
         rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),

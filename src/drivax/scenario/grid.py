@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Float, Int
 
 from drivax.errors import DataError
 from drivax.scenario.schema import Capacity
@@ -161,60 +161,3 @@ def _refuse_unsafe(
             f" {capacity.name!r}",
             cure="convert with a larger capacity",
         )
-
-
-def cell_sides(grid: Grid, edges: Segments, rings_closed: bool) -> Int8[Array, " cell"]:
-    """Which cells far from every edge are drivable: 1 drivable, -1 not, 0 unknown.
-
-    No edge crosses a cell whose 3 x 3 block holds none, so for closed rings the whole cell lies on one side, and
-    the winding number of its centre says on which: rings run with the drivable side on their left (outer rings
-    counter-clockwise, islands clockwise), so it takes one value on the road and one lower off it. Crossings of the
-    line through the cell centres of a row are counted from the right (Sunday's winding number, 2001).
-
-    Args:
-        grid: The grid.
-        edges: All road-edge segments, also those that were cropped away.
-        rings_closed: Whether every road edge is a closed ring; where not, every side is unknown.
-    """
-    side = np.zeros(grid.side**2, dtype=np.int8)
-    if not rings_closed or not len(edges):
-        return side
-    winding = _winding_at_centres(grid, edges)
-    low, high = min(winding.min(), 0), max(winding.max(), 0)
-    if low < 0 < high:
-        return side  # rings contradict each other
-    drivable = winding > 0 if high > 0 else winding == 0
-    corner = np.concatenate((edges.a[:, :2], edges.b[:, :2]))
-    centre = grid.origin + (np.arange(grid.side)[:, None] + 0.5) * grid.cell_m
-    within = (centre >= corner.min(axis=0)) & (centre <= corner.max(axis=0))
-    known = (within[None, :, 0] & within[:, None, 1]) & ~_near_edge(grid, edges)
-    side.reshape(grid.side, grid.side)[known] = np.where(drivable[known], 1, -1)
-    return side
-
-
-def _winding_at_centres(grid: Grid, edges: Segments) -> Int[Array, "row column"]:
-    """Winding number of the edges around the centre of every cell."""
-    scaled_a = (edges.a[:, :2] - grid.origin) / grid.cell_m - 0.5
-    scaled_b = (edges.b[:, :2] - grid.origin) / grid.cell_m - 0.5
-    row_a, row_b = np.floor(scaled_a[:, 1]), np.floor(scaled_b[:, 1])
-    crossing = np.flatnonzero(row_a != row_b)  # a segment is shorter than a cell: one row line at most
-    line = np.maximum(row_a, row_b)[crossing]
-    a, b = scaled_a[crossing], scaled_b[crossing]
-    x = a[:, 0] + (line - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-    up = np.where(row_b[crossing] > row_a[crossing], 1, -1)
-    last = np.clip(np.ceil(x) - 1, -1, grid.side - 1).astype(np.int64)  # last column left of the crossing
-    seen = (line >= 0) & (line < grid.side) & (last >= 0)
-    table = np.zeros((grid.side, grid.side), dtype=np.int64)
-    np.add.at(table, (line[seen].astype(np.int64), last[seen]), up[seen])
-    return np.cumsum(table[:, ::-1], axis=1)[:, ::-1]
-
-
-def _near_edge(grid: Grid, edges: Segments) -> Bool[Array, "row column"]:
-    """Cells whose 3 x 3 block holds the midpoint of an edge segment."""
-    cell = grid.column_row(edges.middle) + 1
-    padded = np.zeros((grid.side + 2, grid.side + 2), dtype=bool)
-    near_square = np.all((cell >= 0) & (cell < grid.side + 2), axis=1)
-    padded[cell[near_square, 1], cell[near_square, 0]] = True
-    size = grid.side
-    shifts = [padded[dy : dy + size, dx : dx + size] for dy in range(3) for dx in range(3)]
-    return np.logical_or.reduce(shifts)

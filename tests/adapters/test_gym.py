@@ -1,0 +1,181 @@
+"""The Gymnasium environment: its own checker, the simulator, and an evaluation as oracles."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+import drivax
+from drivax.adapters import gym
+from drivax.adapters.gym import DrivingEnv
+from drivax.errors import DataError, UsageError
+from drivax.evaluation.rollout import judging
+from drivax.planners.simple import ConstantVelocity
+from drivax.scenario.assemble import assemble
+from drivax.scenario.store import ScenarioWriter
+from drivax.tasks.observations import PRESETS, SPEED_MPS, ObservationConfig
+from drivax.tasks.task import Task
+from scenes import car, straight_road
+
+SMALL = Task(observation=PRESETS["minimal"])
+STILL = np.zeros(2, np.float32)
+
+
+@pytest.fixture(scope="module")
+def data():
+    """Row 0: a free road, left at constant speed. Row 1: a stopped car 30 m ahead."""
+    free = replace(straight_road([car(speed=8.0)]), scenario_id="free")
+    blocked = replace(straight_road([car(speed=10.0), car(x=30.0)]), scenario_id="blocked")
+    return drivax.load([assemble(free), assemble(blocked)])
+
+
+@pytest.fixture(scope="module")
+def env(data):
+    return DrivingEnv(data, SMALL)
+
+
+def drive(env, row, action=STILL):
+    env.reset(options={"scenario": row})
+    steps = [env.step(action)]
+    while not (steps[-1][2] or steps[-1][3]):
+        steps.append(env.step(action))
+    return steps
+
+
+def test_gymnasiums_own_checker(data):
+    """Warnings are errors here, and a spec lets the checker make and close environments of its own."""
+    spec = EnvSpec("Driving-v0", entry_point=DrivingEnv, kwargs={"data": data, "task": SMALL})
+    check_env(gymnasium.make(spec).unwrapped)
+
+
+def test_spaces_are_the_tasks_groups(data):
+    env = DrivingEnv(data)
+    assert set(env.observation_space) == {
+        "ego", "ego_static", "agents", "agents_mask", "road", "road_mask", "lights", "lights_mask", "route",
+        "route_mask",
+    }  # fmt: skip
+    assert env.observation_space["agents"].shape == (16, 5, 12)
+    assert env.observation_space["agents_mask"] == gymnasium.spaces.MultiBinary((16, 5))
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    without = DrivingEnv(data, Task(observation=ObservationConfig(road=0, lights=0)))
+    assert not {"road", "lights", "lights_mask"} & set(without.observation_space)
+    assert without.reset(seed=0)[0] in without.observation_space
+
+
+def test_a_step_is_the_simulators(env, data):
+    simulator = drivax.make_simulator(SMALL)
+    action = np.array([0.5, -0.1], np.float32)
+
+    @jax.jit
+    def two_moments(bank, action):
+        state = simulator.reset(bank, 1)
+        after, transition = simulator.step(bank, state, action)
+        return simulator.observe(bank, state.scene), simulator.observe(bank, after.scene), transition.reward
+
+    before, after, reward = two_moments(data.bank, jnp.asarray(action))
+    seen, info = env.reset(options={"scenario": 1})
+    assert info == {"scenario_id": "blocked"}
+    then, earned, terminated, truncated, info = env.step(action)
+    assert (terminated, truncated, info) == (False, False, {"scenario_id": "blocked"})
+    assert earned == pytest.approx(float(reward), abs=1e-6) and earned > 0.1
+    for got, wanted in ((seen, before), (then, after)):
+        assert set(got) == set(wanted)
+        for name in wanted:
+            np.testing.assert_allclose(got[name], wanted[name], atol=1e-5, err_msg=name)
+
+
+def test_the_log_ends_truncated_with_the_metrics_of_an_evaluation(data):
+    """Zero actions are the planner constant_velocity."""
+    env = DrivingEnv(data, judging(SMALL))
+    results = drivax.evaluate(ConstantVelocity(), data, task=SMALL)
+    for row in range(len(data)):
+        steps = drive(env, row)
+        assert len(steps) == 80
+        assert not any(terminated for _, _, terminated, _, _ in steps)
+        assert [truncated for *_, truncated, _ in steps] == [False] * 79 + [True]
+        assert all(set(info) == {"scenario_id"} for *_, info in steps[:-1])
+        wanted = {k: float(v[row]) for k, v in results.metrics.items() if np.isfinite(v[row])}
+        assert steps[-1][4]["metrics"] == pytest.approx(wanted, abs=1e-4)
+
+
+def test_a_collision_terminates(env):
+    """Box centres 30 m apart, boxes 4.8 m long, 10 m/s: they overlap after 2.52 s, so at the 26th step."""
+    steps = drive(env, 1)
+    *_, reward, terminated, truncated, info = steps[-1]
+    assert (len(steps), terminated, truncated) == (26, True, False)
+    assert reward == pytest.approx(
+        -1.0 + 0.2 * 10.0 / 12.0, abs=0.02
+    )  # collision, and the progress of one step
+    assert info["metrics"]["collision"] == 1.0 and info["metrics"]["steps"] == 26
+    assert "red_light" in info["metrics"]
+
+
+def test_seeds_choose_scenarios_and_results_are_copies(env):
+    first, second = ([env.reset(seed=5)[1], *(env.reset()[1] for _ in range(20))] for _ in range(2))
+    assert first == second
+    assert {info["scenario_id"] for info in first} == {"free", "blocked"}
+    seen, _ = env.reset(options={"scenario": 0})
+    kept = seen["ego"].copy()
+    env.step(np.array([1.0, 0.3], np.float32))
+    np.testing.assert_array_equal(seen["ego"], kept)
+
+
+def test_a_set_on_disk(tmp_path, data):
+    with ScenarioWriter(tmp_path / "set", data.scenarios[0].capacity) as writer:
+        for scenario in data.scenarios:
+            writer.add(scenario)
+    env = DrivingEnv(str(tmp_path / "set"), SMALL)
+    for row, (name, speed) in enumerate((("free", 8.0), ("blocked", 10.0))):
+        seen, info = env.reset(options={"scenario": row})
+        assert info["scenario_id"] == name
+        np.testing.assert_allclose(seen["ego"][-1, 4] * SPEED_MPS, speed, rtol=1e-5)
+    with pytest.raises(DataError, match="does not exist"):
+        DrivingEnv(tmp_path / "nowhere")
+
+
+def test_errors_are_one_line(env):
+    env.reset(seed=0)
+    for options, words in (
+        ({"scenario": 2}, "there is no scenario 2; use a row from 0 to 1"),
+        ({"scenario": -1}, "there is no scenario -1; use a row from 0 to 1"),
+        ({"scenario": "a"}, "there is no scenario 'a'; use a row from 0 to 1"),
+        ({"scenari": 1}, "there is no reset option 'scenari'; the only one is 'scenario'"),
+    ):
+        with pytest.raises(UsageError) as error:
+            env.reset(options=options)
+        assert str(error.value) == words
+    for action in (np.zeros(3), np.array([np.nan, 0.0])):
+        with pytest.raises(UsageError, match="give two finite numbers"):
+            env.step(action)
+    drive(env, 1)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(STILL)
+
+
+def test_without_gymnasium(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    spec = importlib.util.spec_from_file_location("gym_again", gym.__file__)
+    with pytest.raises(UsageError) as error:
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    assert str(error.value) == "gymnasium is not installed; pip install 'drivax[gym]'"
+
+
+def test_steps_are_compiled_once(data):
+    """Another environment of the same task and data shapes costs no compilation."""
+    first, second = DrivingEnv(data, SMALL), DrivingEnv(data, SMALL)
+    for env in (first, second):
+        env.reset(seed=0)
+        env.step(STILL)
+    compiled = gym._advance._cache_size()
+    third = DrivingEnv(data, SMALL)
+    third.reset(options={"scenario": 1})
+    third.step(STILL)
+    assert gym._advance._cache_size() == compiled
+    assert {device.platform for leaf in jax.tree.leaves(third._state) for device in leaf.devices()} == {"cpu"}

@@ -1,0 +1,104 @@
+"""Sides of grid cells against the nearest edge, by brute force."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivax.geometry.polylines import point_to_segment
+from drivax.scenario.grid import Grid
+from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.segments import cut, road_lines
+from drivax.scenario.sides import CUTOFF_M, cell_sides
+
+from .recordings import edge, line
+
+NO_LANES = np.zeros((0, 2))
+CAPACITY = CAPACITIES["default"]
+PATH = np.array([[0.0, 0.0], [10.0, 0.0]])
+
+
+def ring(*corners, number=1):
+    return edge(number, line(*corners, corners[0], step=1.0))
+
+
+def sides_of(*features, closed=True):
+    segments = cut(road_lines(features, np.zeros(3), None))
+    grid = Grid.around(segments.middle, PATH, CAPACITY)
+    return grid, segments, cell_sides(grid, segments, NO_LANES, closed)
+
+
+OUTER = ring((-150, -100), (150, -100), (150, 100), (-150, 100))
+ISLAND = ring((-60, -50), (-60, 50), (60, 50), (60, -50), number=2)  # clockwise: a block of houses
+
+
+def test_sides_of_a_ring_road_by_hand():
+    grid, _, side = sides_of(OUTER, ISLAND)
+
+    def at(x, y):
+        return side[grid.cell(np.array([[float(x), float(y)]]))[0]]
+
+    assert (at(-105, 0), at(105, 75), at(0, 0), at(35, -5)) == (1, 1, -1, -1)
+    # Cells on the border have the side of their points that are beyond the cut-off.
+    assert (at(-149, 0), at(-151, 0), at(59, 0), at(61, 0)) == (1, -1, -1, 1)
+    assert (at(250, 0), at(0, 250)) == (0, 0)  # beyond every edge
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 10_000), st.booleans())
+def test_sides_are_those_of_the_nearest_edge_beyond_the_cutoff(seed, closed):
+    rng = np.random.default_rng(seed)
+    angle = np.linspace(0, 2 * np.pi, 25)[:-1]
+    outer = (140 + rng.uniform(-25, 25, 24))[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    inner = (60 + rng.uniform(-20, 20, 24))[:, None] * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    grid, segments, side = sides_of(ring(*outer), ring(*inner[::-1], number=2), closed=closed)
+    points = rng.uniform(-190, 190, (400, 2))
+    a, b = segments.a[:, :2], segments.b[:, :2]
+    tested = wrong = 0
+    for xy in points:
+        known = side[grid.cell(xy[None])[0]]
+        if known == 0 or point_to_segment(xy[None], a, b)[0].min() <= CUTOFF_M:
+            continue
+        tested += 1
+        wrong += nearest_side(segments, xy) != known
+    # A sliver between samples 2.5 m apart may be missed; nothing larger.
+    assert tested > 100 and wrong <= tested // 100
+
+
+def nearest_side(segments, xy) -> int:
+    """Sign by the nearest edge; of two equally near segments the one whose line is further away."""
+    a, b = segments.a[:, :2], segments.b[:, :2]
+    distance, _ = point_to_segment(xy[None], a, b)
+    tied = np.flatnonzero(distance < distance.min() + 1e-6)
+    step = (b - a)[tied]
+    cross = (step[:, 0] * (xy - a[tied])[:, 1] - step[:, 1] * (xy - a[tied])[:, 0]) / np.linalg.norm(
+        step, axis=1
+    )
+    return int(np.sign(cross[np.abs(cross).argmax()]))
+
+
+def test_open_edges_say_nothing_beyond_their_ends():
+    # One edge along +x from 0 to 100: left of it is road, right of it is not, beyond its ends nobody knows.
+    grid, _, side = sides_of(edge(1, line((0, 0), (100, 0), step=1.0)), closed=False)
+
+    def at(x, y):
+        return side[grid.cell(np.array([[float(x), float(y)]]))[0]]
+
+    assert (at(50, 8), at(50, -8)) == (1, -1)
+    assert (at(-12, 8), at(113, -8)) == (0, 0)
+    assert at(50, 60) == 0
+
+
+def test_a_lane_against_the_edges_leaves_the_side_unknown():
+    edges = cut(road_lines([edge(1, line((0, 0), (100, 0), step=1.0))], np.zeros(3), None))
+    grid = Grid.around(edges.middle, np.array([[0.0, 0.0]]), CAPACITY)
+    lane = np.stack([np.arange(0.0, 100.0), np.full(100, -8.0)], axis=-1)
+    cell = grid.cell(np.array([[50.0, -8.0]]))[0]
+    assert cell_sides(grid, edges, NO_LANES, False)[cell] == -1
+    assert cell_sides(grid, edges, lane, False)[cell] == 0
+
+
+def test_sides_far_from_edges_are_unknown_where_rings_contradict():
+    same_place = ring((-60, -50), (-60, 50), (60, 50), (60, -50), number=3)
+    apart = ring((-120, -90), (-70, -90), (-70, -60), (-120, -60), number=4)
+    grid, _, side = sides_of(same_place, apart)  # one says outside is road, the other that it is not
+    assert side[grid.cell(np.array([[0.0, 0.0], [0.0, 200.0]]))].tolist() == [0, 0]
