@@ -8,10 +8,10 @@ At every step of the log, while the expert is replayed in the graph:
   ``(v - v_leader)^2 / (2 gap)`` (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
   can do (the brake threat number of Braennstroem, Sjoeberg and Coelingh, A Situation and Threat Assessment Algorithm
   for a Rear-End Collision Avoidance System, 2008);
-- criticality is their mean: a conflict counts fully where it is near in time and on the way.
+- criticality is their mean: a conflict counts fully where it is near in time and in the way.
 
-Time to collision sees crossing traffic but takes headings as fixed, so that it finds oncoming traffic in bends;
-required braking follows the way along bends but sees only who is on it. The mean keeps either error at a half.
+Time to collision sees crossing traffic but takes headings as fixed, so that it finds oncoming traffic in bends.
+Required braking follows the way through bends but sees only who is on it. The mean keeps either error below a half.
 """
 
 from __future__ import annotations

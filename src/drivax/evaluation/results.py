@@ -99,7 +99,7 @@ class Results:
         )
 
 
-def _cell(value: float) -> str:
+def _cell(value: Any) -> str:
     if not np.isfinite(value):
         return ""
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"

@@ -1,0 +1,45 @@
+"""``drivax view``: a page in which a scenario set can be browsed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class View:
+    """Write one self-contained HTML page in which the logs of a set are browsed and played.
+
+    Beside the player it shows each scenario's tags, flags and audit. Each scenario adds some tens of kilobytes.
+
+    Example: drivax view sets/world --limit 20 --out world.html
+    """
+
+    set: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
+    """The scenario set (a folder)."""
+    out: Path | None = None
+    """HTML file to write; SET.html beside the set where it is left out."""
+    limit: int = 50
+    """Only the first so many."""
+    ids: tuple[str, ...] = ()
+    """Only these scenarios, in this order."""
+    overwrite: bool = False
+    """Replace an existing file."""
+
+
+def run(args: View) -> int:
+    """Write the page and say where it is and what it leaves out."""
+    from drivax.scenario.store import ScenarioSet
+    from drivax.viewer.player import select, write_player
+
+    data = ScenarioSet.open(args.set)
+    folder = args.set.resolve()
+    chosen = select(data, args.limit, args.ids)
+    path = write_player(
+        chosen, args.out or folder.with_name(f"{folder.name}.html"), args.overwrite, title=folder.name
+    )
+    print(f"{path} ({len(chosen)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
+    return 0

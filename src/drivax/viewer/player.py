@@ -1,0 +1,193 @@
+"""One HTML page in which the logs of a scenario set are browsed: a list, the player, and what is known of each.
+
+The page is self-contained like the report and plays drives with the report's own player.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib import metadata, resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from drivax.errors import UsageError
+from drivax.scenario.schema import Scenario
+from drivax.scenario.store import ScenarioSet
+from drivax.show.episode import Drive, pack_episode
+from drivax.show.palette import LEGEND, THEMES
+from drivax.show.report import _CONTROLS as CONTROLS
+from drivax.show.report import _KEYS as KEYS
+from drivax.show.report import _asset as show_asset
+from drivax.show.report import _colours as colours
+from drivax.show.report import _json as json_text
+from drivax.show.report import _legend_item as legend_item
+from drivax.show.report import _logged as logged_drive
+from drivax.show.report import _publish as publish
+
+#: Findings of the audit that make a log unclean, and how the list says so.
+_FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red"}
+
+
+def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ()) -> list[Scenario]:
+    """Scenarios to show: those named, in that order, or all; then the first ``limit``.
+
+    Raises:
+        UsageError: An id is not in the set, or ``limit`` leaves nothing.
+    """
+    if limit is not None and limit < 1:
+        raise UsageError(f"a limit of {limit} leaves no scenario", cure="use 1 or more")
+    known: dict[str, int] = {}
+    for row, entry in enumerate(data.entries):
+        known.setdefault(entry["scenario_id"], row)
+    for name in ids:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            cure = f"did you mean {near[0]!r}?" if near else "list them with `drivax inspect SET --json`"
+            raise UsageError("is not in the set", file=data.path, record=name, cure=cure)
+    rows = [known[name] for name in ids] if ids else range(len(data))
+    return [data[row] for row in rows[:limit]]
+
+
+def write_player(
+    scenarios: Sequence[Scenario], out: Path, overwrite: bool = False, title: str = "scenarios"
+) -> Path:
+    """Writes the page.
+
+    Args:
+        scenarios: What to show; some 30 kB of page each.
+        out: The HTML file; it appears when it is complete.
+        overwrite: Replace an existing file.
+        title: Heading of the page, as the name of the set.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        UsageError: ``out`` exists or is a folder, or there is no scenario.
+    """
+    if out.is_dir() or (out.exists() and not overwrite):
+        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
+        raise UsageError("exists already", file=out, cure=cure)
+    if not scenarios:
+        raise UsageError("there is no scenario to show", cure="name at least one")
+    publish(out, _page(scenarios, title))
+    return out
+
+
+def findings(scenario: Scenario) -> str:
+    """What the audit found wrong with a log, in words; empty where nothing."""
+    found = [words for name, words in _FINDINGS.items() if scenario.audit.get(name)]
+    if (share := scenario.audit.get("log_offroad_fraction")) is not None and share > 0:
+        found.append("off-road")
+    return ", ".join(found)
+
+
+def _page(scenarios: Sequence[Scenario], title: str) -> str:
+    packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
+    themes = {name: dict(theme) for name, theme in THEMES.items()}
+    data = [f'<script type="application/json" id="palette">{json_text(themes)}</script>']
+    data += [f'<script type="application/json" class="episode">{json_text(one)}</script>' for one in packed]
+    unclean = sum(bool(findings(scenario)) for scenario in scenarios)
+    audited = sum(bool(scenario.audit) for scenario in scenarios)
+    judged = f"the audit finds fault with {unclean} of {audited}" if audited else "not audited"
+    return Template(show_asset("report.html.template")).substitute(
+        title=escape(title),
+        version=escape(metadata.version("drivax")),
+        style=colours() + show_asset("player.css") + _asset("browser.css"),
+        lead=f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
+        sections=_browser(scenarios),
+        data="\n".join(data),
+        script=show_asset("player.js") + _asset("browser.js"),
+    )
+
+
+def _log(scenario: Scenario) -> Drive:
+    """The recorded drive; the audit keeps the step of the first off-road step only."""
+    offroad = scenario.audit.get("first_offroad_step")
+    events = {"offroad": -1 if offroad is None else int(offroad)}
+    return Drive("log", logged_drive(scenario), 0, events, findings(scenario))
+
+
+def _browser(scenarios: Sequence[Scenario]) -> str:
+    buttons = "".join(map(_button, scenarios))
+    details = "".join(map(_details, scenarios))
+    legend = "".join(legend_item(name, words) for name, words in LEGEND)
+    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
+    return (
+        "<section class=browse><div class=choose><input type=search id=filter placeholder='id, tag or flag' "
+        "aria-label='show scenarios with these words'><small id=shown></small>"
+        f"<div class=picker role=group aria-label=Scenarios>{buttons}</div></div>"
+        f"<div class=watch><h2 data-control=title></h2><div id=stage></div>{CONTROLS}"
+        f"<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript></div>"
+        f"<aside id=details aria-label='about the scenario'>{details}</aside></section>"
+    )
+
+
+def _button(scenario: Scenario) -> str:
+    found = findings(scenario)
+    words = " ".join((scenario.id, found, *_flags(scenario), *scenario.tags, *scenario.tags.values())).lower()
+    bad = f"<span class=bad>{escape(found)}</span>" if found else ""
+    return (
+        f'<button type=button data-episode aria-pressed=false data-words="{escape(words)}">'
+        f"{escape(scenario.id)}<small>{escape(' · '.join(scenario.tags.values()))}</small>{bad}</button>"
+    )
+
+
+def _details(scenario: Scenario) -> str:
+    """Tags, flags, audit and what did not fit, as lists; shown while the scenario is."""
+    source = scenario.source
+    about = {
+        "steps": int(scenario.steps),
+        "tracks": source.tracks,
+        "tracks now": source.tracks_valid_now,
+        "map points": source.map_points,
+        "lights": source.lights,
+    }
+    parts = (
+        ("Tags", _facts(scenario.tags)),
+        ("Flags", f"<p>{escape(', '.join(_flags(scenario)) or 'none')}</p>"),
+        ("Audit", _facts(_audit(scenario)) if scenario.audit else "<p>not audited</p>"),
+        ("Source", _facts(about)),
+        ("Did not fit", _facts(scenario.overflow) if scenario.overflow else "<p>nothing</p>"),
+    )
+    return "<div hidden>" + "".join(f"<h3>{name}</h3>{text}" for name, text in parts) + "</div>"
+
+
+def _audit(scenario: Scenario) -> dict[str, Any]:
+    """The audit; the step of a thing that never happened is stored as -1."""
+    return {
+        name: "never" if name.endswith("_step") and value == -1 else value
+        for name, value in scenario.audit.items()
+    }
+
+
+def _facts(values: Mapping[str, Any]) -> str:
+    rows = (
+        f"<dt>{escape(_words(name))}</dt><dd>{escape(_cell(value))}</dd>" for name, value in values.items()
+    )
+    return f"<dl>{''.join(rows)}</dl>"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "undefined"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _flags(scenario: Scenario) -> list[str]:
+    named: Iterable[Any] = scenario.has
+    return [_words(str(flag.name)).lower() for flag in named]
+
+
+def _asset(name: str) -> str:
+    return resources.files("drivax.viewer").joinpath(name).read_text(encoding="utf-8")

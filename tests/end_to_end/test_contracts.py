@@ -1,0 +1,176 @@
+"""The machine-readable contracts, through the command line, on the built-in world."""
+
+import csv
+import json
+
+import jsonschema
+import numpy as np
+import pytest
+
+from drivax.cli import main
+from drivax.evaluation.results import KEYS
+from drivax.metrics.episode import METRICS
+from drivax.synthetic.generate import Generation, generate
+
+NUMBER, WHOLE = {"type": "number"}, {"type": "integer", "minimum": 0}
+MAYBE = {"type": ["number", "null"]}
+
+
+def exactly(**properties):
+    return {
+        "type": "object", "properties": properties, "required": sorted(properties), "additionalProperties": False,
+    }  # fmt: skip
+
+
+SUMMARY = exactly(
+    planner={"type": "string"},
+    traffic={"enum": ["log"]},
+    metrics={
+        "type": "object",
+        "additionalProperties": exactly(mean=MAYBE, low=MAYBE, high=MAYBE, n=WHOLE),
+        "minProperties": 20,
+    },
+)
+KINDS = ("lane", "road_line", "road_edge", "crosswalk", "speed_bump", "stop_sign", "driveway")
+INSPECT = exactly(
+    scenarios={
+        "type": "array",
+        "minItems": 1,
+        "items": exactly(
+            scenario_id={"type": "string"}, dataset={"type": "string"}, segment={"type": "string"}, steps=WHOLE,
+            tracks=WHOLE, tracks_valid_now=WHOLE, map_features=exactly(**dict.fromkeys(KINDS, WHOLE)),
+            map_points=WHOLE, lights=WHOLE, segments=WHOLE, overflow={"type": "object"},
+            flags={"type": "array", "items": {"type": "string"}}, audit={"type": "object"},
+        ),
+    }
+)  # fmt: skip
+BENCH = {
+    "type": "object",
+    "required": [
+        "environment_steps_per_second", "batch", "state_bytes", "compile_seconds", "brute_force_ratio", "by_part",
+        "versions",
+    ],
+    "properties": {
+        "environment_steps_per_second": NUMBER, "batch": WHOLE, "state_bytes": {"type": "integer", "maximum": 4096},
+        "compile_seconds": NUMBER, "brute_force_ratio": NUMBER,
+        "by_part": {"type": "object", "additionalProperties": NUMBER, "minProperties": 8},
+        "versions": {"type": "object"},
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("contracts") / "set"
+    generate(path, 5, 21, Generation(workers=1))
+    return path
+
+
+@pytest.fixture(scope="module")
+def evaluation(data):
+    out = data.parent / "constant"
+    assert main(["evaluate", "--planner", "constant_velocity", "--data", str(data), "--out", str(out)]) == 0
+    return out
+
+
+def test_episodes(evaluation, data):
+    with (evaluation / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [*KEYS, *METRICS]
+    assert len(rows) == 5 and len({row["scenario_id"] for row in rows}) == 5
+    assert {(row["planner"], row["traffic"], row["dataset"]) for row in rows} == {
+        ("constant_velocity", "log", "drivax")
+    }
+    for row in rows:
+        values = {name: float(row[name]) for name in METRICS if row[name] != ""}
+        assert values["steps"] == 80.0
+        assert values["accuracy"] == float(
+            not (values["collision"] or values["offroad"] or values["red_light"])
+        )
+        assert all(
+            0 <= values[name] <= 1 for name in ("vmax_score", "nuplan_score", "progress_ratio", "comfort")
+        )
+        # A full score and its partial one never stand side by side.
+        assert (row["vmax_score"] == "") != (row["vmax_score_partial"] == "")
+
+
+def test_summary_is_recomputable(evaluation):
+    summary = json.loads((evaluation / "summary.json").read_text())
+    jsonschema.validate(summary, SUMMARY)
+    with (evaluation / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for name, value in summary["metrics"].items():
+        cells = [float(row[name]) for row in rows if row[name] != ""]
+        assert value["n"] == len(cells)
+        if cells:
+            assert value["mean"] == pytest.approx(np.mean(cells), rel=1e-4, abs=1e-5)
+            assert value["low"] is None or value["low"] <= value["mean"] <= value["high"]
+        else:
+            assert value["mean"] is None
+
+
+def test_trajectories(evaluation):
+    with np.load(evaluation / "trajectories.npz") as arrays:
+        assert arrays["ego"].shape == (5, 81, 4) and arrays["ego"].dtype == np.float32
+        assert (arrays["start"] == 10).all() and np.isfinite(arrays["ego"]).all()
+
+
+def test_inspect(data, capsys):
+    assert main(["inspect", str(data), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    jsonschema.validate(found, INSPECT)
+    assert len(found["scenarios"]) == 5
+
+
+def test_bench(data, capsys):
+    assert main(["bench", "--data", str(data), "--batch", "4", "--repeats", "1", "--json"]) == 0
+    jsonschema.validate(json.loads(capsys.readouterr().out), BENCH)
+
+
+def test_report(evaluation, data):
+    out = data.parent / "report.html"
+    assert main(["report", str(evaluation), "--out", str(out)]) == 0
+    page = out.read_text()
+    assert "constant_velocity" in page and "<script>" in page and "http" not in page.split("</title>")[0]
+
+
+def test_limit_drives_only_the_first_scenarios(data):
+    out = data.parent / "two"
+    call = [
+        "evaluate",
+        "--planner",
+        "constant_velocity",
+        "--data",
+        str(data),
+        "--out",
+        str(out),
+        "--limit",
+        "2",
+    ]
+    assert main(call) == 0
+    assert len((out / "episodes.csv").read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "status"),
+    [
+        (["--planner", "idn", "--data", "SET", "--out", "NEW"], ["idn", "idm"], 2),
+        (["--planner", "idm", "--data", "MISSING", "--out", "NEW"], ["MISSING"], 1),
+        (["--planner", "idm", "--data", "SET", "--out", "OLD"], ["--overwrite"], 2),
+        (["--planner", "idm", "--data", "SET", "--out", "NEW", "--start-step", "90"], ["90"], 2),
+        (["--planner", "idm", "--data", "SET", "--out", "NEW", "--limit", "0"], ["--limit 0"], 2),
+        (["--planner", "SET", "--data", "SET", "--out", "NEW"], ["no run folder"], 1),
+    ],
+)
+def test_wrong_calls_get_one_line(arguments, words, status, evaluation, data, capsys, tmp_path):
+    places = {
+        "SET": str(data),
+        "NEW": str(tmp_path / "new"),
+        "OLD": str(evaluation),
+        "MISSING": str(tmp_path / "MISSING"),
+    }
+    assert main(["evaluate", *(places.get(word, word) for word in arguments)]) == status
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.startswith("drivax: ")]
+    assert len(lines) == 1 and all(word in lines[0] for word in words), captured.err
+    assert not (tmp_path / "new").exists()
