@@ -38,7 +38,7 @@ endif
 	@touch $@
 
 demo: $(STAMP)
-	$(BIN)/drivax demo $(ARGS)
+	$(BIN)/drivax demo --overwrite $(ARGS)
 
 bench: $(STAMP)
 	$(BIN)/drivax bench $(ARGS)

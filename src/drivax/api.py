@@ -70,6 +70,8 @@ def evaluate(
     """
     loaded = data if isinstance(data, Loaded) else load(data)
     if isinstance(planner, str | Path):
+        if task is not None:
+            raise UsageError("a planner by name brings its own task", cure="leave out task=")
         planner, task = find_planner(str(planner), loaded.bank)
     return drive_all(planner, loaded.bank, loaded.names, task=task, **options)
 

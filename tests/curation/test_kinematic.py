@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.curation.kinematic import BATCH, KinematicConfig, kinematic_steps, score_kinematic
+from drivax.curation import kinematic
+from drivax.curation.kinematic import KinematicConfig, kinematic_steps, score_kinematic
 from drivax.errors import UsageError
 from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import AgentKind, Capacity
@@ -28,6 +29,9 @@ SCENES = {
     ],
     "far": [car(speed=15.0), car(x=60.0)],
     "standing": [car(), car(x=10.0)],
+    "brief": [car(speed=15.0, steps=range(12)), car(x=60.0)],
+    **{f"gap {gap}": [car(speed=9.0), car(x=4.8 + gap)] for gap in (15.0, 20.0, 30.0, 40.0)},
+    **{f"speed {speed}": [car(speed=speed), car(x=24.8)] for speed in (5.0, 8.0, 11.0, 14.0)},
 }
 
 
@@ -56,8 +60,15 @@ def test_hand_computed_values(steps):
     assert steps["leader"][NOW + 10] == pytest.approx(expected((gap - 5) / 5, 25 / (2 * (gap - 5))), abs=1e-3)
     # Ego's front reaches a pedestrian 17.2 m ahead after 1.72 s, when it is at y = -1.25, within the car's 1 m + 0.4 m.
     assert steps["pedestrian"][NOW] == pytest.approx(expected(1.72, 0.0), abs=1e-3)
-    # 0.3 s before, nobody was in the lane, and 1.5 s later the pedestrian is: y = -1.6 reaches 1.4 at -1.4 only.
     assert steps["far"][NOW] == pytest.approx(expected((60 - 4.8) / 15, 15**2 / (2 * (60 - 4.8))), abs=1e-3)
+
+
+def test_every_step_of_an_approach(steps):
+    """From 74 m away to nearly there: no seam where one query of the route ends and the next begins."""
+    at = np.arange(3, 45)
+    gap = 60.0 - 4.8 - 15.0 * (at - NOW) * 0.1
+    wanted = [expected(g / 15.0, 15.0**2 / (2 * g)) for g in gap]
+    np.testing.assert_allclose(steps["far"][at], wanted, atol=1e-3)
 
 
 def test_who_is_not_in_the_way_does_not_count(steps):
@@ -66,16 +77,11 @@ def test_who_is_not_in_the_way_does_not_count(steps):
     assert steps["standing"].max() == 0.0
 
 
-def test_nearer_and_faster_is_more_critical():
-    gaps, speeds = (15.0, 20.0, 30.0, 40.0), (5.0, 8.0, 11.0, 14.0)
-    near = np.asarray(
-        kinematic_steps(CONFIG, bank_of(*(straight_road([car(speed=9.0), car(x=4.8 + g)]) for g in gaps)))
-    )[:, NOW]
-    fast = np.asarray(
-        kinematic_steps(CONFIG, bank_of(*(straight_road([car(speed=v), car(x=24.8)]) for v in speeds)))
-    )[:, NOW]
+def test_nearer_and_faster_is_more_critical(steps):
+    near, fast = ([steps[name][NOW] for name in SCENES if name.startswith(kind)] for kind in ("gap", "speed"))
+    assert len(near) == len(fast) == 4
     assert (np.diff(near) < 0).all() and (np.diff(fast) > 0).all()
-    assert near.min() > 0 and fast.max() < 1
+    assert min(near) > 0 and max(fast) < 1
 
 
 def test_invariant_to_shifting_and_turning_the_world(steps):
@@ -86,23 +92,20 @@ def test_invariant_to_shifting_and_turning_the_world(steps):
 
 
 def test_steps_where_ego_is_not_there_score_nothing(steps):
-    seen = range(0, 12)
-    bank = bank_of(straight_road([car(speed=15.0, steps=seen), car(x=60.0)]))
-    score = np.asarray(kinematic_steps(CONFIG, bank))[0]
-    np.testing.assert_allclose(score[:12], steps["far"][:12], atol=1e-4)
-    assert (score[12:] == 0).all() and (score[:12] > 0).all()
+    np.testing.assert_allclose(steps["brief"][:12], steps["far"][:12], atol=1e-4)
+    assert (steps["brief"][:12] > 0).all() and (steps["brief"][12:] == 0).all()
 
 
-def test_a_set_larger_than_a_batch_scores_the_same(tmp_path, steps):
-    """Padded and batched, against the trimmed bank; the names repeat so that the set has BATCH + 3 scenarios."""
-    names = (list(SCENES) * BATCH)[: BATCH + 3]
+def test_a_set_larger_than_a_batch_scores_the_same(tmp_path, steps, monkeypatch):
+    """Padded and batched, against the trimmed bank of all."""
+    monkeypatch.setattr(kinematic, "BATCH", 4)
+    names = list(SCENES)[:6]
     with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
-        for row, name in enumerate(names):
-            recording = replace(straight_road(SCENES[name]), scenario_id=f"{row}")
-            writer.add(assemble(recording))
+        for name in names:
+            writer.add(assemble(replace(straight_road(SCENES[name]), scenario_id=name)))
     done = []
     scores = score_kinematic(ScenarioSet.open(tmp_path / "set"), CONFIG, lambda *at: done.append(at))
-    assert done == [(BATCH, BATCH + 3), (BATCH + 3, BATCH + 3)]
+    assert done == [(4, 6), (6, 6)]
     np.testing.assert_allclose(scores, np.stack([steps[name] for name in names]), atol=1e-5)
 
 

@@ -68,8 +68,12 @@ def test_damaged_tables(data, table, tmp_path):
     write_scores(table, file)
     whole = file.read_bytes()
     half = whole[: len(whole) // 2]
+    flipped = bytearray(whole)
+    flipped[whole.index(b"step_score") + 60] ^= 0xFF
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    for content in (b"", b"text", half, (tmp_path / "other.npz").read_bytes()):
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    others = [(tmp_path / name).read_bytes() for name in ("other.npz", "array.npy")]
+    for content in (b"", b"text", half, bytes(flipped), *others):
         file.write_bytes(content)
         with pytest.raises(DataError, match=r"no table of scores, or damaged .*; run `drivax curate` again"):
             read_scores(file, data)

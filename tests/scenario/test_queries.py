@@ -156,8 +156,10 @@ def test_route_projection_and_lookahead():
 
 def test_stop_line_is_finite():
     bank = bank_of(straight_road([car(0, 0, 0, 5)], light=4))
-    through, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]))
-    beside, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 3.0]), jnp.array([41.0, 3.0]))
-    back, before = light_crossing(bank, jnp.asarray(0), jnp.array([41.0, 0.5]), jnp.array([39.0, 0.5]))
-    assert bool(through[0]) and not bool(beside[0]) and not bool(back[0])
+    z = jnp.zeros(())
+    through, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]), z)
+    beside, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 3.0]), jnp.array([41.0, 3.0]), z)
+    back, before = light_crossing(bank, jnp.asarray(0), jnp.array([41.0, 0.5]), jnp.array([39.0, 0.5]), z)
+    above, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]), z + 8.0)
+    assert bool(through[0]) and not bool(beside[0]) and not bool(back[0]) and not bool(above[0])
     assert float(before[0]) == pytest.approx(1.0, abs=1e-3)

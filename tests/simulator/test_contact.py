@@ -7,11 +7,9 @@ import pytest
 
 from drivax.geometry.boxes import corners, overlap, time_to_overlap
 from drivax.simulator.contact import (
-    ABSENT,
-    APART,
-    IGNORED,
-    TOUCHING,
     CollisionType,
+    Contact,
+    first_contacts,
     judge_contacts,
     next_contacts,
     time_to_collision,
@@ -137,7 +135,8 @@ def test_fault_by_the_order_of_nuplan(other, ego_speed, other_speed, unlawful, f
     found, found_kind = judge_contacts(
         world, jnp.array(0), jnp.array([False, True]), jnp.array(ego_speed), speeds, jnp.array(unlawful)
     )
-    assert (bool(found), CollisionType(int(found_kind))) == (fault, kind)
+    assert (bool(found[1]), CollisionType(int(found_kind))) == (fault, kind)
+    assert not bool(found[0])
 
 
 def test_a_pedestrian_who_walks_into_a_stopped_car_is_not_its_fault():
@@ -145,17 +144,32 @@ def test_a_pedestrian_who_walks_into_a_stopped_car_is_not_its_fault():
     found, kind = judge_contacts(
         world, jnp.array(0), jnp.array([False, True]), jnp.array(0.0), jnp.array([0.0, 1.5]), jnp.array(False)
     )
-    assert not bool(found)
+    assert not bool(found.any())
     assert CollisionType(int(kind)) == CollisionType.VULNERABLE
 
 
 def test_contact_memory():
-    before = jnp.array([ABSENT, ABSENT, APART, TOUCHING, IGNORED, IGNORED, TOUCHING], jnp.int8)
-    touching = jnp.array([True, False, True, True, True, False, False])
-    valid = jnp.array([True, True, True, True, True, True, False])
-    after = next_contacts(before, touching, valid)
-    expected = [IGNORED, APART, TOUCHING, TOUCHING, IGNORED, APART, ABSENT]
+    c = Contact
+    rows = [  # before, touching, valid, fault -> after
+        (c.ABSENT, True, True, False, c.IGNORED),
+        (c.ABSENT, False, True, False, c.APART),
+        (c.APART, True, True, True, c.AT_FAULT),
+        (c.APART, True, True, False, c.HIT),
+        (c.AT_FAULT, True, True, False, c.AT_FAULT),
+        (c.HIT, True, True, False, c.HIT),
+        (c.HIT, False, True, False, c.PARTED),
+        (c.PARTED, True, True, True, c.HIT),  # fault was decided at the first contact
+        (c.PARTED, False, True, False, c.PARTED),
+        (c.IGNORED, True, True, True, c.IGNORED),
+        (c.IGNORED, False, True, False, c.APART),
+        (c.AT_FAULT, True, False, False, c.ABSENT),
+    ]
+    before, touching, valid, fault, expected = (np.array(column) for column in zip(*rows, strict=True))
+    before = jnp.asarray(before, jnp.int8)
+    after = next_contacts(before, jnp.asarray(touching), jnp.asarray(valid), jnp.asarray(fault))
     np.testing.assert_array_equal(np.asarray(after), expected)
+    first = first_contacts(before, jnp.asarray(touching))
+    np.testing.assert_array_equal(np.asarray(first), (np.array(before) == c.APART) & touching)
 
 
 def test_gradient_of_time_to_overlap_is_finite():

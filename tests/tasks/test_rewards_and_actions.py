@@ -83,5 +83,6 @@ def test_termination_and_truncation_are_separate(measured):
     assert ends == (False, True)
     crash = replace(facts, collision=jnp.asarray(True))
     assert jax.tree.map(bool, task.ended(bank, scene, crash)) == (True, False)
+    assert jax.tree.map(bool, replace(task, to_the_end=True).ended(bank, scene, crash)) == (False, True)
     away = replace(facts, left_map=jnp.asarray(True))
     assert jax.tree.map(bool, task.ended(bank, Simulator(task).scene(bank, 0, 20), away)) == (False, True)

@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 
 from drivax.errors import DrivaxError, UsageError
 
@@ -141,6 +142,9 @@ def _dispatch(arguments: list[str]) -> int:
 def _run(name: str, command: Command, arguments: list[str]) -> int:
     import tyro
 
+    # Compiled programs are kept between commands: most of a short command's time is compilation.
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "drivax" / "jax"))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     module = importlib.import_module(command.module)
     config = getattr(module, command.config)
     options = (tyro.conf.FlagCreatePairsOff,)

@@ -19,7 +19,7 @@ class Demo:
     """
 
     out: Path = Path("demo")
-    """Folder for scenario sets, runs and the report; a former demo's is replaced."""
+    """Folder for scenario sets, runs and the report."""
     steps: int | None = None
     """Environment steps to train; the preset's number by default."""
     training: int = 256
@@ -28,6 +28,8 @@ class Demo:
     """Scenarios to judge on."""
     workers: int | None = None
     """Processes that generate; as many as there are CPU cores by default."""
+    overwrite: bool = False
+    """Replace what a former demo left in OUT."""
 
 
 def run(args: Demo) -> int:
@@ -35,7 +37,7 @@ def run(args: Demo) -> int:
     began = time.monotonic()
     overrides = () if args.steps is None else ("--total_steps", str(args.steps))
     config = DemoConfig(args.training, args.held_out, overrides=overrides, workers=args.workers)
-    result = run_demo(args.out, config, lambda line: print(line, flush=True))
+    result = run_demo(args.out, config, lambda line: print(line, flush=True), overwrite=args.overwrite)
     print(result.text())
     print(f"report: {result.report.resolve()}  ({time.monotonic() - began:.0f} s in all)")
     return 0

@@ -31,7 +31,7 @@ from drivax.planners.simple import logged_motion
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import LEVEL_M, project_on_route
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.contact import IGNORED, TTC_HORIZON_S
+from drivax.simulator.contact import TTC_HORIZON_S, Contact
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import alone
 from drivax.simulator.types import Facts, Frame, SimState
@@ -78,8 +78,8 @@ def required_braking(
     """Deceleration (m/s2) that avoids reaching the nearest agent on the log's own way at its present speed.
 
     An agent is on the way where its box reaches into the strip as wide as ego along the log's route, on ego's level,
-    up to about 75 m ahead. Agents whose overlap the simulator ignores are left out. 0 where nobody is, or the nearest
-    one is not approached.
+    up to about 75 m ahead. Whom the simulator leaves out of the time to collision is left out here too. 0 where nobody
+    is, or the nearest one is not approached.
 
     Args:
         bank: The scenarios.
@@ -92,19 +92,23 @@ def required_braking(
 
     def window(offset_m: float) -> Any:
         near = along_m + offset_m
-        return jax.vmap(lambda point: project_on_route(bank, scene.index, point, near, _LOG_ROUTE))(xy)
+        return jax.vmap(lambda point: project_on_route(bank, scene.index, point, near, route=_LOG_ROUTE))(xy)
 
-    hits = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(window, _WINDOWS_M))
+    # Beyond the end of a window a hit is its last point, so each agent counts where it is nearest.
+    first, second = map(window, _WINDOWS_M)
+    nearer = first.distance_m <= second.distance_m
+    hits = jax.tree.map(lambda a, b: jnp.where(nearer.reshape(-1, *(1,) * (a.ndim - 1)), a, b), first, second)
     cos = jnp.sum(frame.box[:, 2:4] * hits.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
-    counts = frame.valid & (jnp.arange(len(xy)) != slot) & (state.contacts != IGNORED)
+    left_out = (state.contacts == Contact.IGNORED) | (state.contacts == Contact.HIT)
+    counts = frame.valid & (jnp.arange(len(xy)) != slot) & ~left_out
     counts &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
     on_way = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
     gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
     gap = jnp.where(counts & on_way & (hits.along_m > along_m), gap, jnp.inf)
-    nearest = jnp.unravel_index(jnp.argmin(gap), gap.shape)
-    speed = jnp.sum(frame.velocity[nearest[1]] * hits.heading[nearest])
+    nearest = jnp.argmin(gap)
+    speed = jnp.sum(frame.velocity[nearest] * hits.heading[nearest])
     closing = jnp.maximum(state.facts.speed_mps - speed, 0.0)
     return closing * closing / (2.0 * jnp.maximum(gap[nearest], 0.1))
 
@@ -121,8 +125,11 @@ def _one_log(config: KinematicConfig, bank: ScenarioBank, index: Array) -> Float
 
     def score(state: SimState, along_m: Array) -> tuple[Array, Array]:
         frame = simulator.frame(bank, state.scene, alone(state.scene), 0)
-        at = project_on_route(bank, index, frame.box[state.scene.slot, :2], along_m, _LOG_ROUTE).along_m
-        along_m = jnp.maximum(along_m, at)
+        # No further than the car can have come, as the simulator follows its own route.
+        reach_m = 1.5 * state.facts.moved_m + 2.0
+        here = state.scene.history[-1, :2]
+        hit = project_on_route(bank, index, here, along_m, reach_m, route=_LOG_ROUTE)
+        along_m = jnp.maximum(along_m, hit.along_m)
         braking = required_braking(bank, state, frame, along_m) / config.full_braking_mps2
         value = (urgency(state.facts, config) + jnp.clip(braking, 0.0, 1.0)) / 2
         there = bank.agents[index, state.scene.step, state.scene.slot, 7] > 0

@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -116,13 +117,14 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             cure="make them with `drivax curate METHOD --data SET --out FILE`",
         )
     try:
-        with np.load(file, allow_pickle=False) as stored:
+        # np.load leaves a file that it opened itself open where it is damaged.
+        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as stored:
             header = json.loads(str(stored["header"][()]))
             ids = tuple(str(name) for name in stored["scenario_id"])
             steps = stored["step_score"]
         version, found = header["version"], header["set_hash"]
         table = ScoreTable(header["method"], header["config"], found, ids, steps)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(
             f"is no table of scores, or damaged ({type(error).__name__})", file=file, cure=_AGAIN
         ) from error

@@ -60,7 +60,8 @@ def _findings(results: Results) -> list[Finding]:
                 "distance_m": metric["distance"],
                 "route_deviation_max_m": metric["route_deviation_max"],
                 "reached_goal": None if metric["reached_goal"] is None else bool(metric["reached_goal"]),
-                "clean": bool(metric["accuracy"]),
+                "ignored_overlaps": int(metric["ignored_overlaps"] or 0),
+                "clean": None if metric["accuracy"] is None else bool(metric["accuracy"]),
             }
         )
     return rows

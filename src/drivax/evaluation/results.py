@@ -20,7 +20,7 @@ KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
 #: Metrics that are shares of episodes: their interval is Wilson's.
 RATES = (
     "accuracy", "accuracy_at_fault", "success", "success_moving", "collision", "at_fault_collision", "offroad",
-    "left_map", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal",
+    "left_map", "off_route", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal",
 )  # fmt: skip
 #: Codes and counts that no mean makes sense of.
 NOT_SUMMARISED = ("collision_type", "steps")

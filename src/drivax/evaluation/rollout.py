@@ -40,7 +40,7 @@ class Episodes:
 
 def judging(task: Task) -> Task:
     """The task as evaluation runs it: failures are recorded and the episode goes on to the end of the log."""
-    return replace(task, ends=())
+    return replace(task, to_the_end=True)
 
 
 @partial(jax.jit, static_argnames=("simulator", "start_step"))

@@ -12,7 +12,7 @@ from drivax.errors import DrivaxError, UsageError
 from drivax.evaluation.results import Results
 from drivax.evaluation.rollout import Episodes, drive, judging
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import LogTraffic
@@ -54,7 +54,18 @@ def evaluate(
         raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
     if not 0 <= start_step < bank.steps - 1:
         raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {bank.steps - 2}")
-    simulator = Simulator(judging(task or Task()), traffic or LogTraffic())
+    task = judging(task or Task())
+    simulator = Simulator(task, traffic or LogTraffic())
+    if getattr(planner, "actions", task.actions) != task.actions:
+        raise UsageError(
+            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
+        )
+    absent = np.flatnonzero(np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) <= 0)
+    if absent.size:
+        name = scenarios[int(absent[0])]["scenario_id"]
+        raise UsageError(
+            f"ego is not in the log at step {start_step}", record=name, cure="begin at another step"
+        )
     root = jax.random.key(seed)
     parts: list[Episodes] = []
     for first in range(0, len(bank), BATCH):
@@ -72,7 +83,7 @@ def evaluate(
     _refuse_nan(planner, whole, scenarios)
     return Results(
         planner=planner.name,
-        traffic="log",
+        traffic=simulator.traffic.name,
         seed=seed,
         scenarios=scenarios,
         metrics={name: np.where(v.defined, v.value, np.nan) for name, v in whole.metrics.items()},

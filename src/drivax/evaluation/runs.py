@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +60,7 @@ def run_evaluation(
         task: Action space and observation of the planner.
         overwrite: Replace an existing run folder.
     """
-    count = min(len(data), config.limit or len(data))
+    count = len(data) if config.limit is None else min(len(data), config.limit)
     scenarios = [data[row] for row in range(count)]
     bank = ScenarioBank.from_scenarios(scenarios) if bank is None else bank
     refuse_existing(Path(out), overwrite)
@@ -72,16 +74,17 @@ def run_evaluation(
             seed=config.seed,
             progress=lambda done, total: bar.update(done),
         )
-    folder = RunFolder.create(
-        out,
-        config,
-        data=[data],
-        overwrite=overwrite,
-        kind="evaluation",
-        planner=planner.name,
-        traffic=config.traffic,
-    )
-    results.write(folder.path)
+    # Everything is written beside the final name, so that a folder of that name is always a whole run.
+    out = Path(out)
+    partial = out.parent / f".{out.name}.partial-{os.getpid()}"
+    notes = {"kind": "evaluation", "planner": results.planner, "traffic": results.traffic}
+    try:
+        RunFolder.create(partial, config, data=[data], overwrite=True, **notes)
+        results.write(partial)
+        shutil.rmtree(out, ignore_errors=True)
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return results
 
 

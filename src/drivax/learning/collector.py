@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.metrics.episode import episode_metrics
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
@@ -62,7 +62,7 @@ def start_environments(simulator: Simulator, bank: ScenarioBank, key: Array, cou
     """Environments at scenarios drawn with replacement, at random steps so that their ends are staggered."""
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
-    step = jax.random.randint(step_key, (count,), CURRENT_STEP, bank.steps - 2)
+    step = _start(bank, index, jax.random.randint(step_key, (count,), CURRENT_STEP, bank.steps - 2))
     state = jax.vmap(simulator.reset, in_axes=(None, 0, 0))(bank, index, step)
     observation = jax.vmap(simulator.observe, in_axes=(None, 0))(bank, state.scene)
     return Environments(state, jnp.zeros(count, bool), dict(observation))
@@ -92,7 +92,7 @@ def collect(
         key, act_key, index_key, start_key = jax.random.split(key, 4)
         choice, action, extra = actor(now.observation, act_key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
-        start = jax.random.randint(start_key, (count,), CURRENT_STEP, latest_start + 1)
+        start = _start(bank, index, jax.random.randint(start_key, (count,), CURRENT_STEP, latest_start + 1))
         state, transition = step_all(bank, now.state, action, now.over, index, start)
         row = Rollout(
             observation=now.observation,
@@ -112,16 +112,29 @@ def collect(
     return environments, rollout, jax.tree.map(lambda leaf: leaf.sum(axis=0), tally)
 
 
+def _start(bank: ScenarioBank, index: Array, step: Array) -> Array:
+    """Steps at which the ego is in the log: those asked for, or the current one, at which it always is."""
+    return jnp.where(bank.agents[index, step, 0, AGENT_VALID] > 0, step, CURRENT_STEP)
+
+
 def _tally(
     bank: ScenarioBank, state: SimState, terms: dict[str, Array], done: Array, over: Array
 ) -> dict[str, Array]:
     """Sums over the batch: metrics of episodes that end now, reward terms of steps that count."""
-    values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, state)
-    totals = {"episodes": done.sum().astype(jnp.float32), "steps": (~over).sum().astype(jnp.float32)}
-    for name in ROLLOUT_METRICS:
-        counts = done & values[name].defined
-        totals[name] = jnp.sum(jnp.where(counts, values[name].value, 0.0))
-        totals[f"{name}/n"] = counts.sum().astype(jnp.float32)
+
+    def of_episodes() -> dict[str, Array]:
+        values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, state)
+        sums = {}
+        for name in ROLLOUT_METRICS:
+            counts = done & values[name].defined
+            sums[name] = jnp.sum(jnp.where(counts, values[name].value, 0.0))
+            sums[f"{name}/n"] = counts.sum().astype(jnp.float32)
+        return sums
+
+    # Most steps end no episode; the branch is on the whole batch, so it really is skipped.
+    nothing = {name: jnp.zeros(()) for metric in ROLLOUT_METRICS for name in (metric, f"{metric}/n")}
+    totals = jax.lax.cond(done.any(), of_episodes, lambda: nothing)
+    totals |= {"episodes": done.sum().astype(jnp.float32), "steps": (~over).sum().astype(jnp.float32)}
     for name, term in terms.items():
         totals[f"reward/{name}"] = jnp.sum(jnp.where(over, 0.0, term))
     return totals

@@ -119,9 +119,10 @@ def validate(
     """Closed-loop score of the policy's mode on held-out scenarios, and what to log."""
     planner = policy_planner(ppo, state.parameters)
     results = evaluate(planner, validation.bank, validation.names, task=config.task)
-    full, partial = results.metrics["vmax_score"], results.metrics["vmax_score_partial"]
-    score = float(np.nanmean(np.where(np.isfinite(full), full, partial)))
-    row = {"validation/score": score}
+    # Full scores where there are any; partial ones are never mixed with them.
+    name = next(n for n in ("vmax_score", "vmax_score_partial") if np.isfinite(results.metrics[n]).any())
+    score = float(np.nanmean(results.metrics[name]))
+    row = {f"validation/{name}": score}
     for name in _VALIDATION:
         values = results.metrics[name]
         if np.isfinite(values).any():

@@ -18,6 +18,7 @@ from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
+from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
 
 
@@ -52,6 +53,16 @@ class PpoConfig:
     value_coefficient: float = 0.5
     entropy_coefficient: float = 0.01
     gradient_norm: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
+            raise ValueError("environments, unroll and minibatches are at least 1")
+        if self.steps_per_iteration % self.minibatches:
+            raise ValueError(
+                f"environments x unroll = {self.steps_per_iteration} is no multiple of {self.minibatches} minibatches"
+            )
+        if not CURRENT_STEP <= self.latest_start < STEPS - 2:
+            raise ValueError(f"latest_start is {self.latest_start}; use {CURRENT_STEP} to {STEPS - 3}")
 
     @property
     def steps_per_iteration(self) -> int:
@@ -156,21 +167,22 @@ class Ppo:
         size = config.steps_per_iteration
 
         def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            order = jax.random.permutation(key, size).reshape(config.minibatches, -1)
-            return jax.lax.scan(minibatch, carry, order)
+            order_key, noise_key = jax.random.split(key)
+            order = jax.random.permutation(order_key, size).reshape(config.minibatches, -1)
+            return jax.lax.scan(minibatch, carry, (order, jax.random.split(noise_key, config.minibatches)))
 
-        def minibatch(carry: tuple[Any, Any], rows: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            parameters, optimiser = carry
+        def minibatch(
+            carry: tuple[Any, Any], now: tuple[Array, Array]
+        ) -> tuple[tuple[Any, Any], dict[str, Array]]:
+            (parameters, optimiser), (rows, key) = carry, now
             part = jax.tree.map(lambda leaf: leaf[rows], batch)
-            key = jax.random.fold_in(update_noise, rows[0])
             (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key)
             logs["gradient_norm"] = optax.tree.norm(gradient)
             change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
             return (optax.apply_updates(parameters, change), optimiser), logs
 
-        order_key, update_noise = jax.random.split(key)
         carry = (state.parameters, state.optimiser)
-        (parameters, optimiser), logs = jax.lax.scan(epoch, carry, jax.random.split(order_key, config.epochs))
+        (parameters, optimiser), logs = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
         return parameters, optimiser, {f"loss/{name}": value.mean() for name, value in logs.items()}
 
     def _loss(self, parameters: Any, part: dict[str, Any], key: Array) -> tuple[Array, dict[str, Array]]:

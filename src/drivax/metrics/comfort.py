@@ -61,9 +61,9 @@ def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarr
 class ComfortSteps:
     """The last eight steps of a window, oldest first: whether each is comfortable, and what was measured."""
 
-    comfortable: Bool[Array, 8]
-    jerk_mps3: Float[Array, 8]
-    lateral_mps2: Float[Array, 8]
+    comfortable: Bool[Array, " 8"]
+    jerk_mps3: Float[Array, " 8"]
+    lateral_mps2: Float[Array, " 8"]
 
 
 def judge_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.metrics.comfort import TAIL, judge_comfort
 from drivax.metrics.scores import Value, nuplan_score, vmax_score
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.queries import is_mapped
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import TTC_HORIZON_S
@@ -45,11 +46,11 @@ STEP_VALUES: dict[str, Callable[[Facts], _Step]] = {
     "lane_straddle": lambda f: _always(f.straddling * DT_S),
     "route_deviation": lambda f: _always(f.route_deviation_m),
     "off_route": lambda f: _always(f.off_route),
-    "log_divergence": lambda f: _always(f.log_divergence_m),
+    "log_divergence": lambda f: (f.log_divergence_m, f.logged.astype(jnp.float32)),
     "goal_distance": lambda f: _always(f.goal_distance_m),
     "progress": lambda f: _always(f.progress_m),
-    "log_progress": lambda f: _always(f.log_progress_m),
     "distance": lambda f: _always(f.moved_m),
+    "ignored": lambda f: _always(f.ignored),
 }
 _COMFORT = ("comfort", "jerk", "lateral_acceleration")
 _ROWS = {name: row for row, name in enumerate((*STEP_VALUES, *_COMFORT))}
@@ -122,7 +123,7 @@ def episode_add(episode: Episode, state: SimState, final: Bool[Array, ""]) -> Ep
 
 def _comfort(
     state: SimState, final: Bool[Array, ""]
-) -> tuple[Float[Array, 3], Float[Array, ""], Float[Array, 3]]:
+) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, " 3"]]:
     """Sum over the steps that are judged now, how many they are, and the largest of each comfort value."""
     judged = judge_comfort(state.scene.history)
     step = state.scene.step - (TAIL - 1) + jnp.arange(TAIL)
@@ -205,9 +206,7 @@ METRICS: dict[str, Metric] = {
     "route_deviation_max": Metric(
         "m", "low", "largest distance to the route", _ROUTE, "route_deviation", "max"
     ),
-    "off_route": Metric(
-        "-", "low", "share of steps off the route's lanes", _ROUTE | _LANES, "off_route", "mean"
-    ),
+    "off_route": Metric("-", "low", "left the lanes of the route", _ROUTE | _LANES, "off_route", "any"),
     "ade": Metric("m", "-", "mean distance to the logged position", source="log_divergence", operator="mean"),
     "fde": Metric(
         "m", "-", "distance to the logged position at the end", source="log_divergence", operator="last"
@@ -215,6 +214,9 @@ METRICS: dict[str, Metric] = {
     "goal_distance": Metric("m", "low", "distance to the goal at the end", _ROUTE, "goal_distance", "last"),
     "reached_goal": Metric("-", "high", "within 3 m of the goal, or progress ratio at least 0.95", _ROUTE),
     "distance": Metric("m", "-", "distance driven", source="distance", operator="sum"),
+    "ignored_overlaps": Metric(
+        "-", "-", "agents ignored because they overlapped at first", source="ignored", operator="max"
+    ),
     "steps": Metric("-", "-", "steps driven"),
 }
 #: Events whose first step is kept beside the metrics.
@@ -229,13 +231,17 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
 
     def known(needs: Flag) -> Bool[Array, ""]:
         wanted = jnp.uint32(int(needs))
-        return (flags & wanted) == wanted
+        # The route is ego's; other slots have none.
+        return ((flags & wanted) == wanted) & ((Flag.ROUTE not in needs) | (state.scene.slot == 0))
 
     result = {
         name: Value(value := _read(episode, metric), known(metric.needs) & jnp.isfinite(value))
         for name, metric in METRICS.items()
         if metric.operator is not None
     }
+    mapped = is_mapped(bank, index)
+    for name in ("offroad", "left_map"):
+        result[name] = Value(result[name].value, result[name].defined & mapped)
     result = {name: Value(jnp.where(v.defined, v.value, 0.0), v.defined) for name, v in result.items()}
     result |= _progress(bank, state, known(_ROUTE), result)
     result |= _compliance(episode, result, known(_LANES))
@@ -311,11 +317,8 @@ def _outcome(bank: ScenarioBank, state: SimState, known: dict[str, Value]) -> di
     clean = ~(known["collision"].value > 0) & ~offroad & ~ran_red
     lawful = ~(known["at_fault_collision"].value > 0) & ~offroad & ~ran_red
     success = clean & (known["reached_goal"].value > 0)
-    index, start = state.scene.index, state.start
-    path = bank.agents[index, :, state.scene.slot, :2]
-    steps = jnp.sqrt(jnp.sum((path[1:] - path[:-1]) ** 2, axis=-1))
-    logged = jnp.sum(jnp.where(jnp.arange(bank.steps - 1) >= start, steps, 0.0))
-    defined = known["collision"].defined
+    logged = bank.log_ahead[state.scene.index, state.start]
+    defined = known["collision"].defined & known["offroad"].defined
     return {
         "accuracy": _yes(clean, defined),
         "accuracy_at_fault": _yes(lawful, defined),

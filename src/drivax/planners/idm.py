@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from drivax.geometry.angles import wrap
 from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import route_ahead
+from drivax.scenario.queries import LEVEL_M, route_ahead
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import LightState
 from drivax.simulator.idm import IdmParameters, idm_acceleration
@@ -27,7 +27,11 @@ _YELLOW_BRAKING_MPS2 = 3.0
 
 @record
 class IdmPlanner:
-    """A rule-based driver; uses the situation's truth, not observations."""
+    """A rule-based driver; uses the situation's truth, not observations.
+
+    Where no limit is known it wants 13.4 m/s (50 km/h would be 13.9); where a scenario has no route on lanes it follows
+    the path that the log takes.
+    """
 
     actions: ActionSpace = static(default=ActionSpace())
     parameters: IdmParameters = static(default=IdmParameters())
@@ -54,13 +58,17 @@ class IdmPlanner:
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
         gap, leader_speed = self._leader(bank, situation, path, there, offsets)
-        wanted = self._desired_speed(path, there, offsets)
+        wanted = jnp.where(there[1], self._desired_speed(path, there, offsets), 0.0)
         acceleration = idm_acceleration(speed, wanted, gap, leader_speed, self.parameters)
         ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
+        left_m = bank.route_points[scene.index, 0] - 1 - scene.route_m
+        ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
         target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, :2] - me[:2]
         forward = target[0] * me[2] + target[1] * me[3]
         left = target[1] * me[2] - target[0] * me[3]
-        curvature = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
+        curvature = jnp.where(
+            forward > 1.0, 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0), 0.0
+        )
         return jnp.clip(self.actions.action(acceleration, curvature, me[4]), -1.0, 1.0), carry
 
     def _leader(
@@ -73,6 +81,7 @@ class IdmPlanner:
         half_length = jnp.abs(cos) * frame.box[:, 4] / 2 + jnp.abs(sin) * frame.box[:, 5] / 2
         half_width = jnp.abs(sin) * frame.box[:, 4] / 2 + jnp.abs(cos) * frame.box[:, 5] / 2
         others = frame.valid & (jnp.arange(frame.valid.shape[0]) != scene.slot)
+        others &= jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
         blocks = others & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
         gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
         speed = jnp.sqrt(jnp.sum(frame.velocity**2, axis=-1)) * cos

@@ -46,6 +46,7 @@ class ScenarioBank:
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
         log_progress: Arc length of the logged ego along route 0.
+        log_ahead: Distance that the logged ego still drives.
         road: Observation pieces in order of rank: x, y, direction, length, kind, limit (-1), curvature.
         flags: ``scenario.schema.Flag`` bits.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
@@ -69,6 +70,7 @@ class ScenarioBank:
     route_points: Int[Array, "N 2"]
     goal: Float[Array, "N 2"]
     log_progress: Float[Array, "N T"]
+    log_ahead: Float[Array, "N T"]
     road: Float[Array, "N O 8"]
     road_rows: Int[Array, " N"]
     flags: UInt[Array, " N"]
@@ -112,6 +114,13 @@ class ScenarioBank:
             if Flag.NO_FUTURE in scenario.has and not allow_no_future:
                 raise DataError(
                     "has no logged future (a test split)", record=scenario.id, cure="leave it out of the set"
+                )
+        for scenario in kept:
+            if scenario.capacity != kept[0].capacity:
+                raise DataError(
+                    f"has capacity {scenario.capacity.name!r}, others {kept[0].capacity.name!r}",
+                    record=scenario.id,
+                    cure="convert all sets with one --capacity",
                 )
         arrays, static = _stack(kept, trim)
         return cls(**{name: jnp.asarray(value) for name, value in arrays.items()}, **static)
@@ -201,7 +210,16 @@ def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, An
         "route_points": _column(scenarios, "route_points")[:, :2].astype(np.int32),
         "goal": _column(scenarios, "goal_xy"),
         "log_progress": _column(scenarios, "log_progress"),
+        "log_ahead": _log_ahead(scenarios),
     }
+
+
+def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
+    """Distance that each ego log drives from every step to its end; gaps in it count for nothing."""
+    xy, valid = _column(scenarios, "agent_xy")[:, :, 0], _column(scenarios, "agent_valid")[:, :, 0]
+    moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
+    ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
+    return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1).astype(np.float32)
 
 
 def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:

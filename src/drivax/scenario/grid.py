@@ -27,7 +27,7 @@ class Grid:
     around the query, because its midpoint is at most 2 m from its nearest point.
     """
 
-    origin: Float[Array, 2]
+    origin: Float[Array, " 2"]
     cell_m: float
     side: int
 
@@ -99,7 +99,7 @@ class GridSegments:
 
     grid: Grid
     segments: Segments
-    blocks: Int[Array, 4]
+    blocks: Int[Array, " 4"]
     edge_start: Int[Array, " cell_plus_1"]
     lane_start: Int[Array, " cell_plus_1"]
     overflow: dict[str, int]

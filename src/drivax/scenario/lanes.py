@@ -100,7 +100,7 @@ class LaneGraph:
         return [(int(other), float(shift)) for other, shift in sides if other >= 0]
 
 
-def lane_graph(features: Sequence[MapFeature], origin: Float[Array, 3]) -> LaneGraph:
+def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> LaneGraph:
     """Builds the lane graph of all lanes that have a direction (two or more points, some length).
 
     Args:
@@ -329,7 +329,7 @@ class LaneSegments:
         return np.where(found, near.lane[best], -1), s[rows, best], distance[rows, best]
 
     def around(
-        self, xyz: Float[Array, 3], heading: float, reach_m: float, turn_rad: float
+        self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
     ) -> list[tuple[int, float, float]]:
         """All lanes that fit one pose: (lane, arc length on it, distance), the nearest first."""
         near = self._near(xyz[None, :2], reach_m)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import wrap
-from drivax.scenario.bank import DEFAULT_LANE_WIDTH_M, ScenarioBank
+from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 
 EDGE_CUTOFF_M = 3.0
@@ -25,7 +25,7 @@ LANE_MARGIN_M = 0.2
 _FAR = 1e9
 
 
-def _cell(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2]) -> Int[Array, 2]:
+def _cell(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Int[Array, " 2"]:
     """Grid cell (x, y) of a point, clamped so that its 3 x 3 block lies in the grid."""
     grid = round((bank.grid_side.shape[1]) ** 0.5)
     cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
@@ -34,7 +34,7 @@ def _cell(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2]) -> Int
 
 def _runs(
     start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int, index: Int[Array, ""],
-    cell: Int[Array, 2], grid: int,
+    cell: Int[Array, " 2"], grid: int,
 ) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
     """The rows of the 3 x 3 cells around ``cell``: three contiguous reads of fixed length, and which rows count.
 
@@ -66,7 +66,7 @@ def _to_segments(
 
 
 def left_of_edges(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, 2], points: Float[Array, "P 2"],
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
     z: Float[Array, ""],
 ) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
     """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
@@ -119,7 +119,7 @@ class LaneHits:
 
 
 def around_lanes(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, 2], heading: Float[Array, 2],
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], heading: Float[Array, " 2"],
     points: Float[Array, "P 2"], z: Float[Array, ""],
 ) -> LaneHits:  # fmt: skip
     """Where a box lies among the lanes around it.
@@ -147,14 +147,17 @@ def around_lanes(
     has_lane = aligned[best] & reachable[best]
     nearest = jnp.argmin(own)
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
-    friendly = jnp.where(against, _FAR, own).min()
-    beyond = jnp.sqrt(corner) - (half + LANE_MARGIN_M)
-    outside = jnp.where(aligned, beyond, _FAR).min(axis=1) > 0.0
+    friendly = jnp.where(aligned, own, _FAR).min()
+    if bank.long_ego:
+        points_near, outside = jax.vmap(lambda point: _corner_lanes(bank, index, point, heading, z))(points)
+    else:
+        points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
+        outside = _outside_lanes(corner, aligned, half)
     leaving = jnp.abs(side[1:, best]) - (half[best] + LANE_MARGIN_M) > 0.0
     near = reachable.any()
     return LaneHits(
         near=near,
-        points_near=corner.min(axis=1) <= LANE_CUTOFF_M**2,
+        points_near=points_near,
         on_corridor=((rows[8] == 1.0) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
@@ -166,8 +169,31 @@ def around_lanes(
     )
 
 
+def _outside_lanes(
+    squared: Float[Array, "P K"], aligned: Bool[Array, " K"], half: Float[Array, " K"]
+) -> Bool[Array, " P"]:
+    """Whether each point is outside every lane that runs ego's way."""
+    return ~(aligned & (squared <= (half + LANE_MARGIN_M) ** 2)).any(axis=1)
+
+
+def _corner_lanes(
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    point: Float[Array, " 2"],
+    heading: Float[Array, " 2"],
+    z: Float[Array, ""],
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """For a corner that its box's own cells may not reach: whether a lane is near, and whether it is outside all."""
+    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, point), grid)
+    squared = _to_segments(rows, point[None])[0]
+    squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
+    aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
+    return squared.min() <= LANE_CUTOFF_M**2, _outside_lanes(squared, aligned, rows[5])[0]
+
+
 def offroad_distance(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, 2], points: Float[Array, "P 2"],
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
     points_near_lane: Bool[Array, " P"], z: Float[Array, ""],
 ) -> Float[Array, " P"]:  # fmt: skip
     """How far each point is beyond the nearest road edge, m: positive off the road, negative on it.
@@ -189,10 +215,15 @@ def offroad_distance(
     return jnp.where(known, -left, jnp.where(off, EDGE_CUTOFF_M, -EDGE_CUTOFF_M))
 
 
-def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2]) -> Bool[Array, ""]:
+def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Bool[Array, ""]:
     """Whether a point lies outside the box around all edges and lanes of the scenario."""
     box = bank.map_box[index]
-    return (xy < box[:2]).any() | (xy > box[2:]).any()
+    return ((xy < box[:2]).any() | (xy > box[2:]).any()) & is_mapped(bank, index)
+
+
+def is_mapped(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether the scenario has any edge or lane, without which being off the road means nothing."""
+    return (bank.grid_edge[index, -1] > 0) | (bank.grid_lane[index, -1] > 0)
 
 
 @record
@@ -202,7 +233,7 @@ class RouteHit:
     along_m: Float[Array, ""]
     lateral_m: Float[Array, ""]
     distance_m: Float[Array, ""]
-    heading: Float[Array, 2]
+    heading: Float[Array, " 2"]
 
 
 _WINDOW = 40
@@ -210,15 +241,21 @@ _WINDOW_BEHIND = 6
 
 
 def project_on_route(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, 2], near_m: Float[Array, ""], route: int = 0
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    xy: Float[Array, " 2"],
+    near_m: Float[Array, ""],
+    ahead_m: float | Float[Array, ""] = 33.0,
+    route: int = 0,
 ) -> RouteHit:
-    """Projects a point on the route within a window from 6 m behind to 33 m ahead of ``near_m``.
+    """Projects a point on the route within a window from 6 m behind to ``ahead_m`` ahead of ``near_m``.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         xy: The point, m.
         near_m: Arc length around which to look; the last known position along the route.
+        ahead_m: How far ahead to look; a car that moved little cannot have reached the other leg of a hairpin.
         route: 0 the route to the goal, 1 the log's own.
     """
     count = bank.routes.shape[2]
@@ -226,7 +263,8 @@ def project_on_route(
     size = min(_WINDOW, count)
     window = jax.lax.dynamic_slice(bank.routes, (index, route, first, 0), (1, 1, size, 5))[0, 0]
     a, b = window[:-1], window[1:]
-    real = first + 1 + jnp.arange(size - 1) < bank.route_points[index, route]
+    place = first + jnp.arange(size - 1)
+    real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
     rows = jnp.stack([a[:, 0], a[:, 1], b[:, 0], b[:, 1]])
     squared, side = _to_segments(rows, xy[None])
     k = jnp.argmin(jnp.where(real, squared[0], _FAR))
@@ -257,36 +295,35 @@ def route_ahead(
 
 
 def light_crossing(
-    bank: ScenarioBank, index: Int[Array, ""], before: Float[Array, 2], now: Float[Array, 2]
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    before: Float[Array, " 2"],
+    now: Float[Array, " 2"],
+    z: Float[Array, ""],
 ) -> tuple[Bool[Array, " L"], Float[Array, " L"]]:
     """Which stop lines a point crossed forwards between two steps, and its distance before each line now (m).
 
     A line is crossed when the signed distance along the lane's heading changes sign and the point passes through the
-    finite segment.
+    finite segment. The distance is infinite for lines of other lanes (more than 2 m beside the segment) and levels.
     """
     line = bank.light_line[index]
     middle = (line[:, 0:2] + line[:, 2:4]) / 2
     half = jnp.sqrt(jnp.sum((line[:, 2:4] - line[:, 0:2]) ** 2, -1)) / 2
     cos, sin = jnp.cos(line[:, 5]), jnp.sin(line[:, 5])
 
-    def split(point: Float[Array, 2]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
+    def split(point: Float[Array, " 2"]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
         d = point - middle
         return d[:, 0] * cos + d[:, 1] * sin, d[:, 1] * cos - d[:, 0] * sin
 
     (s0, t0), (s1, t1) = split(before), split(now)
     share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
     through = jnp.abs(t0 + (t1 - t0) * share) <= half
-    return (s0 < 0.0) & (s1 >= 0.0) & through, -s1
+    level = jnp.abs(line[:, 4] - z) <= LEVEL_M
+    before_m = jnp.where(level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
+    return (s0 < 0.0) & (s1 >= 0.0) & through & level, before_m
 
 
 def turns_right(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, " L"]:
     """Whether the lane behind each stop line ends more than 45 deg to the right of its start."""
     line = bank.light_line[index]
     return wrap(line[:, 6] - line[:, 5]) < -jnp.pi / 4
-
-
-__all__ = [
-    "DEFAULT_LANE_WIDTH_M", "EDGE_CUTOFF_M", "LANE_CUTOFF_M", "LANE_MARGIN_M", "LEVEL_M", "OFFROAD_TOLERANCE_M",
-    "LaneHits", "RouteHit", "around_lanes", "left_of_edges", "left_the_map", "light_crossing", "offroad_distance",
-    "project_on_route", "route_ahead", "turns_right",
-]  # fmt: skip

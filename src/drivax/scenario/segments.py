@@ -85,7 +85,7 @@ class Segments:
 
 
 def road_lines(
-    features: Sequence[MapFeature], origin: Float[Array, 3], split_gap_m: float | None
+    features: Sequence[MapFeature], origin: Float[Array, " 3"], split_gap_m: float | None
 ) -> RoadLines:
     """Features of two or more points as polylines in the local frame.
 

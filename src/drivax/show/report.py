@@ -28,7 +28,7 @@ from drivax.show.selection import Choice, choose, outcome
 from drivax.show.tables import bounds, difference_table, explanations, number, percent, planner_table
 
 EPISODES = 12
-_KEYS = (
+KEYS = (
     ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
     ("+ −", "zoom"), ("f", "follow or whole drive"), ("n p", "next and previous episode"),
 )  # fmt: skip
@@ -64,7 +64,7 @@ def write_report(
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
     packed = _packed_episodes(evaluations, data, episodes) if evaluations and episodes else []
-    _publish(out, _page(evaluations, trainings, packed))
+    publish(out, _page(evaluations, trainings, packed))
     return out
 
 
@@ -124,14 +124,14 @@ def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
     place = stored.rows[run.occurrences[row]]
     steps, start = int(scenario.steps), int(stored.start[place])
     ego = np.full((steps, 4), np.nan)
-    ego[:start] = _logged(scenario)[:start]
+    ego[:start] = logged_drive(scenario)[:start]
     driven = stored.ego[place, : steps - start]
     ego[start : start + len(driven)] = driven
     events = {name: int(at[place]) for name, at in stored.events.items()}
     return Drive(run.name, ego, start, events, outcome(run, row))
 
 
-def _logged(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
+def logged_drive(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
     """The logged ego: position, heading, speed; NaN where it was not valid."""
     steps = int(scenario.steps)
     speed = np.linalg.norm(scenario.agent_velocity[:steps, 0], axis=-1)
@@ -152,14 +152,14 @@ def _page(
     if runs:
         sections.append(_meaning(runs))
     sections.append(_origin([*runs, *trainings]))
-    return Template(_asset("report.html.template")).substitute(
+    return Template(asset("report.html.template")).substitute(
         title=escape(f"{runs[-1].name}: evaluation report" if runs else "training report"),
         version=escape(metadata.version("drivax")),
-        style=_colours() + _asset("player.css"),
+        style=colours() + asset("player.css"),
         lead=_lead(runs),
         sections="\n".join(filter(None, sections)),
         data="\n".join(_data(packed)),
-        script=_asset("player.js") if packed else "",
+        script=asset("player.js") if packed else "",
     )
 
 
@@ -229,8 +229,8 @@ def _player(runs: Sequence[Evaluation], packed: Sequence[tuple[Choice, Mapping[s
         f"<small>{escape(choice.scenario_id)}</small></button>"
         for choice, _ in packed
     )
-    legend = "".join(_legend_item(name, words) for name, words in LEGEND)
-    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in _KEYS)
+    legend = "".join(legend_item(name, words) for name, words in LEGEND)
+    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     reactive = any(run.traffic != "log" for run in runs if comparable(run, runs[-1]))
     caution = (
         "<p><b>Other agents are drawn as recorded;</b> in this traffic they reacted and moved otherwise.</p>"
@@ -241,12 +241,12 @@ def _player(runs: Sequence[Evaluation], packed: Sequence[tuple[Choice, Mapping[s
         f"<section id=episodes><h2>Episodes</h2><p>Chosen by rule: failures of {escape(runs[-1].name)} first, "
         f"each kind in turn, then successes. All planners start from the same scene at the same time.</p>{caution}"
         f"<div class=picker role=group aria-label=Episodes>{buttons}</div><h3 data-control=title></h3>"
-        f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        f"<div id=stage></div>{CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
         "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript></section>"
     )
 
 
-_CONTROLS = """<div class=controls>
+CONTROLS = """<div class=controls>
 <button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
 <button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
 <button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
@@ -263,7 +263,7 @@ _CONTROLS = """<div class=controls>
 </div>"""
 
 
-def _legend_item(name: str, words: str) -> str:
+def legend_item(name: str, words: str) -> str:
     sign = "✕" if name == "mark" else ""
     fill = "" if name in ("log", "route", "mark") else f' style="background:var(--{name})"'
     return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'
@@ -310,29 +310,30 @@ def _data(packed: Sequence[tuple[Choice, Mapping[str, Any]]]) -> list[str]:
     if not packed:
         return []
     themes = {name: dict(theme) for name, theme in THEMES.items()}
-    scripts = [f'<script type="application/json" id="palette">{_json(themes)}</script>']
+    scripts = [f'<script type="application/json" id="palette">{embedded_json(themes)}</script>']
     return scripts + [
-        f'<script type="application/json" class="episode">{_json(data)}</script>' for _, data in packed
+        f'<script type="application/json" class="episode">{embedded_json(data)}</script>'
+        for _, data in packed
     ]
 
 
-def _json(value: Any) -> str:
+def embedded_json(value: Any) -> str:
     """JSON that cannot end the script element that holds it."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def _colours() -> str:
+def colours() -> str:
     """The palette as CSS variables, light and dark."""
     light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
                    for name in ("light", "dark"))  # fmt: skip
     return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
     return resources.files("drivax.show").joinpath(name).read_text(encoding="utf-8")
 
 
-def _publish(out: Path, page: str) -> None:
+def publish(out: Path, page: str) -> None:
     """Write beside the target, make it durable, then rename: never half a report under its name."""
     out.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)

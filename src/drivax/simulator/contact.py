@@ -17,7 +17,21 @@ TTC_HORIZON_S = 5.0
 STOPPED_MPS = 0.05
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
 REAR_AXLE = 1.461 / 5.176
-ABSENT, APART, TOUCHING, IGNORED = range(4)
+
+
+class Contact(enum.IntEnum):
+    """What there is between the judged agent and another.
+
+    ``IGNORED`` overlapped when it appeared and counts for nothing until it parts; ``HIT`` touches without the judged
+    agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, its fault decided once and for all.
+    """
+
+    ABSENT = 0
+    APART = 1
+    HIT = 2
+    IGNORED = 3
+    AT_FAULT = 4
+    PARTED = 5
 
 
 class CollisionType(enum.IntEnum):
@@ -39,13 +53,31 @@ def overlaps(frame: Frame, slot: Int[Array, ""]) -> Bool[Array, " S"]:
     return overlap(frame.box[slot], frame.box) & others & level
 
 
+def first_contacts(before: Int[Array, " S"], touching: Bool[Array, " S"]) -> Bool[Array, " S"]:
+    """Which overlaps count and begin now: the other was there and apart, and has never been hit before."""
+    return touching & (before == Contact.APART)
+
+
 def next_contacts(
-    before: Int[Array, " S"], touching: Bool[Array, " S"], valid: Bool[Array, " S"]
+    before: Int[Array, " S"], touching: Bool[Array, " S"], valid: Bool[Array, " S"], fault: Bool[Array, " S"]
 ) -> Int[Array, " S"]:
-    """Contact code of every slot: an overlap that was there when the agent appeared is ignored until it parts."""
-    ignored = touching & ((before == IGNORED) | (before == ABSENT))
-    code = jnp.where(ignored, IGNORED, jnp.where(touching, TOUCHING, APART))
-    return jnp.where(valid, code, ABSENT).astype(jnp.int8)
+    """Contact code of every slot, one step later.
+
+    Args:
+        before: Codes of the step before.
+        touching: Who overlaps now.
+        valid: Who is there now.
+        fault: For those whose first contact is now: whether it is the judged agent's fault.
+    """
+    c = Contact
+    appears = (before == c.IGNORED) | (before == c.ABSENT)
+    known = jnp.where(
+        before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), jnp.where(before == c.PARTED, c.HIT, before)
+    )
+    contact = jnp.where(appears, c.IGNORED, known)
+    judged = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED)
+    apart = jnp.where(judged, c.PARTED, c.APART)
+    return jnp.where(valid, jnp.where(touching, contact, apart), c.ABSENT).astype(jnp.int8)
 
 
 def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, Array]:
@@ -60,7 +92,7 @@ def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, A
 def judge_contacts(
     frame: Frame, slot: Int[Array, ""], fresh: Bool[Array, " S"], speed: Float[Array, ""],
     others_speed: Float[Array, " S"], unlawful: Bool[Array, ""],
-) -> tuple[Bool[Array, ""], Int[Array, ""]]:  # fmt: skip
+) -> tuple[Bool[Array, " S"], Int[Array, ""]]:  # fmt: skip
     """Fault and type of contacts that began at this step.
 
     Fault follows nuPlan's order: agent itself stopped: no; the other stopped: yes; the other behind: no; hit with the
@@ -75,7 +107,7 @@ def judge_contacts(
         unlawful: The agent is in several lanes or off the road.
 
     Returns:
-        Whether any fresh contact is the agent's fault, and the type of the nearest one.
+        Which fresh contacts are the agent's fault, and the type of the nearest one.
     """
     me = frame.box[slot]
     ahead, left, cos, _ = relative(frame, slot)
@@ -109,19 +141,20 @@ def judge_contacts(
         ),
     )
     nearest = jnp.argmin(jnp.where(fresh, ahead**2 + left**2, jnp.inf))
-    return (fresh & fault).any(), jnp.where(fresh.any(), kind[nearest], CollisionType.NONE).astype(jnp.int8)
+    return fresh & fault, jnp.where(fresh.any(), kind[nearest], CollisionType.NONE).astype(jnp.int8)
 
 
-def time_to_collision(frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"]) -> Float[Array, ""]:
+def time_to_collision(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, " S"]) -> Float[Array, ""]:
     """Seconds to the first overlap at constant velocities and fixed headings, at most 5 (semantics, ``ttc``).
 
-    Agents that lie entirely behind the rear axle are followers and never count. Of the rest, whoever overlaps within
+    Agents that lie entirely behind the rear axle are followers and never count; nor does one that has run into the
+    agent without its fault, which ``left_out`` names. Of the rest, whoever overlaps within
     the horizon is ahead or comes into the lane that the agent sweeps; no cone narrows the view.
     """
     me = frame.box[slot]
     ahead, _, cos, sin = relative(frame, slot)
     reach = jnp.abs(cos) * frame.box[:, LENGTH] / 2 + jnp.abs(sin) * frame.box[:, WIDTH] / 2
-    counts = frame.valid & ~ignored & (jnp.arange(frame.valid.shape[0]) != slot)
+    counts = frame.valid & ~left_out & (jnp.arange(frame.valid.shape[0]) != slot)
     counts &= (ahead + reach > -REAR_AXLE * me[LENGTH]) & (jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M)
     times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
     return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))

@@ -17,8 +17,8 @@ _ALONG_GAIN = 1.0
 
 
 def bicycle(
-    motion: Float[Array, 4], acceleration: Float[Array, ""], curvature: Float[Array, ""]
-) -> Float[Array, 4]:
+    motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""]
+) -> Float[Array, " 4"]:
     """One step of 0.1 s: the car drives the distance it really travels and turns by curvature times distance.
 
     A car that would go below zero speed stops inside the step after ``v^2 / (2 |a|)`` and stays: no creep, no reverse.
@@ -45,7 +45,7 @@ def bicycle(
 
 
 def follow(
-    motion: Float[Array, 4], target: Float[Array, 4], beyond: Float[Array, 4]
+    motion: Float[Array, " 4"], target: Float[Array, " 4"], beyond: Float[Array, " 4"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Acceleration and curvature that follow a log (semantics, ``expert_actions``).
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.simulator.contact import ABSENT
-from drivax.simulator.situation import PAUSE_STEPS, measure
+from drivax.simulator.contact import Contact
+from drivax.simulator.lights import remember_lights
+from drivax.simulator.situation import measure
 from drivax.simulator.traffic import LogTraffic, alone, frame_of, logged_history
 from drivax.simulator.types import Frame, Scene, SimState, Situation, Task, Traffic, Transition
 
@@ -35,11 +37,10 @@ class Simulator:
         cast = alone(scene)
         now, before = self.frame(bank, scene, cast, 0), self.frame(bank, scene, cast, 1)
         # Overlaps at the start are ignored until they part, as if everyone had just appeared.
-        contacts = jnp.full(now.valid.shape, ABSENT, jnp.int8)
-        pause = jnp.full(bank.light_state.shape[2], PAUSE_STEPS + 1, jnp.int8)
-        situation, contacts, pause = measure(bank, scene, now, before, contacts, pause)
+        contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
+        found, contacts, lights = measure(bank, scene, now, before, contacts, remember_lights(bank, scene))
         return SimState(
-            situation.scene, situation.facts, contacts, pause, self.task.episode_start(), situation.scene.step
+            found.scene, found.facts, contacts, lights, self.task.episode_start(), found.scene.step
         )
 
     def scene(self, bank: ScenarioBank, index: Any, step: Any, slot: Any = 0) -> Scene:
@@ -52,6 +53,7 @@ class Simulator:
             history=logged_history(bank, index, step, slot),
             action=jnp.zeros(2),
             route_m=bank.log_progress[index, step],
+            z=bank.agents[index, step, slot, AGENT_Z],
             traffic=self.traffic.start(bank, index, step),
         )
 
@@ -60,13 +62,13 @@ class Simulator:
         return frame_of(bank, scene.index, scene.step, self.traffic.agents(bank, scene, back), cast, back)
 
     def step(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, 2]
+        self, bank: ScenarioBank, state: SimState, action: Float[Array, " 2"]
     ) -> tuple[SimState, Transition]:
         """Drives one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
     def replay(
-        self, bank: ScenarioBank, state: SimState, motion: Float[Array, 4], action: Float[Array, 2]
+        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " 2"]
     ) -> tuple[SimState, Transition]:
         """Puts the agent at ``motion`` one step later, without dynamics (the exact expert); ``action`` is recorded."""
         return self._drive(bank, state, action, motion)
@@ -78,11 +80,18 @@ class Simulator:
         moved = jax.vmap(lambda s, a: self._move(bank, s.scene, states.scene, a, None))(states, actions)
         return jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, a))(states, moved, actions)
 
-    def situation(self, bank: ScenarioBank, state: SimState) -> Situation:
-        """The present pose measured again, with its surroundings; for planners."""
-        cast = alone(state.scene)
+    def situation(self, bank: ScenarioBank, state: SimState, cast: Scene | None = None) -> Situation:
+        """The state's facts with the surroundings that they were measured in; for planners.
+
+        Args:
+            bank: The scenarios.
+            state: The state.
+            cast: Scenes of all driven agents of the scenario, stacked; the agent alone by default.
+        """
+        cast = alone(state.scene) if cast is None else cast
         now, before = self.frame(bank, state.scene, cast, 0), self.frame(bank, state.scene, cast, 1)
-        return measure(bank, state.scene, now, before, state.contacts, state.light_pause)[0]
+        again, _, _ = measure(bank, state.scene, now, before, state.contacts, state.lights)
+        return Situation(state.scene, state.facts, again.surroundings)
 
     def observe(self, bank: ScenarioBank, scene: Scene, cast: Scene | None = None) -> Mapping[str, Any]:
         """The task's observation of a scene, live or replayed."""
@@ -101,6 +110,7 @@ class Simulator:
         over: Bool[Array, ""],
         index: Any,
         step: Any = CURRENT_STEP,
+        slot: Any = 0,
     ) -> tuple[SimState, Transition]:
         """A step, or where the episode is ``over`` the beginning of scenario ``index`` instead.
 
@@ -108,13 +118,13 @@ class Simulator:
         be masked; in exchange nothing is measured or observed twice, and every state that a policy sees, final ones
         included, is seen once.
         """
-        fresh = self.scene(bank, index, step)
+        fresh = self.scene(bank, index, step, slot)
         moved = self._move(bank, state.scene, alone(state.scene), action, None)
         scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
         before = replace(
             state,
-            contacts=jnp.where(over, jnp.int8(ABSENT), state.contacts),
-            light_pause=jnp.where(over, jnp.int8(PAUSE_STEPS + 1), state.light_pause),
+            contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
+            lights=jax.tree.map(partial(jnp.where, over), remember_lights(bank, fresh), state.lights),
             start=jnp.where(over, fresh.step, state.start),
         )
         after, transition = self._settle(bank, before, scene, alone(scene), action)
@@ -150,10 +160,10 @@ class Simulator:
     ) -> tuple[SimState, Transition]:
         """Measures an agent after everyone has moved, and turns the step into a transition."""
         now, previous = self.frame(bank, moved, cast, 0), self.frame(bank, moved, cast, 1)
-        found, contacts, pause = measure(bank, moved, now, previous, before.contacts, before.light_pause)
+        found, contacts, lights = measure(bank, moved, now, previous, before.contacts, before.lights)
         terminated, truncated = self.task.ended(bank, found.scene, found.facts)
         terms = self.task.reward(before.facts, found.facts, found.surroundings)
-        after = SimState(found.scene, found.facts, contacts, pause, before.episode, before.start)
+        after = SimState(found.scene, found.facts, contacts, lights, before.episode, before.start)
         final = found.scene.step >= bank.steps - 1
         episode = self.task.episode_add(before.episode, after, terminated | truncated | final)
         after = replace(after, episode=episode)

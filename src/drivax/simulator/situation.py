@@ -9,98 +9,114 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.queries import (
     OFFROAD_TOLERANCE_M,
+    LaneHits,
     around_lanes,
+    is_mapped,
     left_the_map,
-    light_crossing,
     offroad_distance,
     project_on_route,
-    turns_right,
 )
-from drivax.scenario.schema import DT_S, LightState
+from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import (
-    IGNORED,
     STOPPED_MPS,
-    TOUCHING,
+    Contact,
+    first_contacts,
     judge_contacts,
     next_contacts,
     overlaps,
     time_to_collision,
 )
-from drivax.simulator.types import MOTION_SPEED, Facts, Frame, Scene, Situation, Surroundings
+from drivax.simulator.lights import judge_lights
+from drivax.simulator.types import MOTION_SPEED, Facts, Frame, LightMemory, Scene, Situation, Surroundings
 
 #: Lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
-#: A stop before a right turn on red: slower than this, this near, this recently.
-_PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
 
 
 def measure(
-    bank: ScenarioBank, scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"],
-    light_pause: Int[Array, " L"],
-) -> tuple[Situation, Int[Array, " S"], Int[Array, " L"]]:  # fmt: skip
+    bank: ScenarioBank,
+    scene: Scene,
+    frame: Frame,
+    previous: Frame,
+    contacts: Int[Array, " S"],
+    lights: LightMemory,
+) -> tuple[Situation, Int[Array, " S"], LightMemory]:
     """Measures the driven agent of a scene.
 
     Args:
         bank: The scenarios.
-        scene: The scene; its ``route_m`` is that of the step before.
+        scene: The scene; its ``route_m`` and ``z`` are those of the step before.
         frame: Everyone now.
         previous: Everyone one step ago.
         contacts: Contact codes of the step before.
-        light_pause: Steps since the agent last stood before each stop line.
+        lights: What is remembered about stop lines.
 
     Returns:
-        The situation (with ``route_m`` brought up to date), new contact codes, new light memory.
+        The situation (with route position and height brought up to date), new contact codes, new light memory.
     """
     me, z = frame.box[scene.slot], frame.z[scene.slot]
-    box_corners = corners(me)
-    lanes = around_lanes(bank, scene.index, me[:2], me[2:4], box_corners, z)
-    beyond = offroad_distance(bank, scene.index, me[:2], box_corners, lanes.points_near, z).max()
-    left_map = left_the_map(bank, scene.index, me[:2])
-    offroad = (beyond > OFFROAD_TOLERANCE_M) & ~left_map
-    route = project_on_route(bank, scene.index, me[:2], scene.route_m)
-    scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m))
+    height = bank.agent_box[scene.index, scene.slot, 2]
+    ground = z - height / 2
+    lanes, beyond, left_map, offroad = _on_the_map(bank, scene.index, me, ground)
+    moved = _norm(scene.history[-1, :2] - scene.history[-2, :2])
+    route = project_on_route(bank, scene.index, me[:2], scene.route_m, 1.5 * moved + 2.0)
+    along = jnp.maximum(scene.route_m, route.along_m)
+    scene = replace(scene, route_m=along, z=jnp.where(lanes.near, lanes.z + height / 2, z))
 
     touching = overlaps(frame, scene.slot)
-    codes = next_contacts(contacts, touching, frame.valid)
-    fresh = (codes == TOUCHING) & (contacts != TOUCHING)
+    fresh = first_contacts(contacts, touching)
     speed = jnp.maximum(scene.history[-1, MOTION_SPEED], scene.history[-2, MOTION_SPEED])
     others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
     unlawful = lanes.leaving_lane | offroad
-    at_fault, collision_type = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
-    red, light_pause = _red_light(bank, scene, me, route.distance_m, light_pause)
-    now, goal = scene.history[-1], bank.goal[scene.index]
+    fault, collision_type = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
+    codes = next_contacts(contacts, touching, frame.valid, fault)
+    routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
+    red, lights = judge_lights(bank, scene, me, ground, routed & (route.distance_m <= _ON_ROUTE_M), lights)
+    now = scene.history[-1]
     logged = bank.agents[scene.index, scene.step, scene.slot]
     acceleration, jerk, lateral = _rates(scene.history)
     facts = Facts(
-        collision=(codes == TOUCHING).any(),
-        at_fault=at_fault,
+        collision=((codes == Contact.HIT) | (codes == Contact.AT_FAULT)).any(),
+        at_fault=fault.any(),
         collision_type=collision_type,
         offroad=offroad,
         offroad_m=beyond,
         left_map=left_map,
         red_light=red,
-        ttc_s=time_to_collision(frame, scene.slot, codes == IGNORED),
+        ttc_s=time_to_collision(frame, scene.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT)),
         ttc_defined=now[MOTION_SPEED] >= STOPPED_MPS,
         speed_mps=now[MOTION_SPEED],
         limit_mps=lanes.limit,
-        on_lane=lanes.near,
+        routed=routed,
+        logged=logged[AGENT_VALID] > 0,
+        ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
-        moved_m=_norm(now[:2] - scene.history[-2, :2]),
+        moved_m=moved,
         progress_m=scene.route_m,
-        log_progress_m=bank.log_progress[scene.index, scene.step],
         route_deviation_m=route.distance_m,
-        off_route=~lanes.on_corridor,
+        off_route=~lanes.on_corridor & routed,
         log_divergence_m=_norm(now[:2] - logged[:2]),
-        goal_distance_m=_norm(now[:2] - goal),
+        goal_distance_m=_norm(now[:2] - bank.goal[scene.index]),
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
     )
-    return Situation(scene, facts, Surroundings(frame, lanes, route)), codes, light_pause
+    return Situation(scene, facts, Surroundings(frame, lanes, route)), codes, lights
+
+
+def _on_the_map(
+    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""]
+) -> tuple[LaneHits, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """Lanes around a box, how far its worst corner is off the road (m), whether it left the map, or only the road."""
+    box_corners = corners(me)
+    lanes = around_lanes(bank, index, me[:2], me[2:4], box_corners, ground)
+    beyond = offroad_distance(bank, index, me[:2], box_corners, lanes.points_near, ground).max()
+    left_map = left_the_map(bank, index, me[:2])
+    return lanes, beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
 
 
 def _norm(vector: Float[Array, "... 2"]) -> Float[Array, ...]:
@@ -120,38 +136,3 @@ def _rates(
     before = (speed[-6] - speed[-11]) / (5 * DT_S)
     yaw_rate = wrap(heading[-1] - heading[-6]) / (5 * DT_S)
     return acceleration, (acceleration - before) / (5 * DT_S), yaw_rate * speed[-1]
-
-
-def _red_light(
-    bank: ScenarioBank,
-    scene: Scene,
-    me: Float[Array, 6],
-    deviation: Float[Array, ""],
-    pause: Int[Array, " L"],
-) -> tuple[Bool[Array, ""], Int[Array, " L"]]:
-    """Whether the front bumper ran a red light at this step (semantics, ``red_light``)."""
-    half = me[4] / 2
-    old = scene.history[-2]
-    front = me[:2] + half * me[2:4]
-    front_before = old[:2] + half * jnp.stack([jnp.cos(old[2]), jnp.sin(old[2])])
-    crossed, before_m = light_crossing(bank, scene.index, front_before, front)
-    last = bank.steps - 1
-    now = bank.light_state[scene.index, jnp.clip(scene.step, 0, last)]
-    then = bank.light_state[scene.index, jnp.clip(scene.step - 1, 0, last)]
-    is_red = _red(now) & _red(then)
-    # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
-    arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
-    paused = jnp.minimum(pause, PAUSE_STEPS + 1) <= PAUSE_STEPS
-    is_red &= ~(turns_right(bank, scene.index) & paused & ~arrow)
-    line = bank.light_line[scene.index]
-    fit = jnp.cos(line[:, 6] - jnp.arctan2(me[3], me[2]))
-    best = jnp.argmax(jnp.where(crossed, fit, -2.0))
-    off_route = (crossed & is_red & (fit >= fit[best] - 1e-6)).any()
-    on_route = (crossed & is_red & (line[:, 7] > 0)).any()
-    stands = (scene.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
-    pause = jnp.where(stands, 0, jnp.minimum(pause + 1, PAUSE_STEPS + 1)).astype(jnp.int8)
-    return jnp.where(deviation <= _ON_ROUTE_M, on_route, off_route), pause
-
-
-def _red(state: Int[Array, " L"]) -> Bool[Array, " L"]:
-    return (state == LightState.ARROW_STOP) | (state == LightState.STOP)

@@ -17,6 +17,8 @@ from drivax.simulator.types import HISTORY, Frame, Scene
 class LogTraffic:
     """The others replay the recording and do not react."""
 
+    name: str = "log"
+
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> tuple[()]:
         """Nothing: the bank and the step say it all."""
         return ()
@@ -67,11 +69,12 @@ def frame_of(
     driven = cast.history[:, HISTORY - 1 - back]
     cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
     one = jnp.ones_like(cos)
-    z = agents[cast.slot, 2]
-    rows = [driven[:, 0], driven[:, 1], z, cos, sin, driven[:, 3] * cos, driven[:, 3] * sin, one]
+    rows = [driven[:, 0], driven[:, 1], cast.z, cos, sin, driven[:, 3] * cos, driven[:, 3] * sin, one]
+    # Before the recording nobody else was seen.
+    agents = agents.at[:, AGENT_VALID].mul(step >= back)
     agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1))
     box, parked = bank.agent_box[index], bank.parked[index]
-    there = bank.parked_valid[index, jnp.clip(step - back, 0, bank.steps - 1)]
+    there = bank.parked_valid[index, jnp.clip(step - back, 0, bank.steps - 1)] & (step >= back)
     return Frame(
         box=jnp.concatenate(
             [jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1), parked[:, :6]]

@@ -27,6 +27,7 @@ class Scene:
         history: x, y, heading, speed of the driven agent over the last 16 steps; the last row is now.
         action: The last action, in the action space's own units ([-1, 1]^2 for the continuous ones).
         route_m: Arc length along the route to the goal, m; never decreases.
+        z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple where the others replay the log.
     """
 
@@ -36,6 +37,7 @@ class Scene:
     history: Float[Array, "*batch 16 4"]
     action: Float[Array, "*batch 2"]
     route_m: Float[Array, "*batch"]
+    z: Float[Array, "*batch"]
     traffic: Any
 
 
@@ -62,8 +64,9 @@ class Frame:
 class Facts:
     """What was measured at one pose, as scalars; kept in the state. Units in names; definitions in the semantics.
 
-    ``ttc_defined`` is false while standing; ``limit_mps`` is -1 where no limit is known; ``on_lane`` says whether a
-    lane is near at all.
+    ``ttc_defined`` is false while standing; ``limit_mps`` is -1 where no limit is known; ``routed`` says whether the
+    agent has a route of its own (ego, on lanes), without which progress and ``off_route`` mean nothing; ``logged``
+    whether the log has the agent at this step; ``ignored`` counts overlaps that do not count.
     """
 
     collision: Bool[Array, "*batch"]
@@ -77,12 +80,13 @@ class Facts:
     ttc_defined: Bool[Array, "*batch"]
     speed_mps: Float[Array, "*batch"]
     limit_mps: Float[Array, "*batch"]
-    on_lane: Bool[Array, "*batch"]
+    routed: Bool[Array, "*batch"]
+    logged: Bool[Array, "*batch"]
+    ignored: Int[Array, "*batch"]
     wrong_way: Bool[Array, "*batch"]
     straddling: Bool[Array, "*batch"]
     moved_m: Float[Array, "*batch"]
     progress_m: Float[Array, "*batch"]
-    log_progress_m: Float[Array, "*batch"]
     route_deviation_m: Float[Array, "*batch"]
     off_route: Bool[Array, "*batch"]
     log_divergence_m: Float[Array, "*batch"]
@@ -111,14 +115,28 @@ class Situation:
 
 
 @record
+class LightMemory:
+    """What is remembered about stop lines.
+
+    Attributes:
+        pause: Steps since the agent last stood before the line; saturates.
+        crossed: Steps since it crossed the line off its route, until that is judged: positive where the light was red,
+            negative where not, 0 for none.
+    """
+
+    pause: Int[Array, "*batch L"]
+    crossed: Int[Array, "*batch L"]
+
+
+@record
 class SimState:
     """State of one driven agent in one scenario.
 
     Attributes:
         scene: What observations depend on.
         facts: The last measurement.
-        contacts: Per slot: 0 absent, 1 apart, 2 touching, 3 ignored until it parts.
-        light_pause: Steps since the agent last stood before each stop line; saturates.
+        contacts: Code per slot (``simulator.contact.Contact``).
+        lights: What is remembered about each stop line.
         episode: Accumulators of the task's metrics since ``start``.
         start: Step at which the episode began.
     """
@@ -126,7 +144,7 @@ class SimState:
     scene: Scene
     facts: Facts
     contacts: Int[Array, "*batch S"]
-    light_pause: Int[Array, "*batch L"]
+    lights: LightMemory
     episode: Any
     start: Int[Array, "*batch"]
 
@@ -155,7 +173,12 @@ class Transition:
 
 @runtime_checkable
 class Traffic(Protocol):
-    """How everyone who is not driven moves."""
+    """How everyone who is not driven moves; ``name`` is what tables call it."""
+
+    @property
+    def name(self) -> str:
+        """As printed in tables."""
+        ...
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
         """Traffic state at a step of the log."""
@@ -174,7 +197,9 @@ class Traffic(Protocol):
 class Task(Protocol):
     """What makes it a learning problem; satisfied by ``tasks.Task``, which the simulator never imports."""
 
-    def motion(self, motion: Float[Array, 4], action: Float[Array, 2], length: Any) -> Float[Array, 4]:
+    def motion(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length: Any
+    ) -> Float[Array, " 4"]:
         """Next motion of the driven agent for an action of the task's action space."""
         ...
 

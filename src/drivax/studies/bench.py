@@ -18,7 +18,7 @@ from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.exhaustive import without_grid
 from drivax.scenario.queries import around_lanes, left_of_edges, project_on_route
-from drivax.simulator.contact import IGNORED, overlaps, time_to_collision
+from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import alone
@@ -132,7 +132,7 @@ def _parts(simulator: Simulator) -> dict[str, Part]:
         return project_on_route(bank, state.scene.index, state.scene.history[-1, :2], state.scene.route_m)
 
     def ttc(bank: ScenarioBank, state: SimState) -> Any:
-        return time_to_collision(frame(bank, state), state.scene.slot, state.contacts == IGNORED)
+        return time_to_collision(frame(bank, state), state.scene.slot, state.contacts == Contact.IGNORED)
 
     return {
         "dynamics": lambda bank, state: bicycle(state.scene.history[-1], jnp.ones(()), jnp.full((), 0.1)),

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from drivax import settings
+from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.evaluation.results import paired_differences
 from drivax.evaluation.runs import EvaluationConfig, format_summary, run_evaluation
@@ -73,23 +73,33 @@ class Demo:
 
 
 def run_demo(
-    out: Path, config: DemoConfig | None = None, say: Callable[[str], None] = lambda _: None
+    out: Path,
+    config: DemoConfig | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    *,
+    overwrite: bool = False,
 ) -> Demo:
     """Generates both sets, trains, evaluates all planners and writes the report.
 
     Args:
-        out: Folder for sets, runs and ``report.html``; what a former demo left there is replaced.
+        out: Folder for sets, runs and ``report.html``.
         config: Sizes.
         say: Called with a line before each stage.
+        overwrite: Replace what a former demo left in ``out``.
+
+    Raises:
+        UsageError: ``out`` exists and ``overwrite`` is not given.
     """
     config = config or DemoConfig()
+    if out.exists() and any(out.iterdir()) and not overwrite:
+        raise UsageError("exists already", file=out, cure="choose another --out or pass --overwrite")
     out.mkdir(parents=True, exist_ok=True)
     say(f"1/4  {config.training} training and {config.held_out} held-out scenarios of the built-in world")
     training = _scenarios(out / "sets" / "train", config.training, _TRAINING_SEED, config)
     held_out = _scenarios(out / "sets" / "held_out", config.held_out, _HELD_OUT_SEED, config)
     say("2/4  training PPO")
     training_config = settings.load(TrainConfig, config.preset, list(config.overrides))
-    run = train(training_config, training, out / "policy", overwrite=True).path
+    run = train(training_config, training, out / "training" / "policy", overwrite=True).path
     say("3/4  driving the held-out scenarios")
     runs, results = [], {}
     bank = ScenarioBank.from_scenarios(held_out)
@@ -98,7 +108,8 @@ def run_demo(
     }
     planners["policy"] = load_policy(run, bank)
     for name, (planner, task) in planners.items():
-        folder = out / f"evaluation_{name}"
+        folder = out / "evaluation" / name
+        folder.parent.mkdir(exist_ok=True)
         named = EvaluationConfig(planner=name if name in REFERENCES else str(run))
         results[name] = run_evaluation(named, planner, held_out, folder, bank=bank, task=task, overwrite=True)
         runs.append(folder)
@@ -113,9 +124,8 @@ def run_demo(
 
 
 def _scenarios(path: Path, count: int, seed: int, config: DemoConfig) -> ScenarioSet:
-    shutil.rmtree(path, ignore_errors=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    options = Generation(workers=config.workers or os.cpu_count() or 1)
+    options = Generation(workers=config.workers or os.cpu_count() or 1, overwrite=True)
     with Progress("generating", "scenarios", count) as bar:
         generate(path, count, seed, options, lambda done, total: bar.update(done), audit)
     return ScenarioSet.open(path)

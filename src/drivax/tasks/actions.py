@@ -27,23 +27,23 @@ class ActionSpace:
     acceleration_mps2: float = 6.0
     steering: float = 0.3
 
-    def command(self, action: Float[Array, 2], length_m: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def command(self, action: Float[Array, " 2"], length_m: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Acceleration (m/s2) and curvature (1/m) of an action; actions beyond [-1, 1] are clipped."""
         action = jnp.clip(action, -1.0, 1.0)
         scale = jnp.where(action[0] < 0, self.braking_mps2, self.acceleration_mps2)
         steering = action[1] * self.steering
         if self.kind == "published":
-            steering = jnp.tan(steering) / (_WHEELBASE * length_m)
+            steering = jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, 1.0))
         return action[0] * scale, steering
 
     def action(
         self, acceleration: Float[Array, ""], curvature: Float[Array, ""], length_m: Any
-    ) -> Float[Array, 2]:
+    ) -> Float[Array, " 2"]:
         """The action that commands this; not clipped, so that what lies outside [-1, 1] can be seen."""
         scale = jnp.where(acceleration < 0, self.braking_mps2, self.acceleration_mps2)
         steering = curvature
         if self.kind == "published":
-            steering = jnp.arctan(curvature * _WHEELBASE * length_m)
+            steering = jnp.arctan(curvature * _WHEELBASE * jnp.maximum(length_m, 1.0))
         return jnp.stack([acceleration / scale, steering / self.steering])
 
 

@@ -17,12 +17,14 @@ from drivax.geometry.angles import rotate
 from drivax.scenario.bank import ROUTE_LIMIT, ScenarioBank
 from drivax.scenario.queries import route_ahead
 from drivax.scenario.record import record
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, LightState
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, LightState
 from drivax.simulator.types import HISTORY, Frame, Scene
 
 POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Reach of the road group ahead, behind and to each side, m.
 ROAD_AHEAD_M, ROAD_BEHIND_M, ROAD_SIDE_M = 70.0, 10.0, 25.0
+#: A stop line so far behind the ego is passed, m.
+_PASSED_M = 5.0
 Observation = dict[str, Array]
 
 
@@ -47,6 +49,10 @@ class ObservationConfig:
     route: int = 10
     route_step_m: float = 5.0
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= 10:
+            raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
+
 
 PRESETS = {
     "minimal": ObservationConfig(agents=8, steps=1, edges=False),
@@ -68,8 +74,8 @@ def observe(
         frames: Everyone ``back`` steps ago.
 
     Returns:
-        ``ego [steps, 7]``: position, heading (sin, cos), velocity, and in every row the last action's place is taken
-        by ``ego_static [4]``: length, width, last action. ``agents [agents, steps, 12]`` with ``agents_mask [agents,
+        ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last action.
+        ``agents [agents, steps, 12]`` with ``agents_mask [agents,
         steps]``, ``road [road, 10]``, ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``.
     """
     view = _View.of(scene)
@@ -83,7 +89,7 @@ def observe(
 class _View:
     """The ego frame."""
 
-    xy: Float[Array, 2]
+    xy: Float[Array, " 2"]
     cos: Float[Array, ""]
     sin: Float[Array, ""]
 
@@ -160,11 +166,11 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _Vi
     inside = (xy[:, 0] < ROAD_AHEAD_M) & (xy[:, 0] > -ROAD_BEHIND_M) & (jnp.abs(xy[:, 1]) < ROAD_SIDE_M)
     wanted = lane | area | (edge if config.edges else jnp.zeros_like(edge))
     inside &= wanted & (jnp.arange(count) < bank.road_rows[scene.index])
-    # Compact without sorting: the j-th row inside is where the running count first reaches j + 1.
+    # Compact without sorting: the running count says where each row inside goes.
     running = jnp.cumsum(inside.astype(jnp.int32))
-    place = jnp.searchsorted(running, jnp.arange(1, config.road + 1), method="scan_unrolled")
+    place = jnp.where(inside, running - 1, config.road)
+    take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(count), mode="drop")
     mask = jnp.arange(config.road) < running[-1]
-    take = jnp.clip(place, 0, count - 1)
     types = jnp.stack([lane, edge, area], axis=-1).astype(jnp.float32)[take]
     chosen = rows[take]
     limit = jnp.where(chosen[:, 6:7] > 0, chosen[:, 6:7] / SPEED_MPS, 0.0)
@@ -182,10 +188,13 @@ def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _
     state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
     middle = (line[:, 0:2] + line[:, 2:4]) / 2
     offset = middle - view.xy
-    # Lights of the route come first, then the nearest.
-    distance = jnp.sum(offset * offset, axis=-1) - jnp.where(line[:, 7] > 0, 1e8, 0.0)
-    chosen = _nearest(jnp.where(state >= 0, distance, jnp.inf), config.lights)
-    there = (state[chosen] >= 0) & (jnp.arange(config.lights) < state.shape[0])
+    distance = jnp.sqrt(jnp.sum(offset * offset, axis=-1))
+    # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
+    ahead = offset[:, 0] * jnp.cos(line[:, 5]) + offset[:, 1] * jnp.sin(line[:, 5])
+    seen = (state >= 0) & (ahead > -_PASSED_M)
+    rank = distance + jnp.where(line[:, 7] > 0, 0.0, 1e4)
+    chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
+    there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
     colour = _colour(state[chosen])
     parts = [view.point(middle[chosen]) / POSITION_M, colour, line[chosen, 7:8]]
     return _masked("lights", jnp.concatenate(parts, axis=-1), there)
@@ -202,6 +211,8 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
+    # Without a route on lanes the bank holds the log's own path, which nobody may see.
+    there &= ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
     direction = view.vector(rows[:, 3:5])
     limit = rows[:, ROUTE_LIMIT : ROUTE_LIMIT + 1]
     parts = [

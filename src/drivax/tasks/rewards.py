@@ -36,13 +36,13 @@ def red_light(before: Facts, now: Facts, around: Surroundings) -> Float[Array, "
 
 
 def off_route(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 while off the corridor of the route; 0 where no lane is near, since nothing is known there."""
-    return (now.off_route & now.on_lane).astype(jnp.float32)
+    """1 while off the corridor of the route; 0 for agents without a route."""
+    return now.off_route.astype(jnp.float32)
 
 
 def progress(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """Progress gained along the route as a share of what 12 m/s gain, in [0, 1]."""
-    return jnp.clip((now.progress_m - before.progress_m) / _FULL_PROGRESS_M, 0.0, 1.0)
+    """Progress gained along the route as a share of what 12 m/s gain, in [0, 1]; 0 for agents without a route."""
+    return now.routed * jnp.clip((now.progress_m - before.progress_m) / _FULL_PROGRESS_M, 0.0, 1.0)
 
 
 def discomfort(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:

@@ -28,16 +28,19 @@ class Task:
         actions: The action space.
         observation: Groups and sizes.
         reward: Preset and weights.
-        ends: Failures that terminate an episode; evaluation overrides this with none, since it always runs to the
-            end of the log.
+        ends: Failures that terminate an episode.
+        to_the_end: Whether episodes go on to the end of the log whatever happens, as evaluation does.
     """
 
     actions: ActionSpace = field(default_factory=ActionSpace)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     rewards: RewardConfig = field(default_factory=RewardConfig)
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
+    to_the_end: bool = False
 
-    def motion(self, motion: Float[Array, 4], action: Float[Array, 2], length: Any) -> Float[Array, 4]:
+    def motion(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length: Any
+    ) -> Float[Array, " 4"]:
         """Next motion for an action: the kinematic bicycle."""
         return bicycle(motion, *self.actions.command(action, length))
 
@@ -57,11 +60,12 @@ class Task:
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Terminated by a failure; truncated where the log or the map ends."""
         failed = {"collision": facts.collision, "offroad": facts.offroad, "red_light": facts.red_light}
-        terminated = jnp.zeros((), bool)
+        log_ends, terminated = scene.step >= bank.steps - 1, jnp.zeros((), bool)
+        if self.to_the_end:
+            return terminated, log_ends
         for name in self.ends:
             terminated = terminated | failed[name]
-        left = facts.left_map if self.ends else jnp.zeros((), bool)
-        return terminated, ((scene.step >= bank.steps - 1) | left) & ~terminated
+        return terminated, (log_ends | facts.left_map) & ~terminated
 
     def episode_start(self) -> Episode:
         """Empty accumulators."""

@@ -18,14 +18,14 @@ from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.show.episode import Drive, pack_episode
 from drivax.show.palette import LEGEND, THEMES
-from drivax.show.report import _CONTROLS as CONTROLS
-from drivax.show.report import _KEYS as KEYS
-from drivax.show.report import _asset as show_asset
-from drivax.show.report import _colours as colours
-from drivax.show.report import _json as json_text
-from drivax.show.report import _legend_item as legend_item
-from drivax.show.report import _logged as logged_drive
-from drivax.show.report import _publish as publish
+from drivax.show.report import CONTROLS as CONTROLS
+from drivax.show.report import KEYS as KEYS
+from drivax.show.report import asset as show_asset
+from drivax.show.report import colours as colours
+from drivax.show.report import embedded_json as json_text
+from drivax.show.report import legend_item as legend_item
+from drivax.show.report import logged_drive as logged_drive
+from drivax.show.report import publish as publish
 
 #: Findings of the audit that make a log unclean, and how the list says so.
 _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red"}
@@ -57,7 +57,7 @@ def write_player(
     """Writes the page.
 
     Args:
-        scenarios: What to show; some 30 kB of page each.
+        scenarios: What to show; some tens of kB of page each.
         out: The HTML file; it appears when it is complete.
         overwrite: Replace an existing file.
         title: Heading of the page, as the name of the set.
@@ -96,11 +96,11 @@ def _page(scenarios: Sequence[Scenario], title: str) -> str:
     return Template(show_asset("report.html.template")).substitute(
         title=escape(title),
         version=escape(metadata.version("drivax")),
-        style=colours() + show_asset("player.css") + _asset("browser.css"),
+        style=colours() + show_asset("player.css") + asset("browser.css"),
         lead=f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
         sections=_browser(scenarios),
         data="\n".join(data),
-        script=show_asset("player.js") + _asset("browser.js"),
+        script=show_asset("player.js") + asset("browser.js"),
     )
 
 
@@ -189,5 +189,5 @@ def _flags(scenario: Scenario) -> list[str]:
     return [_words(str(flag.name)).lower() for flag in named]
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
     return resources.files("drivax.viewer").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,73 @@
+"""Running a red light (semantics, ``red_light``): stop lines, right turns after a stop, lights off the route."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.queries import light_crossing, turns_right
+from drivax.scenario.schema import LightState
+from drivax.simulator.types import HISTORY, MOTION_SPEED, LightMemory, Scene
+
+#: A stop before a right turn on red: slower than this, this near, within so many steps.
+_PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
+#: Off the route, which of the lights it crossed an agent obeyed is judged by its heading so many steps later.
+JUDGED_AFTER = 20
+
+
+def _fronts(scene: Scene, length_m: Float[Array, ""]) -> Float[Array, "16 2"]:
+    """Front bumper at every step of the scene's history."""
+    past = scene.history
+    ahead = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
+    return past[:, :2] + ahead * length_m / 2
+
+
+def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
+    """The memory that a scene's recent motion implies, as if it had been driven."""
+    length = bank.agent_box[scene.index, scene.slot, 0]
+    ground = scene.z - bank.agent_box[scene.index, scene.slot, 2] / 2
+    pause = jnp.full(bank.light_line.shape[1], PAUSE_STEPS + 1, jnp.int32)
+    fronts = _fronts(scene, length)
+    for age in range(HISTORY - 1, -1, -1):
+        front = fronts[HISTORY - 1 - age]
+        _, before_m = light_crossing(bank, scene.index, front, front, ground)
+        stands = scene.history[HISTORY - 1 - age, MOTION_SPEED] < _PAUSE_MPS
+        pause = jnp.where(stands & (before_m >= 0.0) & (before_m < _PAUSE_M), age, pause)
+    return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
+
+
+def judge_lights(
+    bank: ScenarioBank, scene: Scene, me: Float[Array, " 6"], ground: Float[Array, ""], on_route: Bool[Array, ""],
+    memory: LightMemory,
+) -> tuple[Bool[Array, ""], LightMemory]:  # fmt: skip
+    """Whether a red light was run, found out at this step, and what to remember.
+
+    On the route only its own lights count, at once. Off it, of the lines that were crossed together the one counts
+    whose lane ends most nearly in the heading that the agent has two seconds later.
+    """
+    front_before, front = _fronts(scene, me[4])[-2:]
+    crossed, before_m = light_crossing(bank, scene.index, front_before, front, ground)
+    last = bank.steps - 1
+    now = bank.light_state[scene.index, jnp.clip(scene.step, 0, last)]
+    then = bank.light_state[scene.index, jnp.clip(scene.step - 1, 0, last)]
+    is_red = _red(now) & _red(then)
+    # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
+    arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
+    is_red &= ~(turns_right(bank, scene.index) & (memory.pause < PAUSE_STEPS) & ~arrow)
+    line = bank.light_line[scene.index]
+    ran = (crossed & is_red & (line[:, 7] > 0)).any() & on_route
+
+    age = memory.crossed + jnp.sign(memory.crossed)
+    due = jnp.abs(age) > JUDGED_AFTER
+    fit = jnp.where(due, jnp.cos(line[:, 6] - jnp.arctan2(me[3], me[2])), -2.0)
+    ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
+    begins = crossed & ~on_route
+    age = jnp.where(begins, jnp.where(is_red, 1, -1), jnp.where(due, 0, age))
+    stands = (scene.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
+    pause = jnp.where(stands, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
+    return ran, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))
+
+
+def _red(state: Int[Array, " L"]) -> Bool[Array, " L"]:
+    return (state == LightState.ARROW_STOP) | (state == LightState.STOP)

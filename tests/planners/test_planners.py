@@ -1,0 +1,100 @@
+"""Planners: what each promises, on scenes whose answer is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from drivax.networks.actor_critic import ActorCriticConfig, Policy
+from drivax.networks.encoders import MlpConfig, group_spec
+from drivax.planners.catalogue import PLANNERS, make_planner
+from drivax.planners.idm import IdmPlanner
+from drivax.planners.network import NetworkPlanner
+from drivax.planners.planner import Planner
+from drivax.planners.simple import expert_action, logged_motion
+from drivax.simulator.idm import IdmParameters, idm_acceleration
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import ActionSpace
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from scenes import RED, bank_of, car, straight_road
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Simulator(Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)))
+
+
+def act(planner, simulator, bank, slot=0):
+    def one(bank):
+        state = simulator.reset(bank, 0, 10, slot)
+        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.scene)
+        key = jax.random.key(0)
+        return planner.act(planner.init(bank, state, key), bank, state, situation, seen, key)[0]
+
+    return np.asarray(jax.jit(one)(bank))
+
+
+@pytest.mark.parametrize("name", sorted(PLANNERS))
+def test_every_planner_answers_with_an_action(name, simulator):
+    planner = make_planner(name)
+    assert isinstance(planner, Planner) and planner.name == name
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(30, 0, 0, 5)], light=RED))
+    action = act(planner, simulator, bank)
+    assert action.shape == (2,) and np.isfinite(action).all() and (np.abs(action) <= 1).all()
+    # Leaves are arrays or nothing, settings are part of the structure: the same program serves equal planners.
+    assert jax.tree.structure(planner) == jax.tree.structure(make_planner(name))
+
+
+def test_idm_on_a_free_road_accelerates_by_its_law(simulator):
+    # Desired speed is the limit of 13.4 m/s; a free road leaves a (1 - (v / v0)^4).
+    action = act(IdmPlanner(), simulator, bank_of(straight_road([car(0, 0, 0, 9)])))
+    assert action[0] * 6.0 == pytest.approx(1.5 * (1 - (9 / 13.4) ** 4), rel=1e-3)
+    assert action[1] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_idm_brakes_for_the_nearest_thing_in_its_corridor(simulator):
+    # Gap of 20 - 4.8 = 15.2 m to a car at 5 m/s.
+    leader = act(IdmPlanner(), simulator, bank_of(straight_road([car(0, 0, 0, 9), car(20, 0, 0, 5)])))
+    speed = np.array(9.0)
+    expected = idm_acceleration(speed, np.array(13.4), np.array(15.2), np.array(5.0), IdmParameters())
+    assert leader[0] * 6.0 == pytest.approx(float(expected), rel=1e-3)
+    beside = act(IdmPlanner(), simulator, bank_of(straight_road([car(0, 0, 0, 9), car(20, 3.7, 0, 5)])))
+    assert beside[0] > 0
+
+
+def test_idm_law_by_hand():
+    p = IdmParameters()
+    # At rest, 2 m behind a standing leader: s* = s0 = gap, so a = a_max (1 - 0 - 1) = 0.
+    assert float(idm_acceleration(np.array(0.0), np.array(10.0), np.array(2.0), np.array(0.0), p)) == 0.0
+    # v = v0, free: zero; twice the comfortable gap of s0 + vT = 17 m: a (1 - 1 - 1/4).
+    assert float(
+        idm_acceleration(np.array(10.0), np.array(10.0), np.array(1e9), np.array(10.0), p)
+    ) == pytest.approx(0)
+    found = idm_acceleration(np.array(10.0), np.array(10.0), np.array(34.0), np.array(10.0), p)
+    assert float(found) == pytest.approx(-1.5 / 4)
+    # Never below the maximal deceleration.
+    assert float(idm_acceleration(np.array(20.0), np.array(10.0), np.array(0.2), np.array(0.0), p)) == -6.0
+
+
+def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 3.7, 0, 6, steps=range(60))]))
+    ego = simulator.scene(bank, 0, 88)
+    np.testing.assert_allclose(logged_motion(bank, ego, 1), [71.1, 0, 0, 9], atol=1e-3)
+    np.testing.assert_allclose(logged_motion(bank, ego, 4), [73.8, 0, 0, 9], atol=1e-3)
+    gone = simulator.scene(bank, 0, 59, 1)
+    np.testing.assert_allclose(logged_motion(bank, gone, 1), gone.history[-1])
+    steady = expert_action(bank, simulator.scene(bank, 0, 10), ActionSpace())
+    np.testing.assert_allclose(steady, 0.0, atol=1e-4)
+
+
+def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
+    bank = bank_of(straight_road([car(0, 0, 0, 9)]))
+    spec = group_spec(jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank))
+    policy = Policy(ActorCriticConfig(encoder=MlpConfig(hidden=(8,)), head=(4,)), spec, nnx.Rngs(3))
+    graph, weights = nnx.split(policy)
+    mode, sample = (act(NetworkPlanner(weights, graph, samples=s), simulator, bank) for s in (False, True))
+    seen = jax.jit(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)))(bank)
+    np.testing.assert_allclose(mode, policy(seen).mode(), rtol=1e-4, atol=1e-6)
+    assert np.abs(sample - mode).max() > 1e-3 and (jnp.abs(sample) < 1).all()

@@ -1,0 +1,64 @@
+"""The bank: what it refuses, how large it is, and that padding costs nothing but memory."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from drivax.errors import DataError, DrivaxError
+from drivax.evaluation.rollout import drive, judging
+from drivax.planners.idm import IdmPlanner
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import Flag, Scenario
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
+
+
+def without_future(scenario: Scenario) -> Scenario:
+    record = scenario.record.copy()
+    record["flags"] |= int(Flag.NO_FUTURE)
+    return replace(scenario, record=record)
+
+
+def test_a_bank_refuses_nothing_and_test_splits():
+    with pytest.raises(DrivaxError, match="at least one"):
+        ScenarioBank.from_scenarios([])
+    short = without_future(assemble(straight_road([car(0, 0, 0, 5)])))
+    with pytest.raises(DataError, match=r"hand-made.*no logged future"):
+        ScenarioBank.from_scenarios([short])
+    assert len(ScenarioBank.from_scenarios([short], allow_no_future=True)) == 1
+
+
+def test_size_per_scenario():
+    scenarios = [assemble(generate_recording(3, i)) for i in range(3)]
+    whole, trimmed = (ScenarioBank.from_scenarios(scenarios, trim=trim) for trim in (False, True))
+    assert trimmed.nbytes // 3 < 300_000 < whole.nbytes // 3 <= 600_000
+
+
+def test_trimming_changes_no_result():
+    scenarios = [assemble(generate_recording(4, i)) for i in range(3)]
+    simulator, rows, keys = Simulator(judging(Task())), np.arange(3), jax.random.split(jax.random.key(0), 3)
+    one, other = (
+        drive(simulator, IdmPlanner(), ScenarioBank.from_scenarios(scenarios, trim=trim), rows, keys)
+        for trim in (True, False)
+    )
+    np.testing.assert_allclose(one.motion, other.motion, atol=1e-4)
+    for name in one.metrics:
+        for part in ("value", "defined"):
+            a, b = (np.asarray(getattr(result.metrics[name], part)) for result in (one, other))
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4, err_msg=name)
+
+
+def test_a_long_ego_is_told_apart():
+    assert not bank_of(straight_road([car(0, 0, 0, 5)])).long_ego
+    assert bank_of(straight_road([car(0, 0, 0, 5, length=11.0, width=2.5)])).long_ego
+
+
+def test_limits_fall_back_to_the_class_of_the_lane():
+    bank = bank_of(straight_road([car(0, 0, 0, 5)], limit=None))
+    used = np.asarray(bank.lanes)[0, 6]
+    np.testing.assert_allclose(used[used < 1e5], 13.4, rtol=1e-6)
