@@ -298,3 +298,9 @@ def test_dump_is_readable():
     assert "hidden: [1, 2]" in text
     assert "optimizer: {kind: sgd, lr: 0.1, momentum: 0.0}" in text
     assert text.index("steps") < text.index("name") < text.index("network")
+
+
+def test_a_folder_may_bear_the_name_of_a_preset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()
+    assert settings.load(dict, "demo")["total_steps"] > 0

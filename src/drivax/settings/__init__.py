@@ -81,7 +81,8 @@ def _find(source: str | Path) -> Path:
     path = Path(source)
     if path.is_file():
         return path
-    if path.is_dir():
+    # A folder may bear the name of a preset (`drivax demo` writes one called demo).
+    if path.is_dir() and source not in presets():
         raise UsageError(
             "is a folder, not a configuration file", file=path, cure="name a .yaml file or a preset"
         )

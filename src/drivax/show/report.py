@@ -264,6 +264,7 @@ CONTROLS = """<div class=controls>
 
 
 def legend_item(name: str, words: str) -> str:
+    """One entry of the legend."""
     sign = "✕" if name == "mark" else ""
     fill = "" if name in ("log", "route", "mark") else f' style="background:var(--{name})"'
     return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'
@@ -330,6 +331,7 @@ def colours() -> str:
 
 
 def asset(name: str) -> str:
+    """Text of a file of this package."""
     return resources.files("drivax.show").joinpath(name).read_text(encoding="utf-8")
 
 

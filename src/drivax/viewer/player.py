@@ -96,11 +96,11 @@ def _page(scenarios: Sequence[Scenario], title: str) -> str:
     return Template(show_asset("report.html.template")).substitute(
         title=escape(title),
         version=escape(metadata.version("drivax")),
-        style=colours() + show_asset("player.css") + asset("browser.css"),
+        style=colours() + show_asset("player.css") + _asset("browser.css"),
         lead=f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
         sections=_browser(scenarios),
         data="\n".join(data),
-        script=show_asset("player.js") + asset("browser.js"),
+        script=show_asset("player.js") + _asset("browser.js"),
     )
 
 
@@ -189,5 +189,5 @@ def _flags(scenario: Scenario) -> list[str]:
     return [_words(str(flag.name)).lower() for flag in named]
 
 
-def asset(name: str) -> str:
+def _asset(name: str) -> str:
     return resources.files("drivax.viewer").joinpath(name).read_text(encoding="utf-8")
