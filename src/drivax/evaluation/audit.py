@@ -55,7 +55,7 @@ def _findings(results: Results) -> list[Finding]:
             {
                 "log_collides": bool(metric["collision"]),
                 "log_offroad_fraction": round(float(results.offroad_steps[number]) / steps, 4),
-                "first_offroad_step": int(results.events["offroad"][number]),
+                "first_offroad_step": _step(results.events["offroad"][number]),
                 "log_runs_red": None if metric["red_light"] is None else bool(metric["red_light"]),
                 "distance_m": metric["distance"],
                 "route_deviation_max_m": metric["route_deviation_max"],
@@ -69,3 +69,7 @@ def _findings(results: Results) -> list[Finding]:
 
 def _number(value: Any) -> float | None:
     return round(float(value), 3) if np.isfinite(value) else None
+
+
+def _step(value: Any) -> int | None:
+    return int(value) if value >= 0 else None

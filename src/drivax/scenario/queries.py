@@ -49,7 +49,13 @@ def _runs(
         block = jax.lax.dynamic_slice(rows, (index, 0, bounds[0]), (1, rows.shape[1], run))[0]
         features.append(block)
         inside.append(jnp.arange(run) < bounds[3] - bounds[0])
-    return jnp.concatenate(features, axis=1), jnp.concatenate(inside)
+    # Read once: without the barrier XLA repeats the reads in every operation that uses them.
+    return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
+
+
+def _first_smallest(values: Float[Array, " K"]) -> Int[Array, ""]:
+    """``argmin`` as two reductions that vectorise; XLA's own compares pairs one by one on a CPU."""
+    return jnp.min(jnp.where(values == values.min(), jnp.arange(values.shape[0]), values.shape[0] - 1))
 
 
 def _to_segments(
@@ -143,9 +149,9 @@ def around_lanes(
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
     reachable = own <= LANE_CUTOFF_M**2
-    best = jnp.argmin(jnp.where(aligned, own, _FAR))
+    best = _first_smallest(jnp.where(aligned, own, _FAR))
     has_lane = aligned[best] & reachable[best]
-    nearest = jnp.argmin(own)
+    nearest = _first_smallest(own)
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
@@ -267,7 +273,7 @@ def project_on_route(
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
     rows = jnp.stack([a[:, 0], a[:, 1], b[:, 0], b[:, 1]])
     squared, side = _to_segments(rows, xy[None])
-    k = jnp.argmin(jnp.where(real, squared[0], _FAR))
+    k = _first_smallest(jnp.where(real, squared[0], _FAR))
     u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
     distance = jnp.sqrt(squared[0, k])

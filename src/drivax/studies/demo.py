@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from drivax.show.report import write_report
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
+from drivax.tracking.runs import describe_run, write_text
 
 #: Planners that the trained policy is compared with.
 REFERENCES = ("expert", "constant_velocity", "idm")
@@ -58,6 +60,10 @@ class Demo:
     report: Path
     summaries: list[dict[str, Any]]
     differences: dict[str, dict[str, dict[str, float | int | None]]]
+
+    def as_json(self) -> dict[str, Any]:
+        """Summaries, paired differences to the policy, and what made them."""
+        return {"summaries": self.summaries, "policy_minus": self.differences, **describe_run()}
 
     def text(self) -> str:
         """The table, and one line per comparison."""
@@ -120,7 +126,9 @@ def run_demo(
         name: {metric: paired_differences(policy, results[name], metric).as_dict() for metric in _COMPARED}
         for name in REFERENCES
     }
-    return Demo(report, [result.summary() for result in results.values()], differences)
+    demo = Demo(report, [result.summary() for result in results.values()], differences)
+    write_text(out / "demo.json", json.dumps(demo.as_json(), indent=1) + "\n")
+    return demo
 
 
 def _scenarios(path: Path, count: int, seed: int, config: DemoConfig) -> ScenarioSet:
