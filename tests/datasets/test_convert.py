@@ -233,6 +233,8 @@ def test_command_says_what_it_wrote_and_what_it_skipped(folder, tmp_path, capsys
     assert out.startswith(f"{tmp_path / 'set'}: 4 scenarios from 3 files in ")
     assert out.endswith("4 records skipped, 1 file of other formats ignored\n")
     lines = err.splitlines()
+    progress, *lines = lines
+    assert progress.startswith("converting: 3 files")
     assert len(lines) == 4 and all(line.startswith("skipped ") for line in lines)
     assert f"{folder / 'b.tfrecord'}: record 1: the payload is damaged" in lines[0]
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.geometry.angles import wrap
+from drivax.planners.planner import Memoryless
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import LEVEL_M, route_ahead
 from drivax.scenario.record import record, static
@@ -26,7 +27,7 @@ _YELLOW_BRAKING_MPS2 = 3.0
 
 
 @record
-class IdmPlanner:
+class IdmPlanner(Memoryless):
     """A rule-based driver; uses the situation's truth, not observations.
 
     Where no limit is known it wants 13.4 m/s (50 km/h would be 13.9); where a scenario has no route on lanes it follows
@@ -37,10 +38,6 @@ class IdmPlanner:
     parameters: IdmParameters = static(default=IdmParameters())
     name: str = static(default="idm")
     replays: bool = static(default=False)
-
-    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
-        """Nothing to carry."""
-        return ()
 
     def act(
         self,

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.planners.planner import Memoryless
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.types import SimState, Situation
 
 
 @record
-class NetworkPlanner:
+class NetworkPlanner(Memoryless):
     """Acts by the policy's mode, or by a sample.
 
     Attributes:
@@ -29,10 +30,6 @@ class NetworkPlanner:
     name: str = static(default="policy")
     samples: bool = static(default=False)
     replays: bool = static(default=False)
-
-    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
-        """Nothing to carry."""
-        return ()
 
     def act(
         self,

@@ -47,3 +47,11 @@ class Planner(Protocol):
     ) -> tuple[Float[Array, "2"], Any]:
         """An action of the task's action space, and the carry for the next step."""
         ...
+
+
+class Memoryless:
+    """Mixed into planners that carry nothing from step to step."""
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
+        """Nothing to carry."""
+        return ()

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from drivax.planners.planner import Memoryless
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.dynamics import follow
@@ -35,7 +36,7 @@ def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Flo
 
 
 @record
-class Expert:
+class Expert(Memoryless):
     """The log. ``expert`` replays it exactly; ``expert_actions`` drives it through the dynamics."""
 
     actions: ActionSpace = static(default=ActionSpace())
@@ -45,10 +46,6 @@ class Expert:
     def name(self) -> str:
         """``expert`` or ``expert_actions``."""
         return "expert" if self.replays else "expert_actions"
-
-    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
-        """Nothing to carry."""
-        return ()
 
     def act(
         self,
@@ -64,15 +61,11 @@ class Expert:
 
 
 @record
-class ConstantVelocity:
+class ConstantVelocity(Memoryless):
     """Keeps speed and heading."""
 
     name: str = static(default="constant_velocity")
     replays: bool = static(default=False)
-
-    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
-        """Nothing to carry."""
-        return ()
 
     def act(
         self,

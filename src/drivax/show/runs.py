@@ -116,11 +116,13 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]
     if not folders or len(set(resolved)) < len(resolved):
         raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")
     evaluations, trainings = [], []
+    # A training and the evaluation of its policy may share a name: they never stand in one table.
     names: set[str] = set()
+    charts: set[str] = set()
     for folder in folders:
         about = _about(folder)
         if about.get("kind") == "training":
-            trainings.append(Training(folder, _unique(folder.name, folder, names), about, _curves(folder)))
+            trainings.append(Training(folder, _unique(folder.name, folder, charts), about, _curves(folder)))
         elif about.get("kind") == "evaluation":
             name = _unique(str(about.get("planner", folder.name)), folder, names)
             evaluations.append(_evaluation(folder, name, about))
