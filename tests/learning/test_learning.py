@@ -101,6 +101,8 @@ def test_a_run_is_never_overwritten_or_resumed_on_other_data(data, config, tmp_p
     generate(tmp_path / "other", 4, 12, Generation(workers=1))
     with pytest.raises(UsageError, match="other scenarios"):
         train(config, ScenarioSet.open(tmp_path / "other"), tmp_path / "run", resume=True)
+    with pytest.raises(UsageError, match="same --validation"):
+        train(config, data, tmp_path / "run", resume=True, validation=ScenarioSet.open(tmp_path / "other"))
     info = json.loads((tmp_path / "run" / "run.json").read_text())
     assert info["kind"] == "training" and info["data"][0]["hash"] == data.hash
 

@@ -50,22 +50,9 @@ def evaluate(
         UsageError: If the table and the bank disagree, or the start step leaves no action.
         DrivaxError: If the planner produced numbers that are not finite.
     """
-    if len(scenarios) != len(bank):
-        raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
-    if not 0 <= start_step < bank.steps - 1:
-        raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {bank.steps - 2}")
     task = judging(task or Task())
     simulator = Simulator(task, traffic or LogTraffic())
-    if getattr(planner, "actions", task.actions) != task.actions:
-        raise UsageError(
-            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
-        )
-    absent = np.flatnonzero(np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) <= 0)
-    if absent.size:
-        name = scenarios[int(absent[0])]["scenario_id"]
-        raise UsageError(
-            f"ego is not in the log at step {start_step}", record=name, cure="begin at another step"
-        )
+    _refuse_misfits(planner, task, bank, scenarios, start_step)
     root = jax.random.key(seed)
     parts: list[Episodes] = []
     for first in range(0, len(bank), BATCH):
@@ -92,6 +79,25 @@ def evaluate(
         start=start_step,
         offroad_steps=whole.offroad_steps,
     )
+
+
+def _refuse_misfits(
+    planner: Planner, task: Task, bank: ScenarioBank, scenarios: Sequence[Mapping[str, str]], start_step: int
+) -> None:
+    if len(scenarios) != len(bank):
+        raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
+    if not 0 <= start_step < bank.steps - 1:
+        raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {bank.steps - 2}")
+    if getattr(planner, "actions", task.actions) != task.actions:
+        raise UsageError(
+            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
+        )
+    absent = np.flatnonzero(np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) <= 0)
+    if absent.size:
+        name = scenarios[int(absent[0])]["scenario_id"]
+        raise UsageError(
+            f"ego is not in the log at step {start_step}", record=name, cure="begin at another step"
+        )
 
 
 def _refuse_nan(planner: Planner, episodes: Episodes, scenarios: Sequence[Mapping[str, str]]) -> None:

@@ -66,7 +66,7 @@ def train(
         UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, or a resumed run was trained
             on other data.
     """
-    folder = _open(config, data, Path(out), resume, overwrite)
+    folder = _open(config, data, validation, Path(out), resume, overwrite)
     if resume:
         config = folder.config(TrainConfig)
     bank = ScenarioBank.from_scenarios(data)
@@ -154,10 +154,23 @@ def _first_state(ppo: Ppo, bank: ScenarioBank, config: TrainConfig, stored: Chec
     return jax.jit(ppo.init)(bank, jax.random.key(config.seed))
 
 
-def _open(config: TrainConfig, data: ScenarioSet, out: Path, resume: bool, overwrite: bool) -> RunFolder:
+def _open(
+    config: TrainConfig,
+    data: ScenarioSet,
+    validation: ScenarioSet | None,
+    out: Path,
+    resume: bool,
+    overwrite: bool,
+) -> RunFolder:
+    held_out = None if validation is None else validation.hash
     if not resume:
-        return RunFolder.create(out, config, data=[data], overwrite=overwrite, kind="training")
+        notes = {"kind": "training", "validation": held_out}
+        return RunFolder.create(out, config, data=[data], overwrite=overwrite, **notes)
     folder = RunFolder.open(out)
+    if folder.info.get("validation") != held_out:
+        raise UsageError(
+            "was validated on other scenarios", file=out, cure="resume with the same --validation"
+        )
     trained_on = [entry.get("hash") for entry in folder.info.get("data", [])]
     if trained_on != [data.hash]:
         raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")

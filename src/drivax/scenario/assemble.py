@@ -53,6 +53,7 @@ FLAT_M = 0.01
 #: that there are none.
 MEASURED = (
     Flag.LANE_GRAPH
+    | Flag.DEFAULT_LIMITS
     | Flag.SPEED_LIMITS
     | Flag.CHAINED_GRAPH
     | Flag.CLOSED_EDGES
@@ -60,6 +61,8 @@ MEASURED = (
     | Flag.ROUTE
     | Flag.ELEVATION
 )
+#: Lanes whose class has a limit (``scenario.bank.CLASS_LIMIT_MPS``).
+_LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
 _COUNTED = {
     "lane": LANE_KINDS,
     "road_line": LINE_KINDS,
@@ -300,6 +303,7 @@ def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) 
         (Flag.CLOSED_EDGES, rings),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
+        (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & np.isin(parts.graph.kind, _LIMITED_KINDS)).any()),
         (
             Flag.ELEVATION,
             np.ptp(parts.roads.lines.points[:, 2]) > FLAT_M if len(parts.roads.lines.points) else False,

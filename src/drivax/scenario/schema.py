@@ -100,6 +100,8 @@ class Flag(enum.IntFlag):
     JITTERED_TIME = 1024
     ROUTE = 2048
     ELEVATION = 4096
+    #: Some lane has no limit of its own and gets that of its class (freeway, surface street).
+    DEFAULT_LIMITS = 8192
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,7 @@ def measure(
     Args:
         bank: The scenarios.
         scene: The scene; its ``route_m`` and ``z`` are those of the step before.
-        frame: Everyone now.
-        previous: Everyone one step ago.
+        frame, previous: Everyone now, and one step ago.
         contacts: Contact codes of the step before.
         lights: What is remembered about stop lines.
 
@@ -58,25 +57,16 @@ def measure(
         The situation (with route position and height brought up to date), new contact codes, new light memory.
     """
     me, z = frame.box[scene.slot], frame.z[scene.slot]
-    height = bank.agent_box[scene.index, scene.slot, 2]
-    ground = z - height / 2
+    ground = z - (height := bank.agent_box[scene.index, scene.slot, 2]) / 2
     lanes, beyond, left_map, offroad = _on_the_map(bank, scene.index, me, ground)
     moved = _norm(scene.history[-1, :2] - scene.history[-2, :2])
     route = project_on_route(bank, scene.index, me[:2], scene.route_m, 1.5 * moved + 2.0)
     along = jnp.maximum(scene.route_m, route.along_m)
     scene = replace(scene, route_m=along, z=jnp.where(lanes.near, lanes.z + height / 2, z))
-
-    touching = overlaps(frame, scene.slot)
-    fresh = first_contacts(contacts, touching)
-    speed = jnp.maximum(scene.history[-1, MOTION_SPEED], scene.history[-2, MOTION_SPEED])
-    others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
-    unlawful = lanes.leaving_lane | offroad
-    fault, collision_type = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
-    codes = next_contacts(contacts, touching, frame.valid, fault)
+    codes, fault, collision_type = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
     red, lights = judge_lights(bank, scene, me, ground, routed & (route.distance_m <= _ON_ROUTE_M), lights)
-    now = scene.history[-1]
-    logged = bank.agents[scene.index, scene.step, scene.slot]
+    now, logged = scene.history[-1], bank.agents[scene.index, scene.step, scene.slot]
     acceleration, jerk, lateral = _rates(scene.history)
     facts = Facts(
         collision=((codes == Contact.HIT) | (codes == Contact.AT_FAULT)).any(),
@@ -106,6 +96,18 @@ def measure(
         jerk_mps3=jerk,
     )
     return Situation(scene, facts, Surroundings(frame, lanes, route)), codes, lights
+
+
+def _touch(
+    scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""]
+) -> tuple[Int[Array, " S"], Bool[Array, " S"], Int[Array, ""]]:
+    """New contact codes, which contacts that begin now are the agent's fault, and the type of the nearest of them."""
+    touching = overlaps(frame, scene.slot)
+    fresh = first_contacts(contacts, touching)
+    speed = jnp.maximum(scene.history[-1, MOTION_SPEED], scene.history[-2, MOTION_SPEED])
+    others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
+    fault, collision_type = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
+    return next_contacts(contacts, touching, frame.valid, fault), fault, collision_type
 
 
 def _on_the_map(
