@@ -37,32 +37,29 @@ _ON_ROUTE_M = 2.0
 
 
 def measure(
-    bank: ScenarioBank,
-    scene: Scene,
-    frame: Frame,
-    previous: Frame,
-    contacts: Int[Array, " S"],
-    lights: LightMemory,
-) -> tuple[Situation, Int[Array, " S"], LightMemory]:
+    bank: ScenarioBank, scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], lights: LightMemory
+) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measures the driven agent of a scene.
 
     Args:
         bank: The scenarios.
-        scene: The scene; its ``route_m`` and ``z`` are those of the step before.
-        frame, previous: Everyone now, and one step ago.
+        scene: The scene, with the ``route_m`` and ``z`` of the step before.
+        frame: Everyone now.
+        previous: Everyone one step ago.
         contacts: Contact codes of the step before.
         lights: What is remembered about stop lines.
 
     Returns:
-        The situation (with route position and height brought up to date), new contact codes, new light memory.
+        The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
     """
     me, z = frame.box[scene.slot], frame.z[scene.slot]
-    ground = z - (height := bank.agent_box[scene.index, scene.slot, 2]) / 2
+    height = bank.agent_box[scene.index, scene.slot, 2]
+    ground = z - height / 2
     lanes, beyond, left_map, offroad = _on_the_map(bank, scene.index, me, ground)
     moved = _norm(scene.history[-1, :2] - scene.history[-2, :2])
     route = project_on_route(bank, scene.index, me[:2], scene.route_m, 1.5 * moved + 2.0)
-    along = jnp.maximum(scene.route_m, route.along_m)
-    scene = replace(scene, route_m=along, z=jnp.where(lanes.near, lanes.z + height / 2, z))
+    z = jnp.where(lanes.near, lanes.z + height / 2, z)
+    scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
     codes, fault, collision_type = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
     red, lights = judge_lights(bank, scene, me, ground, routed & (route.distance_m <= _ON_ROUTE_M), lights)
