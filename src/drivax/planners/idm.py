@@ -30,8 +30,8 @@ _YELLOW_BRAKING_MPS2 = 3.0
 class IdmPlanner(Memoryless):
     """A rule-based driver; uses the situation's truth, not observations.
 
-    Where no limit is known it wants 13.4 m/s (50 km/h would be 13.9); where a scenario has no route on lanes it follows
-    the path that the log takes.
+    Where no limit is known it wants 13.4 m/s, the limit of a surface street; where a scenario has no
+    route on lanes it follows the path that the log takes.
     """
 
     actions: ActionSpace = static(default=ActionSpace())
