@@ -25,7 +25,8 @@ from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.assemble import assemble, with_ego
-from drivax.scenario.schema import AgentKind, Recording, Scenario
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import AgentKind, Scenario
 from drivax.synthetic.world import generate_recording
 from drivax.tracking.runs import versions
 

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.signal import savgol_filter
 
-from drivax.scenario.schema import DT_S, Recording
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import DT_S
 from drivax.synthetic.generate import GeneratedSet, Generation, generate
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 

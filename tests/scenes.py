@@ -6,17 +6,8 @@ import numpy as np
 
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.schema import (
-    STEPS,
-    AgentKind,
-    Flag,
-    Light,
-    LightState,
-    MapFeature,
-    Recording,
-    RoadKind,
-    Tracks,
-)
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import STEPS, AgentKind, Flag, LightState, RoadKind
 
 LANE_M = 3.7
 

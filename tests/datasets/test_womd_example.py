@@ -11,7 +11,8 @@ import pytest
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.womd_example import WomdExample, decode
 from drivax.errors import DataError
-from drivax.scenario.schema import AgentKind, Flag, Recording, RoadKind
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import AgentKind, Flag, RoadKind
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from drivax.datasets import messages
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.womd_scenario import WomdScenario, decode
 from drivax.errors import DataError, UsageError
-from drivax.scenario.schema import AgentKind, Flag, MapFeature, Recording, RoadKind
+from drivax.scenario.recording import MapFeature, Recording
+from drivax.scenario.schema import AgentKind, Flag, RoadKind
 
 
 @pytest.fixture(scope="module")

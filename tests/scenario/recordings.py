@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivax.scenario.schema import AgentKind, Light, MapFeature, Recording, RoadKind, Tracks
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import AgentKind, RoadKind
 
 #: Far from the origin, as real map frames are (UTM): float32 would be half a metre coarse here.
 FAR = np.array([661_234.5, 4_012_345.25, 37.0])

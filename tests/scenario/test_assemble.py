@@ -11,17 +11,8 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.scenario.assemble import assemble, count_source, windows, with_ego
 from drivax.scenario.filling import MISSING, blank
-from drivax.scenario.schema import (
-    CAPACITIES,
-    AgentKind,
-    Capacity,
-    Event,
-    Flag,
-    LightState,
-    MapFeature,
-    RoadKind,
-    record_dtype,
-)
+from drivax.scenario.recording import Event, MapFeature
+from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag, LightState, RoadKind, record_dtype
 
 from .recordings import (
     FAR,

@@ -5,7 +5,8 @@ import pytest
 
 from drivax.scenario.lanes import LaneSegments, lane_graph
 from drivax.scenario.lights import place_lights, place_stops
-from drivax.scenario.schema import LightState, MapFeature, RoadKind
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import LightState, RoadKind
 from drivax.scenario.segments import cut, road_lines
 
 from .recordings import arc, lane, light, line

@@ -97,7 +97,8 @@ def test_side_of_a_sharp_vertex():
     recording = straight_road([car(0, 0, 0, 5)])
     from dataclasses import replace
 
-    from drivax.scenario.schema import MapFeature, RoadKind
+    from drivax.scenario.recording import MapFeature
+    from drivax.scenario.schema import RoadKind
 
     wedge = MapFeature(9, RoadKind.EDGE_MEDIAN, line((20, 30), (30, 30), (20, 34), (20, 30)))
     bank = bank_of(replace(recording, features=(*recording.features, wedge)))

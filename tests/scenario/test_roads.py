@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivax.scenario.recording import MapFeature
 from drivax.scenario.roads import rank, road_rows
-from drivax.scenario.schema import MapFeature, RoadKind
+from drivax.scenario.schema import RoadKind
 from drivax.scenario.segments import road_lines
 
 from .recordings import arc, edge, lane, line

@@ -55,6 +55,9 @@ COMMANDS = {
 _EXTRAS = {
     "google_crc32c": "womd",
     "google": "womd",
+    "pyarrow": "av2",
+    "shapely": "maps",
+    "pyproj": "maps",
     "matplotlib": "show",
     "av": "show",
     "tensorboardX": "track",

@@ -24,7 +24,8 @@ from drivax.datasets.formats import AUTO, detect, find_files, reader_named
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError, UsageError
 from drivax.scenario.assemble import assemble, windows
-from drivax.scenario.schema import CAPACITIES, Capacity, Recording, Scenario
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
 from drivax.scenario.store import ScenarioWriter
 
 #: Scenarios that are audited together.

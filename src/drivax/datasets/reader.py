@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from drivax.errors import DataError, DrivaxError
-from drivax.scenario.schema import Recording
+from drivax.scenario.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,34 @@ class BadRecord:
         return DataError(self.problem, file=self.file, record=self.record, cure=self.cure)
 
 
+@dataclass(frozen=True)
+class Description:
+    """What ``drivax doctor`` tells about one file of a format.
+
+    Attributes:
+        dataset: Full name of the public data set, for people.
+        flavour: Which of its forms this is.
+        version: Its version, as far as the file tells.
+        recordings: How many recordings the file holds; None where only reading all of it would tell.
+        notes: What the file holds or lacks that its user should know, one short sentence each.
+        missing: Files that must lie beside it before it can be converted, and are not there.
+    """
+
+    dataset: str
+    flavour: str
+    version: str | None = None
+    recordings: int | None = None
+    notes: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
 @runtime_checkable
 class Reader(Protocol):
     """One public format. A new format is one module with such a class, listed in ``formats.READERS``.
 
-    Readers hold no state and no open files: worker processes receive them by name.
+    Readers hold no state and no open files: worker processes receive them by name. The unit that is read at once is
+    one file, the one that names the recording or recordings (a shard, a pickle, a parquet or a database); what
+    belongs to it (a map, poses) is found beside it. Packages of extras are imported when they are needed.
     """
 
     @property
@@ -56,8 +79,25 @@ class Reader(Protocol):
         """File-name patterns of the format; a matching file in a folder is reported when it cannot be read."""
         ...
 
+    @property
+    def companions(self) -> tuple[str, ...]:
+        """File-name patterns of what is read along with those files (maps, poses) and is no recording itself."""
+        ...
+
     def recognise(self, path: Path) -> bool:
         """Whether the content of a file is of this format; looks at the beginning only, never raises."""
+        ...
+
+    def describe(self, path: Path) -> Description:
+        """What the file is, without decoding all of it.
+
+        Raises:
+            DataError: It is damaged.
+        """
+        ...
+
+    def count(self, path: Path) -> int:
+        """About how many scenarios the file will become, quickly; 0 where it cannot be read."""
         ...
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:

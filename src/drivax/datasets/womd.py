@@ -1,27 +1,16 @@
-"""What the two forms of the Waymo Open Motion Dataset share: telling them apart, units, lights, flags."""
+"""What the two forms of the Waymo Open Motion Dataset share: telling them apart, reading records, object types."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from jaxtyping import Float64
 
 from drivax.datasets.messages import example_class, parse, scenario_class
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.tfrecord import read_records
 from drivax.errors import DataError, DrivaxError
-from drivax.scenario.schema import (
-    LANE_KINDS,
-    AgentKind,
-    Flag,
-    Light,
-    LightState,
-    MapFeature,
-    Recording,
-)
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import AgentKind
 
 DATASET = "womd"
 SCENARIO_FORMAT, EXAMPLE_FORMAT = "womd-scenario", "womd-example"
@@ -75,78 +64,3 @@ def explain(error: DataError, payload: bytes, name: str) -> DrivaxError:
 def agent_kind(code: int) -> AgentKind:
     """The class of a WOMD object type; 0 (unset) and codes of later versions count as other."""
     return AgentKind(code) if 1 <= code <= 4 else AgentKind.OTHER
-
-
-class Lights:
-    """Collects light states by lane: slots and list positions move between steps, lanes do not.
-
-    Args:
-        steps: Number of steps; a lane that is not observed at a step has state -1 there.
-    """
-
-    def __init__(self, steps: int) -> None:
-        self._steps = steps
-        self._lights: dict[int, Light] = {}
-
-    def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
-        """Note one observation. Of several for one lane and step the first that is not UNKNOWN counts."""
-        light = self._lights.get(lane)
-        if light is None:
-            states = np.full(self._steps, LightState.UNOBSERVED, np.int8)
-            light = self._lights[lane] = Light(lane, np.array(stop_point, np.float64), states)
-        if light.states[step] <= LightState.UNKNOWN:
-            known = LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
-            light.states[step] = state if known else LightState.UNKNOWN
-
-    def collected(self) -> tuple[Light, ...]:
-        """The lights in order of first observation."""
-        return tuple(self._lights.values())
-
-
-def flags_of(features: Sequence[MapFeature], lights: Sequence[Light], steps: int, current_step: int) -> Flag:
-    """The flags that follow from what a recording holds."""
-    flags = Flag.NONE
-    lanes = [feature for feature in features if feature.kind in LANE_KINDS]
-    if lights:
-        flags |= Flag.LIGHTS
-    if any(lane.successors or lane.predecessors for lane in lanes):
-        flags |= Flag.LANE_GRAPH
-    if any(lane.limit_mps is not None for lane in lanes):
-        flags |= Flag.SPEED_LIMITS
-    if any(feature.points[:, 2].any() for feature in features):
-        flags |= Flag.ELEVATION
-    if current_step == steps - 1:
-        flags |= Flag.NO_FUTURE
-    return flags
-
-
-def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
-    """Row numbers as ints.
-
-    Raises:
-        DataError: One is not a row of ``count`` tracks.
-    """
-    for row in rows:
-        if not 0 <= row < count:
-            raise DataError(f"{what} names track {row}, there are {count}", cure="skip this record")
-    return tuple(int(row) for row in rows)
-
-
-def check_finite(*measured: np.ndarray[Any, Any]) -> None:
-    """Refuse NaN and infinities among what is marked valid.
-
-    Raises:
-        DataError: There are some.
-    """
-    if not all(np.isfinite(values).all() for values in measured):
-        raise DataError("valid states hold numbers that are not finite", cure="skip this record")
-
-
-def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " time"]:
-    """Timestamps with unknown ones (NaN) filled at 10 Hz from the nearest known one before, or after."""
-    known = np.flatnonzero(np.isfinite(timestamps))
-    steps = np.arange(len(timestamps))
-    if known.size == 0:
-        return steps * 0.1
-    nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
-    return timestamps[nearest] + (steps - nearest) * 0.1

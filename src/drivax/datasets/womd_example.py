@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import womd
+from drivax.datasets import readings, womd
 from drivax.datasets.messages import example_class, parse
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
-from drivax.scenario.schema import POLYGON_KINDS, Flag, Light, MapFeature, Recording, RoadKind, Tracks
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import POLYGON_KINDS, Flag, RoadKind
 
 _SKIP = "skip this record, or download the file again"
 _SPANS = ("past", "current", "future")
@@ -67,7 +68,6 @@ def decode(payload: bytes) -> Recording:
         raise DataError(f"state/is_sdc marks {ego.size} rows, not 1", cure=_SKIP)
     features, truncated = _map(table)
     lights = _lights(table, spans)
-    flags = womd.flags_of(features, lights, times.size, spans["past"])
     scenario_id = table.text("scenario/id") or hashlib.sha256(payload).hexdigest()[:16]
     return Recording(
         scenario_id=scenario_id,
@@ -81,7 +81,7 @@ def decode(payload: bytes) -> Recording:
         lights=lights,
         to_predict=tuple(np.flatnonzero(table.rows("state/tracks_to_predict", used) == 1).tolist()),
         of_interest=tuple(np.flatnonzero(table.rows("state/objects_of_interest", used) == 1).tolist()),
-        flags=flags | (Flag.TRUNCATED_MAP if truncated else Flag.NONE),
+        flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
         split_gap_m=_split_gap_m(features),
     )
 
@@ -154,7 +154,7 @@ def _tracks(table: _Features, spans: Mapping[str, int], used: _Array) -> tuple[T
 
     def measured(*names: str) -> _Array:
         values = [np.where(valid, read(name).astype(np.float64), 0.0) for name in names]
-        womd.check_finite(*values)
+        readings.check_finite(*values)
         return values[0] if len(values) == 1 else np.stack(values, axis=-1)
 
     kinds = table.numbers("state/type", (count,))[used]
@@ -169,11 +169,11 @@ def _tracks(table: _Features, spans: Mapping[str, int], used: _Array) -> tuple[T
         track_id=np.array([int(number) for number in table.numbers("state/id")[used]], np.int64),
     )
     micros = np.where(valid, read("timestamp_micros"), -1).max(axis=0, initial=-1)
-    return tracks, womd.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
+    return tracks, readings.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
 
 
 def _lights(table: _Features, spans: Mapping[str, int]) -> tuple[Light, ...]:
-    lights = womd.Lights(sum(spans.values()))
+    lights = readings.Lights(sum(spans.values()))
     start = 0
     for span, steps in spans.items():
         base = f"traffic_light_state/{span}/"

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import womd
+from drivax.datasets import readings, womd
 from drivax.datasets.messages import parse, scenario_class
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
-from drivax.scenario.schema import Light, MapFeature, Recording, RoadKind, Tracks
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import RoadKind
 
 _MPS_PER_MPH = 0.44704
 #: Points are 0.5 m apart; twice that is a jump where the map was clipped, not road.
@@ -77,14 +78,13 @@ def decode(payload: bytes) -> Recording:
         tracks=_tracks(message.tracks, steps),
         features=features,
         lights=lights,
-        to_predict=womd.rows_within(
+        to_predict=readings.rows_within(
             [wanted.track_index for wanted in message.tracks_to_predict],
             len(message.tracks),
             "tracks_to_predict",
         ),
         # These are track ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
-        flags=womd.flags_of(features, lights, steps, message.current_time_index),
         split_gap_m=_SPLIT_GAP_M,
     )
 
@@ -94,7 +94,7 @@ def _check(message: Any, steps: int) -> None:
         raise DataError("the scenario has no steps or no tracks", cure=_SKIP)
     if not 0 <= message.current_time_index < steps:
         raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=_SKIP)
-    womd.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
+    readings.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
         raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=_SKIP)
     for track in message.tracks:
@@ -107,7 +107,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
     table = np.array(rows, np.float64).reshape(len(tracks), steps, 10)
     valid = table[..., 9] > 0.5
     table = np.where(valid[..., None], table, 0.0)
-    womd.check_finite(table)
+    readings.check_finite(table)
     return Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
@@ -121,7 +121,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
 
 
 def _lights(states: Any, steps: int) -> tuple[Light, ...]:
-    lights = womd.Lights(steps)
+    lights = readings.Lights(steps)
     for step, state in enumerate(states):
         for lane in state.lane_states:
             point = lane.stop_point

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 from drivax.geometry.angles import wrap
 from drivax.scenario.lane_paths import walk
 from drivax.scenario.lanes import LaneGraph, LaneSegments
-from drivax.scenario.schema import AgentKind, Tracks
+from drivax.scenario.recording import Tracks
+from drivax.scenario.schema import AgentKind
 
 Array = np.ndarray[Any, Any]
 

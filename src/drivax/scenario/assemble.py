@@ -19,6 +19,7 @@ from drivax.scenario.filling import EVENT_ACTORS, Parts, fill
 from drivax.scenario.grid import GridSegments, arrange
 from drivax.scenario.lanes import LaneGraph, LaneSegments, lane_graph, select
 from drivax.scenario.lights import place_lights, place_stops
+from drivax.scenario.recording import Recording
 from drivax.scenario.roads import road_rows
 from drivax.scenario.routes import EgoLog, RouteSet, find_routes
 from drivax.scenario.schema import (
@@ -32,7 +33,6 @@ from drivax.scenario.schema import (
     AgentKind,
     Capacity,
     Flag,
-    Recording,
     RoadKind,
     Scenario,
     SourceCounts,

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.scenario.schema import DT_S, AgentKind, Capacity, Recording, RoadKind
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import DT_S, AgentKind, Capacity, RoadKind
 
 Array = np.ndarray[Any, Any]
 

@@ -13,9 +13,10 @@ from drivax.scenario.checks import step_seconds
 from drivax.scenario.grid import GridSegments
 from drivax.scenario.lanes import LaneGraph, lane_of_feature
 from drivax.scenario.lights import Lights, Stops
+from drivax.scenario.recording import Event, Recording
 from drivax.scenario.roads import RoadRows
 from drivax.scenario.routes import RouteSet
-from drivax.scenario.schema import Capacity, Event, Flag, Recording, record_dtype
+from drivax.scenario.schema import Capacity, Flag, record_dtype
 from drivax.scenario.segments import RoadLines
 
 Array = np.ndarray[Any, Any]

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import Polylines, point_to_segment
-from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, MapFeature, RoadKind
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind
 from drivax.scenario.segments import LONGEST_M, Segments, inside_box
 
 Array = np.ndarray[Any, Any]

@@ -11,7 +11,8 @@ from jaxtyping import Float, Int, Int8
 
 from drivax.geometry.polylines import point_to_segment
 from drivax.scenario.lanes import END_SPAN_M, LaneGraph, LaneSegments
-from drivax.scenario.schema import Light, MapFeature, RoadKind
+from drivax.scenario.recording import Light, MapFeature
+from drivax.scenario.schema import RoadKind
 from drivax.scenario.segments import path_distance
 
 Array = np.ndarray[Any, Any]

@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import cut_counts
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, MapFeature, RoadKind
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, RoadKind
 from drivax.scenario.segments import RoadLines, inside_box, path_distance
 
 Array = np.ndarray[Any, Any]

@@ -1,8 +1,9 @@
-"""What a driving scenario is: the recording that readers produce and the padded record that is stored.
+"""What a driving scenario is: the vocabulary of its parts and the padded record that is stored.
 
-Two steps lead from a public log to the simulator. A reader (or the built-in world) fills a :class:`Recording`:
-ragged, float64, in the source's own map frame, nothing invented. ``scenario.assemble`` turns it into a
-:class:`Scenario`: local frame, float32, fixed shapes named by :class:`Capacity`, with segments, grid and routes.
+Two steps lead from a public log to the simulator. A reader (or the built-in world) fills a
+:class:`~drivax.scenario.recording.Recording`: ragged, float64, in the source's own map frame, nothing invented.
+``scenario.assemble`` turns it into a :class:`Scenario`: local frame, float32, fixed shapes named by
+:class:`Capacity`, with segments, grid and routes.
 
 This module needs numpy only, so that worker processes that convert data never import JAX.
 """
@@ -14,9 +15,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int8, Int64
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 #: Steps of a full scenario: 10 past, the current one, 80 future (semantics, Time).
 STEPS = 91
@@ -136,95 +136,6 @@ CAPACITIES = {
         edge_run=160, lane_run=256,
     ),
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Everything that moves (or could), one row per track, in the source's map frame.
-
-    Invalid entries hold zeros. ``size`` is per step where the source measures it per step.
-    """
-
-    xy: Float64[np.ndarray, "track time 2"]
-    z: Float64[np.ndarray, "track time"]
-    heading: Float64[np.ndarray, "track time"]
-    velocity: Float64[np.ndarray, "track time 2"]
-    size: Float64[np.ndarray, "track time 3"]
-    valid: Bool[np.ndarray, "track time"]
-    kind: Int8[np.ndarray, " track"]
-    track_id: Int64[np.ndarray, " track"]
-
-
-@dataclass(frozen=True)
-class MapFeature:
-    """One element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
-
-    ``points`` are (x, y, z) in metres; polygons are implicitly closed; a stop sign has one point. Road edges have
-    the drivable side on their left. Links name other features by ``feature_id`` and may dangle.
-    """
-
-    feature_id: int
-    kind: RoadKind
-    points: Float64[np.ndarray, "point 3"]
-    limit_mps: float | None = None
-    width_m: float | None = None
-    successors: tuple[int, ...] = ()
-    predecessors: tuple[int, ...] = ()
-    left_neighbours: tuple[int, ...] = ()
-    right_neighbours: tuple[int, ...] = ()
-    interpolating: bool = False
-    #: For a stop sign: the lanes that it controls.
-    lanes: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class Light:
-    """A traffic light as it concerns one lane."""
-
-    lane_id: int
-    stop_point: Float64[np.ndarray, " 3"]
-    states: Int8[np.ndarray, " time"]
-
-
-@dataclass(frozen=True)
-class Event:
-    """A labelled rare event of the built-in world. ``actors`` are track ids, steps are inclusive."""
-
-    kind: int
-    start: int
-    end: int
-    actors: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A log as its source tells it: ragged arrays, float64, the source's frame; what readers produce.
-
-    Attributes:
-        ego: Row of ``tracks`` that is the ego vehicle.
-        timestamps_s: Seconds, one per step, starting anywhere.
-        current_step: Step at which the future begins (10 in WOMD).
-        to_predict, of_interest: Rows of ``tracks``.
-        route_lanes: Feature ids of the lanes of the intended route, where the source knows it.
-        flags: Facts that only the reader knows (defaulted sizes, truncated map, ...).
-        split_gap_m: Polylines are cut where neighbouring points are further apart (clipping jumps); None: never.
-    """
-
-    scenario_id: str
-    dataset: str
-    segment: str
-    timestamps_s: Float64[np.ndarray, " time"]
-    current_step: int
-    ego: int
-    tracks: Tracks
-    features: tuple[MapFeature, ...]
-    lights: tuple[Light, ...] = ()
-    to_predict: tuple[int, ...] = ()
-    of_interest: tuple[int, ...] = ()
-    route_lanes: tuple[int, ...] = ()
-    events: tuple[Event, ...] = ()
-    flags: Flag = Flag.NONE
-    split_gap_m: float | None = None
 
 
 def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -347,6 +258,8 @@ class SourceCounts:
     map_features: dict[str, int]
     map_points: int
     lights: int
+    #: What the reader or the assembly had to leave out, by name (``dangling_links``, ...); only what is not zero.
+    lost: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

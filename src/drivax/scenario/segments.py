@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import Polylines, arc_lengths, cut_counts, simplify
-from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, MapFeature, RoadKind
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, RoadKind
 
 Array = np.ndarray[Any, Any]
 

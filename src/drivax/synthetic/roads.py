@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from drivax.scenario.schema import MapFeature, RoadKind
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import RoadKind
 from drivax.synthetic.curves import Curve
 from drivax.synthetic.signals import SignalPlan
 

@@ -16,17 +16,8 @@ from jaxtyping import Bool, Float64
 
 from drivax.errors import UsageError
 from drivax.geometry.angles import wrap
-from drivax.scenario.schema import (
-    CURRENT_STEP,
-    DT_S,
-    STEPS,
-    AgentKind,
-    Event,
-    Flag,
-    Light,
-    Recording,
-    Tracks,
-)
+from drivax.scenario.recording import Event, Light, Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Flag
 from drivax.synthetic import expert
 from drivax.synthetic.events import SCRIPTS, EventKind, Staged
 from drivax.synthetic.families import FAMILIES, RoadFamily
