@@ -8,11 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from drivax.errors import DataError
-from drivax.scenario.recording import Light
-from drivax.scenario.schema import LightState
+from drivax.scenario.arrays import differentiate as differentiate
+from drivax.scenario.assemble import STRIDE
+from drivax.scenario.recording import Light, MapFeature
+from drivax.scenario.schema import STEPS, LightState, RoadKind
+
+_UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
+_LAST_STATE = int(max(LightState))
 
 
 class Lights:
@@ -24,21 +29,24 @@ class Lights:
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
-        self._lights: dict[int, Light] = {}
+        # Lists of plain numbers: a scenario has a thousand observations, and arrays are slow one by one.
+        self._found: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
         """Note one observation. Of several for one lane and step the first that is not UNKNOWN counts."""
-        light = self._lights.get(lane)
-        if light is None:
-            states = np.full(self._steps, LightState.UNOBSERVED, np.int8)
-            light = self._lights[lane] = Light(lane, np.array(stop_point, np.float64), states)
-        if light.states[step] <= LightState.UNKNOWN:
-            known = LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
-            light.states[step] = state if known else LightState.UNKNOWN
+        found = self._found.get(lane)
+        if found is None:
+            found = self._found[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
+        states = found[1]
+        if states[step] <= _UNKNOWN:
+            states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
     def collected(self) -> tuple[Light, ...]:
         """The lights in order of first observation."""
-        return tuple(self._lights.values())
+        return tuple(
+            Light(lane, np.array(point, np.float64), np.array(states, np.int8))
+            for lane, (point, states) in self._found.items()
+        )
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
@@ -73,28 +81,6 @@ def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " t
     return timestamps[nearest] + (steps - nearest) * 0.1
 
 
-def differentiate(
-    xy: Float64[np.ndarray, "track time 2"],
-    valid: Bool[np.ndarray, "track time"],
-    timestamps_s: Float64[np.ndarray, " time"],
-) -> Float64[np.ndarray, "track time 2"]:
-    """Velocities from positions, m/s: central differences inside, one-sided at the ends of what was observed.
-
-    No difference is taken over a gap; a position without a valid neighbour, and what is not valid, gets zero.
-    """
-    step = np.arange(len(timestamps_s))
-    behind = np.zeros_like(valid)
-    ahead = np.zeros_like(valid)
-    behind[:, 1:] = valid[:, 1:] & valid[:, :-1]
-    ahead[:, :-1] = behind[:, 1:]
-    first = np.maximum(step - behind, 0)
-    last = np.minimum(step + ahead, len(step) - 1)
-    rows = np.arange(len(xy))[:, None]
-    seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
-    moved = xy[rows, last] - xy[rows, first]
-    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=(behind | ahead)[..., None])
-
-
 def load_json(path: Path) -> Any:
     """The content of a JSON file.
 
@@ -107,3 +93,28 @@ def load_json(path: Path) -> Any:
         raise DataError("is missing", file=path, cure="download it again") from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"is no valid JSON ({error})", file=path, cure="download it again") from error
+
+
+def windows_of(steps: int) -> int:
+    """How many scenarios a recording of so many steps becomes (``scenario.assemble.windows``)."""
+    return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
+
+
+def counted(**counts: int) -> dict[str, int]:
+    """Counts by name for ``Recording.lost``; only what is not zero."""
+    return {name: int(count) for name, count in counts.items() if count}
+
+
+def one_point_features(features: Sequence[MapFeature]) -> int:
+    """How many lines and polygons have one point only: without direction or extent they are nowhere on the map."""
+    return sum(len(f.points) < 2 and f.kind != RoadKind.STOP_SIGN for f in features)
+
+
+def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
+    """Refuse numbers that nothing on a road has: NaN, infinities, and what is further from 0 than ``most``.
+
+    Raises:
+        DataError: There are some.
+    """
+    if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
+        raise DataError(f"holds numbers that are not finite or beyond {most:g}", cure="skip this record")

@@ -1,0 +1,65 @@
+"""``drivax export``: a scenario set, or a part of it, for others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a scenario set, or a part of it, as a set again or in another format.
+
+    set: a scenario set with the chosen records, bit for bit.
+
+    tfexample: TFRecord shards of WOMD tf.Examples with path_samples, for Waymax and V-Max.
+
+    gpudrive: one JSON file per scenario.
+
+    Example: drivax export sets/womd sets/turns --filter type=turn_left --filter lights=yes
+    """
+
+    set: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
+    """Scenario set to read."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder to write."""
+    format: Literal["set", "tfexample", "gpudrive"] = "set"
+    """What to write."""
+    filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Only scenarios for which this holds (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
+    ids: Path | None = None
+    """Only scenarios that this file names: one id per line, or data set, tabulator and id (a split file)."""
+    limit: int | None = None
+    """At most so many scenarios."""
+    paths: Literal["vmax", "published"] = "vmax"
+    """Routes in tf.Examples: 10 of 300 points at 1 m, or 10 of 500 points at 0.5 m."""
+    shard_size: int = 500
+    """Scenarios per TFRecord shard."""
+    overwrite: bool = False
+    """Replace OUT if it is an earlier export (or a scenario set, for the format set)."""
+
+
+def run(args: Export) -> int:
+    """Export, and say what the format had no room for."""
+    from drivax.datasets import export
+    from drivax.tracking.progress import Progress
+
+    options = export.Export(
+        format=args.format,
+        filters=args.filter,
+        ids=args.ids,
+        limit=args.limit,
+        paths=args.paths,
+        shard_size=args.shard_size,
+        overwrite=args.overwrite,
+    )
+    with Progress("exporting", "scenarios") as bar:
+        done = export.export(args.set, args.out, options, lambda count, total: bar.update(count, "", total))
+    lost = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in sorted(done.lost.items()))
+    files = "1 file" if done.files == 1 else f"{done.files:,} files"
+    scenarios = "1 scenario" if done.scenarios == 1 else f"{done.scenarios:,} scenarios"
+    print(f"{done.path}: {scenarios} in {files}" + (f"; no room for {lost}" if lost else ""))
+    return 0

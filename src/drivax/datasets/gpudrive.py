@@ -1,0 +1,335 @@
+"""Reader of GPUDrive's JSON files: scenes of the Waymo Open Motion Dataset, one file each.
+
+They hold tracks and map elements, but no lane graph, no speed limits and no lanes of stop signs; the published files
+also lack every scene with a traffic light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.datasets import readings
+from drivax.datasets.reader import BadRecord, Description
+from drivax.errors import DataError
+from drivax.geometry.angles import wrap
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, DT_S, POLYGON_KINDS, AgentKind, LightState, RoadKind
+
+_Array = np.ndarray[Any, Any]
+
+_SKIP = "skip this file, or make it again from the Waymo protos"
+#: Published files have 1 to 10 MB; what is larger is none, and would need many times its size in memory.
+_LARGEST_BYTES = 200_000_000
+_HEAD_BYTES = 4096
+_MOST_STEPS = 1000
+#: In place of what is not valid.
+_INVALID = -10_000.0
+#: Numbers beyond this (metres, m/s, radians) are damage.
+_LARGEST = 1e7
+#: Box sizes outside are none; the assembly takes the class's.
+_SMALLEST_SIZE_M, _LARGEST_SIZE_M = 0.01, 1000.0
+#: Ids fit into the 31 bits that the public tools give them.
+_ID_END = 2**31
+_AGENTS = {
+    "vehicle": AgentKind.VEHICLE,
+    "pedestrian": AgentKind.PEDESTRIAN,
+    "cyclist": AgentKind.CYCLIST,
+}
+#: Kind of a road whose ``map_element_id`` says nothing; the names of ``type``.
+_ROADS = {
+    "lane": RoadKind.LANE_UNDEFINED,
+    "road_line": RoadKind.LINE_UNKNOWN,
+    "road_edge": RoadKind.EDGE_UNKNOWN,
+    "crosswalk": RoadKind.CROSSWALK,
+    "speed_bump": RoadKind.SPEED_BUMP,
+    "stop_sign": RoadKind.STOP_SIGN,
+    "driveway": RoadKind.DRIVEWAY,
+}
+_KINDS = {int(kind): kind for kind in RoadKind}
+#: Points of the published files are 0.5 m apart; twice that is a jump where the map was clipped.
+_SPLIT_GAP_M, _DENSE_M = 1.0, 0.75
+
+
+@dataclass(frozen=True)
+class GpuDrive:
+    """Reads GPUDrive JSON: tracks with one size each, map elements without links, lights where a file has any."""
+
+    name: str = "gpudrive"
+    patterns: tuple[str, ...] = ("tfrecord-*_*.json",)
+    companions: tuple[str, ...] = ()
+
+    def recognise(self, path: Path) -> bool:
+        """Whether the file begins like a GPUDrive scene."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError:
+            return False
+        objects = b'"objects"' in head and b'"position"' in head
+        return head.lstrip().startswith(b"{") and (objects or (b'"roads"' in head and b'"geometry"' in head))
+
+    def describe(self, path: Path) -> Description:
+        """What the file is.
+
+        Raises:
+            DataError: It is damaged, or lacks what a recording needs.
+        """
+        recording = decode(_load(path))
+        notes = [
+            f"{len(recording.tracks.kind)} objects, {len(recording.features)} road elements",
+            "no lane graph (lanes are chained by geometry) and no speed limits",
+        ]
+        if not recording.lights:
+            notes.append("no traffic lights; the published files leave out every scene that has one")
+        if recording.split_gap_m is None:
+            notes.append("its points were thinned, so it is none of the published files")
+        return Description("Waymo Open Motion Dataset", "GPUDrive JSON", recordings=1, notes=tuple(notes))
+
+    def count(self, path: Path) -> int:
+        """One scenario per file."""
+        return int(self.recognise(path))
+
+    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
+        """The recording of one file, or the bad record in its place."""
+        try:
+            yield decode(_load(path))
+        except DataError as error:
+            yield BadRecord.of(error, path)
+
+
+def _load(path: Path) -> Any:
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise DataError(error.strerror or "cannot be opened", file=path, cure="check the path") from error
+    if size > _LARGEST_BYTES:
+        raise DataError(
+            f"has {size:,} bytes, more than a GPUDrive scene",
+            file=path,
+            cure="name the folder of single scenes",
+        )
+    return readings.load_json(path)
+
+
+def decode(scene: Any) -> Recording:
+    """The recording in a parsed GPUDrive scene.
+
+    Positions stay in WOMD's map frame, metres, float64; invalid steps (-10000 in the file) are zeros; steps are 0.1 s
+    apart, because the file has no timestamps; the current step is 10. ``goalPosition`` is an agent's last valid
+    position and therefore not kept, ``mark_as_expert`` (GPUDrive's choice of agents to replay) is dropped.
+
+    Raises:
+        DataError: The scene lacks what a recording needs, or contradicts itself.
+    """
+    if not isinstance(scene, Mapping):
+        raise DataError("is no GPUDrive scene", cure=_SKIP)
+    metadata, scenario_id = scene.get("metadata"), scene.get("scenario_id")
+    if not isinstance(metadata, Mapping) or "sdc_track_index" not in metadata:
+        raise DataError(
+            "has no metadata with sdc_track_index, so nothing tells which object is the ego",
+            cure="use files of GPUDrive's present converter; its small hand-made test scenes are no recordings",
+        )
+    if not isinstance(scenario_id, str) or not scenario_id.isprintable():
+        raise DataError("has no scenario_id", cure=_SKIP)
+    objects, roads = _rows(scene, "objects"), _rows(scene, "roads")
+    tracks = _tracks(objects)
+    count, steps = tracks.valid.shape
+    ego = _row_numbers([metadata["sdc_track_index"]], count, "sdc_track_index")[0]
+    if tracks.kind[ego] != AgentKind.VEHICLE:
+        raise DataError(f"sdc_track_index names object {ego}, which is no vehicle", cure=_SKIP)
+    features, unknown = _features(roads)
+    rows = {int(track): row for row, track in enumerate(tracks.track_id)}
+    interest = [_whole(track, "objects_of_interest") for track in _listed(metadata, "objects_of_interest")]
+    wanted = [
+        entry.get("track_index") if isinstance(entry, Mapping) else entry
+        for entry in _listed(metadata, "tracks_to_predict")
+    ]
+    return Recording(
+        scenario_id=scenario_id,
+        dataset="womd",
+        segment=scenario_id,
+        timestamps_s=np.arange(steps) * DT_S,
+        current_step=CURRENT_STEP,
+        ego=ego,
+        tracks=tracks,
+        features=features,
+        lights=_lights(scene.get("tl_states"), steps),
+        to_predict=_row_numbers(wanted, count, "tracks_to_predict"),
+        # These are ids, tracks_to_predict are rows.
+        of_interest=tuple(rows[track] for track in interest if track in rows),
+        tags={"source_format": "gpudrive"},
+        lost=readings.counted(
+            unknown_roads=unknown, one_point_features=readings.one_point_features(features)
+        ),
+        split_gap_m=_split_gap_m(features),
+    )
+
+
+def _rows(scene: Mapping[str, Any], name: str) -> Sequence[Mapping[str, Any]]:
+    rows = scene.get(name)
+    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
+        raise DataError(f"has no list of {name}", cure=_SKIP)
+    return rows
+
+
+def _listed(metadata: Mapping[str, Any], name: str) -> list[Any]:
+    values = metadata.get(name)
+    if values is not None and not isinstance(values, list):
+        raise DataError(f"metadata.{name} is no list", cure=_SKIP)
+    return values or []
+
+
+def _whole(value: Any, what: str) -> int:
+    if type(value) is not int:
+        raise DataError(f"{what} holds {str(value)[:40]!r}, which is no whole number", cure=_SKIP)
+    return value
+
+
+def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...]:
+    return readings.rows_within([_whole(value, what) for value in values], count, what)
+
+
+def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
+    """Numbers of a list of dictionaries, ``[row, key]``."""
+    try:
+        table = np.array([[row[key] for key in keys] for row in rows], np.float64)
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
+        raise DataError(f"{what} is no list of numbers {', '.join(keys)}", cure=_SKIP) from error
+    if table.size and table.shape != (len(rows), len(keys)):
+        raise DataError(f"{what} is no list of numbers {', '.join(keys)}", cure=_SKIP)
+    return table.reshape(-1, len(keys))
+
+
+def _columns(row: Any, names: Sequence[str], what: str) -> list[list[Any]]:
+    """Lists of one length that a dictionary holds."""
+    lists = [row.get(name) for name in names] if isinstance(row, Mapping) else []
+    columns = [values for values in lists if isinstance(values, list)]
+    if len(columns) < len(names) or len({len(values) for values in columns}) != 1:
+        raise DataError(f"{what} has no lists {', '.join(names)} of one length", cure=_SKIP)
+    return columns
+
+
+def _ids(rows: Sequence[Mapping[str, Any]], what: str) -> list[int]:
+    """Ids of objects or roads; their numbers where none has an id."""
+    given = [row.get("id") for row in rows]
+    if all(number is None for number in given):
+        return list(range(len(given)))
+    ids = [_whole(number, f"the id of {what}") for number in given]
+    if len(set(ids)) < len(ids) or not all(0 <= number < _ID_END for number in ids):
+        raise DataError(f"the ids of {what} are not unique, or not from 0 to {_ID_END - 1}", cure=_SKIP)
+    return ids
+
+
+def _tracks(objects: Sequence[Mapping[str, Any]]) -> Tracks:
+    table, valid = _states(objects)
+    empty = (table[..., :2] == _INVALID).all(axis=-1)
+    valid &= ~empty
+    table = np.where(valid[..., None], table, 0.0)
+    if not (np.abs(table) <= _LARGEST).all():
+        raise DataError("valid states hold numbers that are not finite or beyond reason", cure=_SKIP)
+    size = _table(objects, ("length", "width", "height"), "the size of objects")
+    size = np.where((size >= _SMALLEST_SIZE_M) & (size <= _LARGEST_SIZE_M), size, 0.0)
+    kinds = [str(row.get("type")) for row in objects]
+    return Tracks(
+        xy=table[..., 0:2].copy(),
+        z=table[..., 2].copy(),
+        size=np.where(valid[..., None], size[:, None], 0.0),
+        heading=np.where(valid, wrap(table[..., 3]), 0.0),
+        velocity=table[..., 4:6].copy(),
+        valid=valid,
+        kind=np.array([_AGENTS.get(kind, AgentKind.OTHER) for kind in kinds], np.int8),
+        track_id=np.array(_ids(objects, "objects"), np.int64),
+    )
+
+
+def _states(objects: Sequence[Mapping[str, Any]]) -> tuple[_Array, _Array]:
+    """x, y, z, heading, vx, vy of every object and step, and which are valid."""
+    if not objects:
+        raise DataError("has no objects", cure=_SKIP)
+    first = objects[0].get("valid")
+    steps = len(first) if isinstance(first, list) else 0
+    if not CURRENT_STEP < steps <= _MOST_STEPS:
+        raise DataError(f"has {steps} steps, not {CURRENT_STEP + 1} to {_MOST_STEPS}", cure=_SKIP)
+    tables, marks = [], []
+    for row, states in enumerate(objects):
+        names = ("position", "heading", "velocity", "valid")
+        position, heading, velocity, valid = _columns(states, names, f"object {row}")
+        if len(position) != steps:
+            raise DataError(f"object {row} has {len(position)} states, {steps} steps", cure=_SKIP)
+        headings = [{"heading": value} for value in heading]
+        parts = (
+            _table(position, "xyz", f"the position of object {row}"),
+            _table(headings, ("heading",), f"the heading of object {row}"),
+            _table(velocity, "xy", f"the velocity of object {row}"),
+        )
+        tables.append(np.concatenate(parts, axis=1))
+        marks.append([mark is True or mark == 1 for mark in valid])
+    return np.stack(tables), np.array(marks, bool)
+
+
+def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...], int]:
+    """Map features in order of the file, and how many roads are of no known kind."""
+    ids = _ids(roads, "roads")
+    features, unknown = [], 0
+    for number, road in zip(ids, roads, strict=True):
+        code, word = road.get("map_element_id"), str(road.get("type"))
+        kind = _KINDS.get(code) if type(code) is int else None
+        kind = _ROADS.get(word) if kind is None else kind
+        points = _table(road.get("geometry"), "xyz", f"the geometry of road {number}")
+        if kind is None or not len(points):
+            unknown += 1
+            continue
+        if not (np.abs(points) <= _LARGEST).all():
+            raise DataError(f"the geometry of road {number} is not finite or beyond reason", cure=_SKIP)
+        features.append(MapFeature(number, kind, points))
+    return tuple(features), unknown
+
+
+def _split_gap_m(features: Sequence[MapFeature]) -> float | None:
+    """Where to cut polylines; None for files whose points were thinned, where a jump looks like any other gap."""
+    gaps = [
+        np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
+        for feature in features
+        if feature.kind not in POLYGON_KINDS and len(feature.points) > 1
+    ]
+    return _SPLIT_GAP_M if gaps and float(np.median(np.concatenate(gaps))) <= _DENSE_M else None
+
+
+def _lights(states: Any, steps: int) -> tuple[Light, ...]:
+    """Lights by lane: a dictionary of lists, one entry per observation."""
+    if not states:
+        return ()
+    if not isinstance(states, Mapping):
+        raise DataError("tl_states is no dictionary of lanes", cure=_SKIP)
+    lights = readings.Lights(steps)
+    for lane, seen in states.items():
+        lane_id, what = _lane_id(lane), f"tl_states of lane {str(lane)[:40]}"
+        times, seen_states, *place = _columns(seen, ("time_index", "state", "x", "y", "z"), what)
+        when = readings.rows_within([_whole(step, what) for step in times], steps, what)
+        rows = [dict(zip("xyz", point, strict=True)) for point in zip(*place, strict=True)]
+        points = _table(rows, "xyz", what)
+        if not (np.abs(points) <= _LARGEST).all():
+            raise DataError(f"{what} is not at a finite place", cure=_SKIP)
+        for step, state, point in zip(when, seen_states, points.tolist(), strict=True):
+            lights.observe(step, lane_id, _light_state(state), point)
+    return lights.collected()
+
+
+def _lane_id(lane: str) -> int:
+    if not (lane.isascii() and lane.isdigit() and len(lane) < 11):
+        raise DataError(f"tl_states names lane {lane[:40]!r}, which is no id", cure=_SKIP)
+    return int(lane)
+
+
+def _light_state(state: Any) -> int:
+    """A state by its word, as GPUDrive's converter writes it, or by WOMD's number; UNKNOWN otherwise."""
+    word = str(state).upper()
+    if word in LightState.__members__ and word != LightState.UNOBSERVED.name:
+        return int(LightState[word])
+    known = type(state) is int and LightState.UNKNOWN <= state <= LightState.FLASHING_CAUTION
+    return state if known else int(LightState.UNKNOWN)

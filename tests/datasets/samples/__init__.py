@@ -1,0 +1,1 @@
+"""Tiny valid samples of every format, written without the code under test."""

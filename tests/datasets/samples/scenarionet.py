@@ -1,0 +1,111 @@
+"""A ScenarioNet pickle, written from the description of its dictionaries: a T-junction with a light, as from WOMD."""
+
+from __future__ import annotations
+
+import pickle
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+STEPS = 91
+X, Y, Z = 8312.0, 8904.0, -24.0  # map frames lie far from their origin
+
+
+def line(*corners: tuple[float, float], step: float = 0.5) -> np.ndarray:
+    """Points every half metre through corners, at the height of the map."""
+    corner = np.array(corners, dtype=np.float64)
+    reach = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(corner, axis=0).T))))
+    s = np.linspace(0.0, reach[-1], max(round(reach[-1] / step), 1) + 1)
+    xy = np.stack([np.interp(s, reach, corner[:, axis]) for axis in (0, 1)], axis=1)
+    return np.concatenate((xy + np.array([X, Y]), np.full((len(s), 1), Z)), axis=1).astype(np.float32)
+
+
+def track(x: float, y: float, speed: float, size: tuple[float, float, float], kind: str) -> dict[str, Any]:
+    """Something that moves east at constant speed; at ``x`` at step 10."""
+    along = x + (np.arange(STEPS) - 10) * 0.1 * speed
+    length, width, height = (np.full(STEPS, part, np.float32) for part in size)
+    position = np.stack((X + along, np.full(STEPS, Y + y), np.full(STEPS, Z + size[2] / 2)), axis=1)
+    return {
+        "type": kind,
+        "state": {
+            "position": position.astype(np.float32),
+            "length": length,
+            "width": width,
+            "height": height,
+            "heading": np.zeros(STEPS, np.float32),
+            "velocity": np.tile(np.array([speed, 0.0], np.float32), (STEPS, 1)),
+            "valid": np.ones(STEPS, bool),
+        },
+        "metadata": {"track_length": STEPS, "type": kind, "object_id": "0", "dataset": "waymo"},
+    }
+
+
+def lane(points: np.ndarray, entry: list[int], leave: list[int], **more: Any) -> dict[str, Any]:
+    """A lane; ids of links are whole numbers, ids of neighbours and boundaries texts."""
+    return {
+        "type": "LANE_SURFACE_STREET", "polyline": points, "speed_limit_mph": 25.0, "speed_limit_kmh": 40.2336,
+        "interpolating": False, "entry_lanes": entry, "exit_lanes": leave, "left_boundaries": [],
+        "right_boundaries": [], "left_neighbor": [], "right_neighbor": [],
+        "width": np.tile(np.array([[1.7, 1.8]], np.float32), (len(points), 1)), **more,
+    }  # fmt: skip
+
+
+def neighbour(name: str) -> dict[str, Any]:
+    return {"feature_id": name, "self_start_index": "0", "self_end_index": "10", "boundaries": []}
+
+
+def features() -> dict[str, Any]:
+    ring = line((-60, -2), (20, -2), (20, -40), (28, -40), (28, -2), (120, -2), (120, 6), (-60, 6), (-60, -2))
+    cross = line((18, -2), (19, -2), (19, 6), (18, 6), step=9.0)
+    return {
+        "1": lane(line((-60, 0), (20, 0)), [], [2, 4], left_neighbor=[neighbour("5")]),
+        "2": lane(
+            line((20, 0), (120, 0)), [1], [], left_neighbor=[], speed_limit_mph=0.0, speed_limit_kmh=0.0
+        ),
+        "4": lane(line((20, 0), (24, -6), (24, -40)), [1], [99], interpolating=True),
+        "5": lane(line((-60, 3.6), (120, 3.6)), [], [], right_neighbor=[neighbour("1")]),
+        "7": {"type": "ROAD_EDGE_BOUNDARY", "polyline": ring},
+        "8": {"type": "ROAD_LINE_BROKEN_SINGLE_WHITE", "polyline": line((-60, 1.8), (120, 1.8))},
+        "9": {"type": "STOP_SIGN", "lane": [4], "position": np.array([X + 22, Y - 3, Z], np.float32)},
+        "10": {"type": "CROSSWALK", "polygon": cross},
+        "11": {"type": "SPEED_BUMP", "polygon": cross + np.array([10, 0, 0])},
+        "12": {"type": "ROAD_EDGE_SIDEWALK", "polygon": cross},
+    }
+
+
+def scenario() -> dict[str, Any]:
+    """The dictionary as ScenarioNet's converter of WOMD makes it."""
+    states = ["LANE_STATE_STOP"] * 30 + [None] * 10 + ["LANE_STATE_GO"] * (STEPS - 40)
+    light = {
+        "type": "TRAFFIC_LIGHT", "state": {"object_state": states}, "lane": 2,
+        "stop_point": np.array([X + 20, Y, Z], np.float32), "metadata": {"track_length": STEPS},
+    }  # fmt: skip
+    tracks = {
+        "17": track(-20.0, 3.6, 9.0, (4.5, 1.9, 1.6), "VEHICLE"),
+        "23": track(30.0, 9.0, 1.0, (0.7, 0.8, 1.8), "PEDESTRIAN"),
+        "2406": track(-40.0, 0.0, 10.0, (5.3, 2.3, 2.0), "VEHICLE"),
+    }
+    return {
+        "id": "0123456789abcdef",
+        "version": "v1.2",
+        "length": STEPS,
+        "tracks": tracks,
+        "dynamic_map_states": {"2": light},
+        "map_features": features(),
+        "metadata": {
+            "id": "0123456789abcdef", "coordinate": "waymo", "metadrive_processed": False, "sdc_id": "2406",
+            "ts": (np.arange(STEPS) * 0.1).astype(np.float32), "dataset": "waymo", "current_time_index": 10,
+            "sdc_track_index": 2, "objects_of_interest": ["17"],
+            "tracks_to_predict": {"23": {"track_index": 1, "track_id": "23", "difficulty": 0}},
+            "number_summary": {"types": {"VEHICLE"}, "num_moving_objects_each_type": defaultdict(int, VEHICLE=2)},
+        },
+    }  # fmt: skip
+
+
+def write(folder: Path) -> Path:
+    """Writes one scenario file and returns its path."""
+    path = folder / "sd_waymo_v1.2_0123456789abcdef.pkl"
+    path.write_bytes(pickle.dumps(scenario(), protocol=4))
+    return path

@@ -1,0 +1,271 @@
+"""GPUDrive JSON: what is read, what is refused, and the real files."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from datasets.samples import gpudrive as sample
+from drivax.datasets.gpudrive import GpuDrive, decode
+from drivax.datasets.reader import BadRecord, Reader
+from drivax.errors import DataError
+from drivax.scenario.assemble import assemble
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind
+
+
+@pytest.fixture
+def scene():
+    return sample.scene()
+
+
+def read(path) -> Recording:
+    (recording,) = GpuDrive().read(path)
+    assert isinstance(recording, Recording), recording
+    return recording
+
+
+def test_tracks(tmp_path):
+    recording = read(sample.write(tmp_path))
+    tracks = recording.tracks
+    assert isinstance(GpuDrive(), Reader)
+    assert (recording.scenario_id, recording.dataset) == ("ef3a8f65142f41ac", "womd")
+    assert recording.tags == {"source_format": "gpudrive"}
+    assert tracks.track_id.tolist() == [78, 3, 41, 2406]
+    assert tracks.kind.tolist() == [
+        AgentKind.VEHICLE,
+        AgentKind.PEDESTRIAN,
+        AgentKind.CYCLIST,
+        AgentKind.VEHICLE,
+    ]
+    np.testing.assert_allclose(tracks.xy[3, 30], (sample.X0 + 10.0, sample.Y0))
+    np.testing.assert_allclose(tracks.z[3], sample.Z0 + 2.33 / 2)
+    np.testing.assert_allclose(tracks.velocity[0, 0], (-4.0, 0.0))
+    np.testing.assert_allclose(tracks.size[3, 5], (5.286, 2.332, 2.33))
+    assert tracks.valid[0].sum() == 85 and not tracks.valid[0, 30:36].any() and not tracks.valid[2, 60:].any()
+    np.testing.assert_allclose(recording.timestamps_s, np.arange(91) * 0.1)
+    assert recording.current_step == 10
+
+
+def test_item_1_headings_are_wrapped(scene):
+    scene["objects"][3]["heading"] = [7 * math.pi / 2] * 91
+    np.testing.assert_allclose(decode(scene).tracks.heading[3], -math.pi / 2)
+
+
+def test_item_4_nothing_is_invented_where_steps_are_invalid(scene):
+    tracks = decode(scene).tracks
+    for values in (tracks.xy, tracks.z, tracks.heading, tracks.velocity, tracks.size):
+        assert not values[~tracks.valid].any()  # -10000 in the file
+
+
+def test_a_step_without_a_place_is_not_valid_whatever_the_file_says(scene):
+    scene["objects"][0]["valid"] = [True] * 91
+    assert not decode(scene).tracks.valid[0, 30:36].any()
+
+
+def test_item_19_ego_and_marks_rows_versus_ids(scene):
+    recording = decode(scene)
+    assert recording.ego == 3
+    assert recording.to_predict == (0,)  # rows in the file
+    assert recording.of_interest == (2, 3)  # ids 41 and 2406 in the file
+    stored = assemble(recording)
+    assert stored.agent_id[0] == 2406
+
+
+def test_roads(scene):
+    recording = decode(scene)
+    kinds = {feature.feature_id: feature.kind for feature in recording.features}
+    assert kinds == {
+        1: RoadKind.LANE_SURFACE, 2: RoadKind.LANE_SURFACE, 5: RoadKind.LANE_FREEWAY,
+        7: RoadKind.LINE_SOLID_SINGLE_YELLOW, 8: RoadKind.EDGE_BOUNDARY, 9: RoadKind.EDGE_MEDIAN,
+        11: RoadKind.CROSSWALK, 12: RoadKind.SPEED_BUMP, 13: RoadKind.DRIVEWAY, 14: RoadKind.STOP_SIGN,
+    }  # fmt: skip
+    first = recording.features[0].points
+    np.testing.assert_allclose(first[[0, -1]], [(sample.X0 + x, sample.Y0, sample.Z0) for x in (-20, 20)])
+    assert all(feature.limit_mps is None for feature in recording.features)
+
+
+@pytest.mark.parametrize(
+    ("code", "word", "kind"),
+    [
+        (-1, "driveway", RoadKind.DRIVEWAY),  # older files have no code for them
+        (None, "lane", RoadKind.LANE_UNDEFINED),
+        (4, "road_edge", RoadKind.EDGE_UNKNOWN),
+        (13, "road_line", RoadKind.LINE_PASSING_DOUBLE_YELLOW),
+        ("2", "road_line", RoadKind.LINE_UNKNOWN),
+    ],
+)
+def test_road_codes(scene, code, word, kind):
+    scene["roads"][0] |= {"map_element_id": code, "type": word}
+    assert decode(scene).features[0].kind == kind
+
+
+def test_roads_of_no_known_kind_and_of_one_point_are_counted(scene):
+    scene["roads"][0] |= {"map_element_id": 99, "type": "runway"}
+    scene["roads"][3]["geometry"] = scene["roads"][3]["geometry"][:1]
+    recording = decode(scene)
+    assert recording.lost == {"unknown_roads": 1, "one_point_features": 1}
+    assert len(recording.features) == 9
+
+
+def test_item_24_no_lane_graph_lanes_are_chained_and_flagged(scene):
+    stored = assemble(decode(scene))
+    lanes = stored.lane_id.tolist()
+    first, second = lanes.index(1), lanes.index(2)
+    assert stored.lane_successor[first].tolist() == [second, -1, -1, -1]
+    assert {Flag.LANE_GRAPH, Flag.CHAINED_GRAPH, Flag.ROUTE} <= set(stored.has)
+    assert Flag.SPEED_LIMITS not in stored.has
+
+
+def test_item_5_jumps_split_dense_polylines_only(scene):
+    edge = scene["roads"][4]["geometry"]
+    del edge[40:60]
+    assert decode(scene).split_gap_m == 1.0
+    assert 8 not in assemble(decode(scene)).feature_id[assemble(decode(scene)).feature_closed]
+    assert (assemble(decode(scene)).feature_id == 8).sum() == 2
+    for road in scene["roads"][:6]:
+        road["geometry"] = road["geometry"][::8]
+    assert decode(scene).split_gap_m is None  # points 4 m apart are thinned lines, not jumps
+    assert (assemble(decode(scene)).feature_id == 8).sum() == 1
+
+
+def test_item_3_sizes_that_are_none_are_the_class_s(scene):
+    scene["objects"][0] |= {"length": 0.0, "width": 1e-300, "height": 1e9}
+    stored = assemble(decode(scene))
+    row = stored.agent_id.tolist().index(78)
+    np.testing.assert_allclose(stored.agent_size[row], (4.1, 1.9, 1.6))
+    assert Flag.DEFAULT_SIZES in stored.has
+
+
+def test_lights_as_the_converter_writes_them(scene):
+    place = {"x": [1.0] * 3, "y": [2.0] * 3, "z": [3.0] * 3}
+    scene["tl_states"] = {"2": {"state": ["stop", "arrow_go", 99], "time_index": [0, 5, 6], **place}}
+    (light,) = decode(scene).lights
+    assert light.lane_id == 2 and light.stop_point.tolist() == [1.0, 2.0, 3.0]
+    assert light.states[[0, 1, 5, 6]].tolist() == [
+        LightState.STOP, LightState.UNOBSERVED, LightState.ARROW_GO, LightState.UNKNOWN
+    ]  # fmt: skip
+
+
+def test_ids_are_numbered_where_the_file_has_none(scene):
+    for row in (*scene["objects"], *scene["roads"]):
+        del row["id"]
+    recording = decode(scene)
+    assert recording.tracks.track_id.tolist() == [0, 1, 2, 3]
+    assert [feature.feature_id for feature in recording.features] == list(range(10))
+
+
+def broken(scene, *path, value):
+    *outer, last = path
+    place = scene
+    for key in outer:
+        place = place[key]
+    place[last] = value
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        (("metadata",), None, "nothing tells which object is the ego"),
+        (("metadata",), {}, "nothing tells which object is the ego"),
+        (("metadata", "sdc_track_index"), 4, "names track 4"),
+        (("metadata", "sdc_track_index"), "3", "no whole number"),
+        (("metadata", "sdc_track_index"), 1, "no vehicle"),
+        (("metadata", "tracks_to_predict"), [{"track_index": 77}], "names track 77"),
+        (("metadata", "tracks_to_predict"), {}, "no list"),
+        (("scenario_id",), None, "no scenario_id"),
+        (("scenario_id",), "\ud800", "no scenario_id"),
+        (("objects",), [], "has no objects"),
+        (("objects",), {"0": 1}, "no list of objects"),
+        (("roads",), None, "no list of roads"),
+        (("objects", 0, "valid"), [True] * 5, "has 5 steps"),
+        (("objects", 1, "heading"), [0.0] * 90, "of one length"),
+        (("objects", 1, "position"), None, "object 1 has no lists"),
+        (("objects", 1, "position", 4), {"x": 1.0, "y": 2.0}, "no list of numbers x, y, z"),
+        (("objects", 1, "position", 4, "x"), float("nan"), "not finite"),
+        (("objects", 1, "position", 4, "x"), 1e300, "beyond reason"),
+        (("objects", 1, "position", 4, "x"), 10**400, "no list of numbers"),
+        (("objects", 1, "id"), 78, "not unique"),
+        (("objects", 1, "id"), 2**31, "not unique, or not from 0"),
+        (("objects", 1, "id"), 1.5, "no whole number"),
+        (("roads", 1, "id"), 1, "not unique"),
+        (("roads", 0, "geometry"), None, "geometry of road 1"),
+        (("roads", 0, "geometry", 3, "y"), [[0]], "geometry of road 1"),
+        (("roads", 0, "geometry", 3, "y"), float("inf"), "not finite"),
+        (("tl_states",), [1], "no dictionary"),
+        (("tl_states",), {"x": {}}, "no id"),
+        (("tl_states",), {"1": {"state": []}}, "no lists"),
+    ],
+)
+def test_what_contradicts_itself_is_refused_in_one_line(tmp_path, path, value, said):
+    scene = sample.scene()
+    broken(scene, *path, value=value)
+    file = tmp_path / "tfrecord-00000-of-00001_0.json"
+    file.write_text(json.dumps(scene))
+    (bad,) = GpuDrive().read(file)
+    assert isinstance(bad, BadRecord) and said in bad.problem, bad
+    assert bad.file == file and bad.cure
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"[[" * 100_000, b"\xff\xfe{}", b'{"a": 1}', b"null"])
+def test_files_that_are_no_scene(tmp_path, content):
+    file = tmp_path / "tfrecord-00000-of-00001_0.json"
+    file.write_bytes(content)
+    (bad,) = GpuDrive().read(file)
+    assert isinstance(bad, BadRecord)
+    assert not GpuDrive().recognise(file) and GpuDrive().count(file) == 0
+
+
+def test_missing_and_oversized_files(tmp_path):
+    (bad,) = GpuDrive().read(tmp_path / "none.json")
+    assert "No such file" in bad.problem
+    large = tmp_path / "large.json"
+    with large.open("wb") as file:
+        file.truncate(300_000_000)  # sparse: takes no space
+    (bad,) = GpuDrive().read(large)
+    assert "300,000,000 bytes" in bad.problem
+
+
+def test_recognises_by_content(tmp_path, scene):
+    assert GpuDrive().recognise(sample.write(tmp_path))
+    roads_first = tmp_path / "b.json"
+    roads_first.write_text(json.dumps({"roads": scene["roads"], **scene}))
+    assert GpuDrive().recognise(roads_first)
+    other = tmp_path / "log_map_archive.json"
+    other.write_text(json.dumps({"drivable_areas": {}, "lane_segments": {}, "pedestrian_crossings": {}}))
+    assert not GpuDrive().recognise(other) and not GpuDrive().recognise(tmp_path)
+
+
+def test_describe(tmp_path):
+    described = GpuDrive().describe(sample.write(tmp_path))
+    assert described.recordings == 1 and "4 objects, 10 road elements" in described.notes[0]
+    assert any("no traffic lights" in note for note in described.notes)
+    with pytest.raises(DataError, match="hand-made"):
+        GpuDrive().describe(sample.write(tmp_path, metadata=None))
+
+
+#: shared/data/README.md
+REAL = {
+    "325": ("ef3a8f65142f41ac", 62, 61, 157, 10_527),
+    "4": ("db4edc9bd0c9d18c", 81, 80, 102, 5_388),
+}
+
+
+@pytest.mark.parametrize("number", REAL)
+def test_real_files(real_data, number):
+    path = real_data / "gpudrive" / f"tfrecord-00000-of-01000_{number}.json"
+    recording = read(path)
+    stored = assemble(recording)
+    counts = len(recording.tracks.kind), recording.ego, len(recording.features), stored.source.map_points
+    assert (recording.scenario_id, *counts) == REAL[number]
+    np.testing.assert_allclose(stored.agent_size[0], (5.286, 2.332, 2.33), atol=1e-3)
+    assert stored.overflow == {} and {Flag.CHAINED_GRAPH, Flag.ROUTE} <= set(stored.has)
+    # Headings are those of the motion.
+    tracks = recording.tracks
+    fast = tracks.valid & (np.hypot(*np.moveaxis(tracks.velocity, -1, 0)) > 3) & (tracks.kind == 1)[:, None]
+    course = np.arctan2(tracks.velocity[..., 1], tracks.velocity[..., 0])
+    off = np.abs((tracks.heading - course + math.pi) % (2 * math.pi) - math.pi)
+    assert fast.sum() > 50 and np.quantile(off[fast], 0.95) < 0.2

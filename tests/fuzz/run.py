@@ -1,0 +1,162 @@
+"""Reads and assembles damaged files of one format, under a limit of memory and of time per file.
+
+    python -m fuzz.run FORMAT --files 200 --seed 0       (from the folder tests)
+
+Prints how the files ended. Exit status 1 when one of them ended in anything but a clear error or a sound scenario.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from drivax.datasets.convert import Conversion, convert_file
+from drivax.datasets.formats import reader_named
+from drivax.datasets.reader import BadRecord
+from drivax.errors import DrivaxError
+from drivax.scenario.schema import CAPACITIES, Scenario
+from fuzz import mutations
+
+#: How the files of a format can be damaged beyond their bytes, by the end of their names.
+BY_SUFFIX: dict[str, Callable[[Path, random.Random], None]] = {
+    ".json": mutations.json_tree,
+    ".pkl": mutations.pickle_tree,
+    ".db": mutations.sqlite_cells,
+    ".gpkg": mutations.sqlite_cells,
+    ".parquet": mutations.arrow_columns,
+    ".feather": mutations.arrow_columns,
+}
+MEMORY = 1 << 30
+SECONDS_PER_FILE = 20
+
+
+class Hang(BaseException):
+    """One file took too long."""
+
+
+def _alarm(*_: object) -> None:
+    raise Hang
+
+
+def damage(folder: Path, rng: random.Random) -> str:
+    """Damage one file of a sample; returns what was done to which."""
+    path = rng.choice(sorted(path for path in folder.rglob("*") if path.is_file()))
+    meaning = BY_SUFFIX.get(path.suffix, mutations.tfrecord if "tfrecord" in path.name else mutations.raw)
+    how = meaning if rng.random() < 0.7 else mutations.raw
+    how(path, rng)
+    return f"{how.__name__} {path.name}"
+
+
+def unsound(scenario: Scenario) -> str | None:
+    """What is wrong with an assembled scenario, by rules of its own: finite, masked, ego there, indices in range."""
+    record, capacity = scenario.record, scenario.capacity
+    for name in record.dtype.names or ():
+        if record[name].dtype.kind == "f" and not np.isfinite(record[name]).all():
+            return f"{name} is not finite"
+    now, valid = int(record["current_step"]), record["agent_valid"]
+    if not valid[now, 0]:
+        return "the ego is not valid at the current step"
+    for name in ("agent_xy", "agent_velocity", "agent_heading"):
+        if record[name][~valid].any():
+            return f"{name} is not zero where it is not valid"
+    if not (np.abs(record["agent_heading"]) <= np.float32(np.pi)).all():
+        return "a heading is not wrapped"
+    if valid.any() and (record["agent_size"][valid.any(axis=0)] <= 0).any():
+        return "an agent has no size"
+    for name, most in (
+        ("segment_lane", capacity.lanes),
+        ("route_lane", capacity.lanes),
+        ("lane_successor", capacity.lanes),
+    ):
+        if not ((record[name] >= -1) & (record[name] < most)).all():
+            return f"{name} is out of range"
+    return None
+
+
+def outcome(path: Path, format_name: str) -> tuple[str, str | None]:
+    """How reading and assembling one file ends: its kind, and what is wrong with that."""
+    kinds = []
+    try:
+        for item in convert_file(path, Conversion(format=format_name)):
+            if isinstance(item, BadRecord):
+                line = str(item.error())
+                if "\n" in line or "assembling failed" in line or "unexpected" in line:
+                    return "bad error", line
+                kinds.append("bad record")
+            elif (wrong := unsound(item)) is not None:
+                return "unsound scenario", wrong
+            else:
+                kinds.append("scenario")
+    except DrivaxError as error:
+        return "error", None if "\n" not in str(error) else str(error)
+    except Hang:
+        return "hang", f"more than {SECONDS_PER_FILE} s\n{traceback.format_exc()}"
+    except BaseException:
+        return "traceback", traceback.format_exc()
+    return ("scenario" if "scenario" in kinds else kinds[0] if kinds else "nothing"), None
+
+
+def limit_memory() -> None:
+    """Refuse this process more than 1 GB beyond what it has now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the files of one format."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("format")
+    parser.add_argument("--files", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="run this file of the series only, with its traceback")
+    args = parser.parse_args(argv)
+    reader_named(args.format)
+    sample = importlib.import_module(f"datasets.samples.{args.format.replace('-', '_')}")
+    signal.signal(signal.SIGALRM, _alarm)
+    ends: Counter[str] = Counter()
+    wrong: list[str] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        whole = Path(scratch) / "whole"
+        whole.mkdir()
+        path = sample.write(whole).relative_to(whole)
+        kind, problem = outcome(whole / path, args.format)  # imports what it needs before memory is limited
+        if kind != "scenario" or problem:
+            print(f"the sample itself: {kind} {problem}")
+            return 1
+        limit_memory()
+        for number in range(args.files) if args.only is None else (args.only,):
+            rng = random.Random(f"{args.seed} {number}")
+            folder = Path(scratch) / "damaged"
+            shutil.copytree(whole, folder)
+            done = damage(folder, rng)
+            begin = time.monotonic()
+            signal.alarm(SECONDS_PER_FILE)
+            kind, problem = outcome(folder / path, args.format)
+            signal.alarm(0)
+            ends[kind] += 1
+            if problem is not None:
+                wrong.append(f"file {number} ({done}, {time.monotonic() - begin:.1f} s): {kind}: {problem}")
+            shutil.rmtree(folder)
+    print(json.dumps({"format": args.format, "capacity": CAPACITIES["default"].name, "ends": ends}))
+    for line in wrong[:20]:
+        print(line)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
