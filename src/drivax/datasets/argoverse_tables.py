@@ -1,0 +1,137 @@
+"""Columns of Argoverse 2 tables (parquet and feather files) as checked numpy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Int
+
+from drivax.errors import DataError, UsageError
+
+Array = np.ndarray[Any, Any]
+
+PARQUET_MAGIC, FEATHER_MAGIC = b"PAR1", b"ARROW1"
+#: The longest logs have some ten thousand rows; damaged files can claim any number.
+MOST_ROWS = 1_000_000
+_AGAIN = "download it again"
+Kind = Literal["number", "whole", "text"]
+
+
+@dataclass(frozen=True)
+class Words:
+    """A column of text: the different words in order of appearance, and the word of every row."""
+
+    words: tuple[str, ...]
+    of_row: Int[Array, " row"]
+
+    def text(self, row: int) -> str:
+        """The text of a row."""
+        return self.words[self.of_row[row]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Some columns of a table, one array per name: float64 or int64, or :class:`Words`."""
+
+    rows: int
+    numbers: Mapping[str, Array]
+    texts: Mapping[str, Words]
+
+    def stacked(self, names: Sequence[str]) -> Array:
+        """Columns of numbers side by side, float64, shape ``(rows, len(names))``."""
+        return np.stack([self.numbers[name] for name in names], axis=1).astype(np.float64)
+
+
+def has_magic(path: Path, magic: bytes) -> bool:
+    """Whether a file begins with these bytes; False where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError:
+        return False
+
+
+def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
+    """Reads columns of a parquet or feather file.
+
+    Args:
+        path: The file.
+        columns: Name and kind of the columns: any number, whole numbers, or text. Other columns are not read.
+
+    Raises:
+        DataError: The file is missing or damaged, or lacks a column, a value, or a kind.
+        UsageError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+    except ImportError as error:
+        raise UsageError(
+            "reading Argoverse 2 needs pyarrow", cure="pip install 'drivax[av2,maps]'"
+        ) from error
+    try:
+        table = _load(path, list(columns))
+        if table.num_rows == 0:
+            raise DataError("holds no rows", file=path, cure=_AGAIN)
+        texts = {name: _words(table.column(name)) for name, kind in columns.items() if kind == "text"}
+        numbers = {
+            name: _numbers(table.column(name), kind == "whole", name)
+            for name, kind in columns.items()
+            if kind != "text"
+        }
+    except FileNotFoundError as error:
+        raise DataError("is missing", file=path, cure=_AGAIN) from error
+    except DataError as error:
+        raise DataError(error.problem, file=path, cure=error.cure) from error
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        raise DataError(f"is no sound table ({str(error)[:160]})", file=path, cure=_AGAIN) from error
+    return Table(table.num_rows, numbers, texts)
+
+
+def _load(path: Path, columns: Sequence[str]) -> Any:
+    """The columns as an Arrow table, validated: string offsets of damaged files may point anywhere."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with pa.OSFile(str(path)) as source:
+        if has_magic(path, PARQUET_MAGIC):
+            file = pq.ParquetFile(source)
+            _check(file.schema_arrow.names, columns, file.metadata.num_rows)
+            table = file.read(columns=list(columns), use_threads=False)
+        else:
+            names = pa.ipc.open_file(source).schema.names
+            _check(names, columns, 0)
+            options = pa.ipc.IpcReadOptions(
+                use_threads=False, included_fields=[names.index(name) for name in columns]
+            )
+            table = pa.ipc.open_file(source, options=options).read_all()
+    _check(table.schema.names, columns, table.num_rows)
+    table.validate(full=True)
+    return table
+
+
+def _check(names: Sequence[str], wanted: Sequence[str], rows: int) -> None:
+    for name in wanted:
+        if names.count(name) != 1:
+            raise DataError(f"has no column {name}", cure="this is another kind of table, or a damaged one")
+    if not 0 <= rows <= MOST_ROWS:
+        raise DataError(f"claims to hold {rows} rows", cure=_AGAIN)
+
+
+def _numbers(column: Any, whole: bool, name: str) -> Array:
+    import pyarrow as pa
+
+    fits = pa.types.is_integer(column.type) or (not whole and pa.types.is_floating(column.type))
+    if not fits or column.null_count:
+        raise DataError(f"column {name} holds {column.type} with {column.null_count} gaps", cure=_AGAIN)
+    return column.to_numpy().astype(np.int64 if whole else np.float64)
+
+
+def _words(column: Any) -> Words:
+    import pyarrow as pa
+
+    encoded = column.cast(pa.string()).combine_chunks().fill_null("").dictionary_encode()
+    return Words(tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64))
