@@ -1,0 +1,325 @@
+"""People's own data: plain arrays in, a recording or a scenario out, with errors that name the argument."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from drivax.errors import UsageError
+from drivax.scenario.agents import DEFAULT_SIZES
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind
+
+Array = np.ndarray[Any, Any]
+
+_AGENT_KEYS = ("xy", "heading", "valid", "size", "kind", "velocity", "z", "id")
+_ROAD_KEYS = ("lanes", "edges", "crosswalks", "stop_signs")
+_LANE_KEYS = ("points", "successors", "left", "right", "limit_mps", "width_m", "kind")
+_LIGHT_KEYS = ("lane", "states", "stop_point")
+_KINDS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST,
+          "other": AgentKind.OTHER, "static": AgentKind.STATIC}  # fmt: skip
+_LANE_KINDS = {"surface": RoadKind.LANE_SURFACE, "freeway": RoadKind.LANE_FREEWAY, "bike": RoadKind.LANE_BIKE}
+_COLOURS = {"red": LightState.STOP, "yellow": LightState.CAUTION, "green": LightState.GO,
+            "unknown": LightState.UNKNOWN, None: LightState.UNOBSERVED}  # fmt: skip
+
+
+def recording_from_arrays(
+    scenario_id: str,
+    agents: Mapping[str, Any],
+    roads: Mapping[str, Any],
+    lights: Sequence[Mapping[str, Any]] = (),
+    route: Sequence[int] = (),
+    ego: int = 0,
+    dt_s: float = DT_S,
+    dataset: str = "own",
+) -> Recording:
+    """A recording of any length from plain arrays: metres, radians anticlockwise from +x, m/s, one map frame.
+
+    Args:
+        scenario_id: Name of the recording; windows that are cut from it share it as their segment.
+        agents: ``xy`` [agent, time, 2], ``heading`` [agent, time], ``valid`` [agent, time]; box ``size`` [agent, 3] or
+            [agent, time, 3] (length, width, height; class defaults where it is missing or 0). Optional: ``kind``, one
+            per agent ("vehicle", "pedestrian", "cyclist", "other", "static"; vehicles if missing); ``velocity``
+            [agent, time, 2] (taken from the positions if missing); ``z`` [agent, time] of the box centre (needed where
+            the roads have heights); ``id``, whole numbers. Entries that are not valid may hold anything.
+        roads: ``lanes``, a sequence of mappings with ``points`` [point, 2 or 3] in driving direction and optionally
+            ``successors``, ``left``, ``right`` (places in this sequence; neighbours run the same way), ``limit_mps``,
+            ``width_m``, ``kind`` ("surface", "freeway", "bike"); without any successor lanes are joined where they
+            touch. ``edges``, polylines [point, 2 or 3] with the drivable side on the left. Optional: ``crosswalks``,
+            polygons; ``stop_signs``, mappings with ``point`` and ``lanes`` (places).
+        lights: Mappings with ``lane`` (place), ``states``, one per step ("red", "yellow", "green", "unknown", None
+            where nobody saw it, or :class:`~drivax.scenario.schema.LightState`), and optionally ``stop_point``
+            (otherwise the beginning of the lane).
+        route: Places of the lanes of the intended route in order, where it is known.
+        ego: Row of the agent that is driven.
+        dt_s: Seconds between steps; anything but 0.1 has to be resampled first (:func:`resample`).
+        dataset: A short name for where the data come from.
+
+    Raises:
+        UsageError: An argument is missing, misspelt, or has another shape; the message names it.
+    """
+    _check_step(dt_s)
+    _known(agents, _AGENT_KEYS, "agents")
+    _known(roads, _ROAD_KEYS, "roads")
+    features = tuple(_features(roads))
+    high = any(np.ptp(feature.points[:, 2]) > 0 for feature in features)
+    tracks = _tracks(agents, ego, needs_height=high)
+    steps = tracks.valid.shape[1]
+    lanes = len(roads.get("lanes", ()))
+    return Recording(
+        scenario_id=scenario_id,
+        dataset=dataset,
+        segment=scenario_id,
+        timestamps_s=np.arange(steps) * DT_S,
+        current_step=min(CURRENT_STEP, steps - 1),
+        ego=ego,
+        tracks=tracks,
+        features=features,
+        lights=tuple(
+            _light(light, f"lights[{i}]", features[:lanes], steps) for i, light in enumerate(lights)
+        ),
+        route_lanes=_places(route, lanes, "route"),
+        flags=Flag.NONE if "velocity" in agents else Flag.DIFFERENTIATED_VELOCITY,
+        tags={"source_format": "arrays"},
+    )
+
+
+def _check_step(dt_s: float) -> None:
+    if abs(dt_s - DT_S) > 1e-3:
+        raise UsageError(
+            f"dt_s is {dt_s}, scenarios have steps of {DT_S} s",
+            cure=f"agents = drivax.scenario.arrays.resample(agents, {dt_s}) first, and leave dt_s out",
+        )
+
+
+def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
+    """Agents at 10 Hz from steps of another length: interpolated linearly, headings the short way round.
+
+    Nothing is made up: a new step is valid where it falls on a valid old one or between two neighbouring valid ones.
+    Velocities are left out, so that they are taken from the new positions.
+
+    Args:
+        agents: As for :func:`recording_from_arrays`.
+        dt_s: Seconds between the given steps.
+
+    Raises:
+        UsageError: ``dt_s`` is not positive, or an array has another shape.
+    """
+    _known(agents, _AGENT_KEYS, "agents")
+    if not 0.0 < dt_s <= 10.0:
+        raise UsageError(f"dt_s is {dt_s}", cure="give the seconds between two steps")
+    valid = _array(agents, "valid", bool, (None, None))
+    count, steps = valid.shape
+    at = np.arange(int((steps - 1) * dt_s / DT_S + 1e-6) + 1) * (DT_S / dt_s)
+    before = np.minimum(np.floor(at + 1e-6).astype(np.int64), max(steps - 2, 0))
+    after = np.minimum(before + 1, steps - 1)
+    share = np.clip(at - before, 0.0, 1.0)
+    share = np.where(share < 1e-6, 0.0, np.where(share > 1 - 1e-6, 1.0, share))
+    seen = (valid[:, before] | (share == 1.0)) & (valid[:, after] | (share == 0.0))
+
+    def between(name: str, columns: tuple[int, ...]) -> Array:
+        values = _where(_array(agents, name, float, (count, steps, *columns)), valid)
+        step = values[:, after] - values[:, before]
+        step = (step + np.pi) % (2 * np.pi) - np.pi if name == "heading" else step
+        return values[:, before] + share.reshape(-1, *[1] * len(columns)) * step
+
+    result = {name: agents[name] for name in ("kind", "id", "size") if name in agents}
+    if "size" in result and np.ndim(result["size"]) == 3:
+        result["size"] = between("size", (3,))
+    result |= {"xy": between("xy", (2,)), "heading": between("heading", ()), "valid": seen}
+    return result | ({"z": between("z", ())} if "z" in agents else {})
+
+
+def differentiate(
+    xy: Float64[np.ndarray, "track time 2"],
+    valid: Bool[np.ndarray, "track time"],
+    timestamps_s: Float64[np.ndarray, " time"],
+) -> Float64[np.ndarray, "track time 2"]:
+    """Velocities from positions, m/s: central differences inside, one-sided at the ends of what was observed.
+
+    No difference is taken over a gap; a position without a valid neighbour, and what is not valid, gets zero.
+    """
+    step = np.arange(len(timestamps_s))
+    behind = np.zeros_like(valid)
+    ahead = np.zeros_like(valid)
+    behind[:, 1:] = valid[:, 1:] & valid[:, :-1]
+    ahead[:, :-1] = behind[:, 1:]
+    first = np.maximum(step - behind, 0)
+    last = np.minimum(step + ahead, len(step) - 1)
+    rows = np.arange(len(xy))[:, None]
+    seconds_apart = (timestamps_s[last] - timestamps_s[first])[..., None]
+    moved = xy[rows, last] - xy[rows, first]
+    return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=(behind | ahead)[..., None])
+
+
+def _known(given: Any, keys: Sequence[str], what: str) -> None:
+    """Refuse a misspelt key, which would otherwise be data that silently disappears."""
+    if not isinstance(given, Mapping):
+        raise UsageError(f"{what} is no mapping", cure=f"give a dictionary with {', '.join(keys)}")
+    for key in given:
+        if key not in keys:
+            raise UsageError(f"{what} has no {key!r}", cure=f"use {', '.join(keys)}")
+
+
+def _array(given: Mapping[str, Any], name: str, kind: type, shape: tuple[int | None, ...]) -> Array:
+    """One of the agents' arrays, of this shape (None: any size)."""
+    if name not in given:
+        raise UsageError(f'agents["{name}"] is missing', cure="see recording_from_arrays")
+    try:
+        values = np.array(given[name], dtype=kind)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f'agents["{name}"] is no array of numbers', cure="give one row per agent") from error
+    if len(values.shape) != len(shape) or any(
+        w not in (None, n) for w, n in zip(shape, values.shape, strict=True)
+    ):
+        wanted = tuple("any" if size is None else size for size in shape)
+        raise UsageError(
+            f'agents["{name}"] has shape {values.shape}, not {wanted}', cure="see recording_from_arrays"
+        )
+    return values
+
+
+def _where(values: Array, valid: Array) -> Array:
+    """Zeros where not valid."""
+    return np.where(valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim)), values, 0.0)
+
+
+def _tracks(agents: Mapping[str, Any], ego: int, needs_height: bool) -> Tracks:
+    valid = _array(agents, "valid", bool, (None, None))
+    count, steps = valid.shape
+    xy = _where(_array(agents, "xy", float, (count, steps, 2)), valid)
+    if not 0 <= ego < count:
+        raise UsageError(f"ego is {ego}, there are {count} agents", cure="give its row in agents")
+    kind = np.array(_kinds(agents, count), np.int8)
+    size = _where(_sizes(agents, count, steps), valid)
+    if "velocity" in agents:
+        velocity = _where(_array(agents, "velocity", float, (count, steps, 2)), valid)
+    else:
+        velocity = differentiate(xy, valid, np.arange(steps) * DT_S)
+    if "z" in agents:
+        z = _where(_array(agents, "z", float, (count, steps)), valid)
+    elif needs_height:
+        raise UsageError('the roads have heights, agents["z"] is missing', cure="give z of the box centres")
+    else:
+        default = np.array([DEFAULT_SIZES[AgentKind(code)][2] for code in kind])[:, None]
+        z = _where(np.where(size[..., 2] > 0, size[..., 2], default) / 2, valid)
+    return Tracks(
+        xy=xy,
+        z=z,
+        heading=_where(_array(agents, "heading", float, (count, steps)), valid),
+        velocity=velocity,
+        size=size,
+        valid=valid,
+        kind=kind,
+        track_id=_array(agents, "id", np.int64, (count,)) if "id" in agents else np.arange(count),
+    )
+
+
+def _kinds(agents: Mapping[str, Any], count: int) -> list[AgentKind]:
+    given = agents.get("kind", ["vehicle"] * count)
+    if isinstance(given, str) or len(given) != count:
+        raise UsageError(f'agents["kind"] has {len(given)} entries, not {count}', cure="give one per agent")
+    return [_named(kind, _KINDS, AgentKind, f'agents["kind"][{row}]') for row, kind in enumerate(given)]
+
+
+def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
+    """Box sizes of every step; zeros, for which the class gives a size, where there are none."""
+    if "size" not in agents:
+        return np.zeros((count, steps, 3))
+    if np.ndim(agents["size"]) == 3:
+        return _array(agents, "size", float, (count, steps, 3))
+    return np.repeat(_array(agents, "size", float, (count, 3))[:, None], steps, axis=1)
+
+
+def _named(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -> Any:
+    """A member of an enumeration, given as one, by its number, or by a word."""
+    try:
+        return names[value] if isinstance(value, str) or value is None else kinds(value)
+    except (KeyError, ValueError, TypeError) as error:
+        words = ", ".join(repr(name) for name in names)
+        raise UsageError(f"{what} is {value!r}", cure=f"use {words}") from error
+
+
+def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
+    """Lanes, edges, crosswalks and stop signs, numbered in this order."""
+    lanes = roads.get("lanes", ())
+    number = 0
+    for name, read in (
+        ("lanes", _lane),
+        ("edges", _edge),
+        ("crosswalks", _crosswalk),
+        ("stop_signs", _stop_sign),
+    ):
+        for row, given in enumerate(roads.get(name, ())):
+            yield read(number, given, f'roads["{name}"][{row}]', len(lanes))
+            number += 1
+
+
+def _points(given: Any, what: str, least: int) -> Array:
+    """Points with heights, 0 where the argument has none."""
+    try:
+        points = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"{what} is no array of points", cure="give (x, y) or (x, y, z) per point"
+        ) from error
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) < least:
+        raise UsageError(
+            f"{what} has shape {points.shape}", cure=f"give at least {least} rows of x, y or x, y, z"
+        )
+    if not np.isfinite(points).all():
+        raise UsageError(f"{what} has a point that is not finite", cure="leave it out")
+    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+
+
+def _lane(number: int, given: Any, what: str, lanes: int) -> MapFeature:
+    _known(given, _LANE_KEYS, what)
+    limit, width = given.get("limit_mps"), given.get("width_m")
+    return MapFeature(
+        feature_id=number,
+        kind=_named(given.get("kind", "surface"), _LANE_KINDS, RoadKind, f'{what}["kind"]'),
+        points=_points(given.get("points"), f'{what}["points"]', 2),
+        limit_mps=None if limit is None else float(limit),
+        width_m=None if width is None else float(width),
+        successors=_places(given.get("successors", ()), lanes, f'{what}["successors"]'),
+        left_neighbours=_places(given.get("left", ()), lanes, f'{what}["left"]'),
+        right_neighbours=_places(given.get("right", ()), lanes, f'{what}["right"]'),
+    )
+
+
+def _edge(number: int, given: Any, what: str, lanes: int) -> MapFeature:
+    return MapFeature(number, RoadKind.EDGE_BOUNDARY, _points(given, what, 2))
+
+
+def _crosswalk(number: int, given: Any, what: str, lanes: int) -> MapFeature:
+    return MapFeature(number, RoadKind.CROSSWALK, _points(given, what, 3))
+
+
+def _stop_sign(number: int, given: Any, what: str, lanes: int) -> MapFeature:
+    _known(given, ("point", "lanes"), what)
+    point = _points([given.get("point")], f'{what}["point"]', 1)
+    return MapFeature(number, RoadKind.STOP_SIGN, point, lanes=_places(given.get("lanes", ()), lanes, what))
+
+
+def _places(given: Any, lanes: int, what: str) -> tuple[int, ...]:
+    """Places in the sequence of lanes."""
+    rows = [given] if isinstance(given, int | np.integer) else list(given)
+    for row in rows:
+        if not isinstance(row, int | np.integer) or not 0 <= row < lanes:
+            raise UsageError(f"{what} names lane {row!r}, there are {lanes}", cure="count lanes from 0")
+    return tuple(int(row) for row in rows)
+
+
+def _light(given: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:
+    _known(given, _LIGHT_KEYS, what)
+    (lane,) = _places(given.get("lane", -1), len(lanes), f'{what}["lane"]')
+    states = list(given.get("states", ()))
+    if len(states) != steps:
+        raise UsageError(f'{what}["states"] has {len(states)} entries, not {steps}', cure="give one per step")
+    codes = [_named(state, _COLOURS, LightState, f'{what}["states"]') for state in states]
+    stop = given.get("stop_point")
+    point = lanes[lane].points[0] if stop is None else _points([stop], f'{what}["stop_point"]', 1)[0]
+    return Light(lane, point, np.array(codes, np.int8))
