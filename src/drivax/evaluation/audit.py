@@ -1,19 +1,38 @@
-"""The audit: a log replayed through the metrics. Whatever the expert does wrong is a defect of map or converter."""
+"""The audit: a log replayed through the metrics. Whatever the expert does wrong is a defect of map or converter.
+
+Steps at which the log does not know the ego are judged by nobody; :data:`~drivax.scenario.selection.FINDINGS` says
+what each finding means.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
-from drivax.evaluation.results import Results
-from drivax.evaluation.runner import BATCH, evaluate
-from drivax.planners.simple import Expert
+from drivax.evaluation.runner import BATCH
+from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.schema import Flag, Scenario
+from drivax.scenario.schema import CURRENT_STEP, Flag, Scenario
+from drivax.simulator.dynamics import bicycle
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.types import Facts, Frame, Scene, SimState, Surroundings
+from drivax.tasks.actions import ActionSpace
 
-Finding = dict[str, float | int | bool | None]
+Finding = dict[str, float | int | bool | str | None]
+
+#: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
+GOAL_M = 3.0
+_ACTIONS = ActionSpace()
+_READ = (
+    "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
+    "logged", "log_divergence_m",
+)  # fmt: skip
 
 
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
@@ -29,47 +48,139 @@ def _text(scenario: Scenario, name: str) -> str:
 
 
 def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
-    """Replays the logs of scenarios exactly; test splits without a future get an empty finding."""
+    """Replays the logs of scenarios exactly, from the current step to their end.
+
+    Args:
+        scenarios: All of one capacity.
+
+    Returns:
+        One finding each, by name. None stands for what cannot be said of a scenario (a route deviation without a
+        route); test splits without a future get only what needs no replay.
+    """
     usable = [scenario for scenario in scenarios if Flag.NO_FUTURE not in scenario.has]
-    if not usable:
-        return [{} for _ in scenarios]
-    findings = iter(
-        [row for first in range(0, len(usable), BATCH) for row in _replay(usable[first : first + BATCH])]
-    )
-    return [{} if Flag.NO_FUTURE in scenario.has else next(findings) for scenario in scenarios]
+    batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
+    replayed = iter([row for batch in batches for row in _replayed(batch)])
+    return [
+        (next(replayed) if Flag.NO_FUTURE not in scenario.has else {}) | _known(scenario)
+        for scenario in scenarios
+    ]
 
 
-def _replay(scenarios: Sequence[Scenario]) -> list[Finding]:
+def _known(scenario: Scenario) -> Finding:
+    """Findings that need no replay."""
+    flags = scenario.has
+    return {
+        "lights_seen": int((scenario.light_state >= 0).any(axis=0).sum()),
+        "default_sizes": Flag.DEFAULT_SIZES in flags,
+        "velocity": "differentiated" if Flag.DIFFERENTIATED_VELOCITY in flags else "measured",
+        "dt_jitter": Flag.JITTERED_TIME in flags,
+    }
+
+
+class _Watch:
+    """A task that only watches: nothing is learned, accumulated or ended, which keeps the program small."""
+
+    def motion(self, motion: Array, action: Array, length: Any) -> Array:
+        """The kinematic bicycle under the default action space."""
+        return bicycle(motion, *_ACTIONS.command(action, length))
+
+    def observe(self, bank: ScenarioBank, scene: Scene, agents: Any, frame: Frame) -> Mapping[str, Any]:
+        """Nothing."""
+        return {}
+
+    def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Array]:
+        """Nothing."""
+        return {}
+
+    def ended(self, bank: ScenarioBank, scene: Scene, facts: Facts) -> tuple[Array, Array]:
+        """Never."""
+        return jnp.zeros((), bool), jnp.zeros((), bool)
+
+    def episode_start(self) -> None:
+        """Nothing."""
+
+    def episode_add(self, episode: Any, state: SimState, final: Array) -> None:
+        """Nothing."""
+
+
+@partial(jax.jit, static_argnames="driven")
+def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) -> dict[str, Array]:
+    """Facts of every scenario at the current step and at every step after it.
+
+    Args:
+        bank: The scenarios.
+        index: Rows of the bank.
+        driven: Follow the log through the dynamics instead of putting ego where it was logged.
+
+    Returns:
+        ``[B, 81]`` each, by the names of ``simulator.types.Facts``.
+    """
+    simulator = Simulator(_Watch())
+
+    def one(state: SimState, _: None) -> tuple[SimState, dict[str, Array]]:
+        action = jnp.clip(expert_action(bank, state.scene, _ACTIONS), -1.0, 1.0)
+        if driven:
+            after, _transition = simulator.step(bank, state, action)
+        else:
+            logged = logged_motion(bank, state.scene, 1)
+            after, _transition = simulator.replay(bank, state, logged, action)
+        return after, _read(after.facts)
+
+    def episode(row: Array) -> dict[str, Array]:
+        start = simulator.reset(bank, row)
+        _, later = jax.lax.scan(one, start, None, length=bank.steps - 1 - CURRENT_STEP)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), _read(start.facts), later)
+
+    return jax.vmap(episode)(index)
+
+
+def _read(facts: Facts) -> dict[str, Array]:
+    return {name: getattr(facts, name) for name in _READ}
+
+
+def _replayed(scenarios: Sequence[Scenario]) -> list[Finding]:
     """Findings of one batch. It is filled up and not trimmed, so that one compiled program serves every batch."""
     filled = [*scenarios, *[scenarios[-1]] * (BATCH - len(scenarios))]
     bank = ScenarioBank.from_scenarios(filled, trim=False)
-    return _findings(evaluate(Expert(), bank, scenario_names(filled)))[: len(scenarios)]
+    series = jax.tree.map(np.asarray, replay(bank, jnp.arange(BATCH)))
+    return [
+        _findings(scenario, {name: values[row] for name, values in series.items()})
+        for row, scenario in enumerate(scenarios)
+    ]
 
 
-def _findings(results: Results) -> list[Finding]:
-    steps = results.motion.shape[1] - 1
-    rows: list[Finding] = []
-    for number in range(len(results)):
-        metric = {name: _number(values[number]) for name, values in results.metrics.items()}
-        rows.append(
-            {
-                "log_collides": bool(metric["collision"]),
-                "log_offroad_fraction": round(float(results.offroad_steps[number]) / steps, 4),
-                "first_offroad_step": _step(results.events["offroad"][number]),
-                "log_runs_red": None if metric["red_light"] is None else bool(metric["red_light"]),
-                "distance_m": metric["distance"],
-                "route_deviation_max_m": metric["route_deviation_max"],
-                "reached_goal": None if metric["reached_goal"] is None else bool(metric["reached_goal"]),
-                "ignored_overlaps": int(metric["ignored_overlaps"] or 0),
-                "clean": None if metric["accuracy"] is None else bool(metric["accuracy"]),
-            }
-        )
-    return rows
+def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Finding:
+    """Findings of one replay; entry 0 of the series is the current step, which only the first steps look at."""
+    flags, logged = scenario.has, series["logged"]
+    judged = logged.copy()
+    judged[0] = False
+    mapped = int(scenario.segment_blocks[2]) > 0
+    hit, off, red = (series[name] & judged for name in ("collision", "offroad", "red_light"))
+    deviation = series["route_deviation_m"][judged] if Flag.ROUTE in flags else np.zeros(0)
+    ran_red = bool(red.any()) if Flag.LIGHTS in flags else None
+    return {
+        "log_collides": bool(hit.any()),
+        "first_collision_step": _first(hit),
+        "log_offroad_fraction": _rounded(off[judged].mean(), 4) if mapped and judged.any() else None,
+        "first_offroad_step": _first(off) if mapped else None,
+        "first_onroad_step": _first(logged & ~series["offroad"] & ~series["left_map"]) if mapped else None,
+        "log_left_map": bool((series["left_map"] & judged).any()) if mapped else None,
+        "log_runs_red": ran_red,
+        "distance_m": _rounded(series["moved_m"][judged].sum()),
+        "route_deviation_mean_m": _rounded(deviation.mean()) if len(deviation) else None,
+        "route_deviation_max_m": _rounded(deviation.max()) if len(deviation) else None,
+        "route_reaches_goal": bool(series["goal_distance_m"][judged][-1] <= GOAL_M)
+        if len(deviation)
+        else None,
+        "ignored_overlaps": int(series["ignored"].max()),
+        "clean": not hit.any() and not off.any() and not ran_red if mapped else None,
+    }
 
 
-def _number(value: Any) -> float | None:
-    return round(float(value), 3) if np.isfinite(value) else None
+def _first(holds: np.ndarray[Any, Any]) -> int | None:
+    """Step of the log at which it holds first."""
+    return CURRENT_STEP + int(holds.argmax()) if holds.any() else None
 
 
-def _step(value: Any) -> int | None:
-    return int(value) if value >= 0 else None
+def _rounded(value: Any, digits: int = 3) -> float | None:
+    return round(float(value), digits) if np.isfinite(value) else None

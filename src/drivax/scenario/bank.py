@@ -42,7 +42,7 @@ class ScenarioBank:
         lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index, corridor flag of car-lane segments,
             sorted by cell. The corridor is the route's lanes and their same-direction neighbours.
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
-        grid_side: 1 drivable, -1 not, 0 unknown, for cells with no edge around.
+        grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.sides.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
         log_progress: Arc length of the logged ego along route 0.

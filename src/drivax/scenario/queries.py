@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.angles import wrap
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
+from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
 
 EDGE_CUTOFF_M = 3.0
 LANE_CUTOFF_M = 4.0
@@ -25,9 +26,14 @@ LANE_MARGIN_M = 0.2
 _FAR = 1e9
 
 
+def _grid_side(bank: ScenarioBank) -> int:
+    """Cells along one side of the grid."""
+    return round((bank.grid_edge.shape[1] - 1) ** 0.5)
+
+
 def _cell(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Int[Array, " 2"]:
     """Grid cell (x, y) of a point, clamped so that its 3 x 3 block lies in the grid."""
-    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    grid = _grid_side(bank)
     cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
     return jnp.clip(cell, 1, grid - 2)
 
@@ -83,7 +89,7 @@ def left_of_edges(
     Returns:
         Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
     """
-    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    grid = _grid_side(bank)
     rows, inside = _runs(bank.grid_edge, bank.edges, bank.edge_run, index, _cell(bank, index, centre), grid)
     squared, side = _to_segments(rows, points)
     squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
@@ -138,7 +144,7 @@ def around_lanes(
         points: Its corners.
         z: Its height.
     """
-    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    grid = _grid_side(bank)
     rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, centre), grid)
     inside = inside & (jnp.abs(rows[4] - z) <= LEVEL_M)
     squared, side = _to_segments(rows, jnp.concatenate([centre[None], points]))
@@ -190,7 +196,7 @@ def _corner_lanes(
     z: Float[Array, ""],
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """For a corner that its box's own cells may not reach: whether a lane is near, and whether it is outside all."""
-    grid = round((bank.grid_side.shape[1]) ** 0.5)
+    grid = _grid_side(bank)
     rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, point), grid)
     squared = _to_segments(rows, point[None])[0]
     squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
@@ -204,7 +210,7 @@ def offroad_distance(
 ) -> Float[Array, " P"]:  # fmt: skip
     """How far each point is beyond the nearest road edge, m: positive off the road, negative on it.
 
-    Without an edge within the cut-off the stored side of the point's grid cell decides, and without that the road
+    Without an edge within the cut-off the stored side of the point's side cell decides, and without that the road
     is where a lane centre is near; such points get plus or minus the cut-off.
     """
     if bank.long_ego:
@@ -212,13 +218,19 @@ def offroad_distance(
         left, known = (part[:, 0] for part in look(points))
     else:
         left, known = left_of_edges(bank, index, centre, points, z)
-    grid = round((bank.grid_side.shape[1]) ** 0.5)
-    cells = jnp.floor((points - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
-    inside = ((cells >= 0) & (cells < grid)).all(axis=1)
-    flat = jnp.clip(cells[:, 1] * grid + cells[:, 0], 0, grid * grid - 1)
-    stored = jnp.where(inside, bank.grid_side[index, flat], 0)
-    off = jnp.where(stored != 0, stored < 0, ~points_near_lane)
+    stored = _stored_side(bank, index, points)
+    off = jnp.where(stored != 0, stored == NOT_DRIVABLE, ~points_near_lane)
     return jnp.where(known, -left, jnp.where(off, EDGE_CUTOFF_M, -EDGE_CUTOFF_M))
+
+
+def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array, "P 2"]) -> Int[Array, " P"]:
+    """Code of the side cell of each point (``scenario.sides.packed``); 0 outside the grid."""
+    grid = round(bank.grid_side.shape[1] ** 0.5)
+    fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
+    inside = ((fine >= 0) & (fine < grid * SPLIT)).all(axis=1)
+    cell, part = jnp.clip(fine // SPLIT, 0, grid - 1), fine % SPLIT
+    word = bank.grid_side[index, cell[:, 1] * grid + cell[:, 0]]
+    return jnp.where(inside, (word >> (2 * (part[:, 1] * SPLIT + part[:, 0]))) & 3, 0)
 
 
 def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Bool[Array, ""]:

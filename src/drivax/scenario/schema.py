@@ -219,7 +219,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "grid_origin": ("f4", (2,)),
         "grid_edge": ("i2", (cells + 1,)),
         "grid_lane": ("i2", (cells + 1,)),
-        "grid_side": ("i1", (cells,)),  # 1 drivable, -1 not, 0 unknown; for cells without an edge in their 3 x 3 block
+        "grid_side": ("i4", (cells,)),  # drivable or not, 3 x 3 side cells per cell (scenario.sides.packed)
         # Observation polylines: pieces of at most 10 m, in order of rank.
         "road_xy": ("f4", (o, 2)),
         "road_direction": ("f4", (o, 2)),

@@ -1,11 +1,11 @@
-"""On which side of the road edges a grid cell lies, for places with no edge within the cut-off of the off-road test."""
+"""On which side of the road edges a place lies, for places with no edge within the cut-off of the off-road test."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int8, Int32
 
 from drivax.scenario.grid import Grid
 from drivax.scenario.segments import Segments
@@ -14,68 +14,84 @@ Array = np.ndarray[Any, Any]
 
 #: Nearer than this to an edge the edge itself decides (``scenario.queries.EDGE_CUTOFF_M``), m.
 CUTOFF_M = 3.0
-#: Samples of a cell are this far apart; edges are heard up to this distance, m.
-_SPACING_M, _REACH_M = 2.5, 20.0
+#: Side cells along one grid cell. Half the diagonal of a side cell must be below the cut-off: then no edge lies between
+#: the centre of a side cell and those of its points that are beyond the cut-off, and the centre speaks for all of them.
+SPLIT = 3
+#: Codes of a packed side cell; 0 is unknown.
+DRIVABLE, NOT_DRIVABLE = 1, 2
+#: Edges are heard up to this distance, m.
+_REACH_M = 20.0
 #: End points within this distance are one vertex, m.
 _JOINED_M = 0.01
 
 
 def cell_sides(
     grid: Grid, edges: Segments, lanes: Float[Array, "point 2"], rings_closed: bool
-) -> Int8[Array, " cell"]:
-    """Which cells are drivable where no edge is within the cut-off: 1 drivable, -1 not, 0 unknown.
+) -> Int32[Array, " cell"]:
+    """Which side cells are drivable where no edge is within the cut-off, packed per grid cell (see :func:`packed`).
 
-    Samples of a cell, 2.5 m apart, that are beyond the cut-off of every edge look at their nearest edge (drivable on
-    its left); points of lane centres there count as drivable. The cell has a side when all of them agree. An open
-    edge says nothing about what lies beyond its end. Cells that no edge reaches get a side from closed rings only.
+    The nearest edge of a cell's centre says so (drivable on its left). An open edge says nothing about what lies
+    beyond its end. Lane centres contradict cells that are not drivable. Grid cells that no edge reaches get a side
+    from closed rings only.
 
     Args:
-        grid: The grid.
+        grid: The grid; each of its cells has 3 x 3 side cells.
         edges: All road-edge segments, also those that were cropped away.
         lanes: Points of lane centres.
         rings_closed: Whether every road edge is a closed ring.
     """
-    side = np.zeros(grid.side**2, dtype=np.int8)
+    fine = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
     if not len(edges):
-        return side
-    count = round(grid.cell_m / _SPACING_M)
-    size = grid.side * count + 1
-    sign, distance = _nearest_sides(grid, edges, size)
-    sign = np.where(distance > CUTOFF_M, sign, 0)
-    blind = ((distance <= _REACH_M) & (distance > CUTOFF_M) & (sign == 0)).reshape(size, size)
-    drivable, not_drivable = (sign > 0).reshape(size, size), (sign < 0).reshape(size, size)
-    on_lane = _lanes_beyond(grid, lanes, distance, size)
-    yes = _any_in_cell(drivable, grid.side, count).ravel() | on_lane
-    no = _any_in_cell(not_drivable, grid.side, count).ravel()
-    undecided = _any_in_cell(blind, grid.side, count).ravel()
-    side[yes & ~no & ~undecided] = 1
-    side[no & ~yes & ~undecided] = -1
+        return np.zeros(grid.side**2, dtype=np.int32)
+    side, distance = _nearest_sides(fine, edges.take(_in_reach(grid, edges)))
+    lane_cells = fine.cell(lanes[fine.contains(lanes)])
+    contradicted = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
+    side[contradicted] = 0
     if rings_closed:
-        within = _sides_within_rings(grid, edges)
+        square = _sides_within_rings(grid, edges).reshape(grid.side, grid.side)
+        within = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
         side = np.where(within != 0, within, side)
-    return side
+    return packed(side.reshape(fine.side, fine.side))
 
 
-def _nearest_sides(
-    grid: Grid, edges: Segments, size: int
-) -> tuple[Int[Array, " sample"], Float[Array, " sample"]]:
-    """Side of the nearest edge (0: none in reach, or beyond its open end) and distance to it, of every sample."""
-    reach = int(_REACH_M / _SPACING_M)
+def packed(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
+    """Sides (1 drivable, -1 not, 0 unknown) of the 3 x 3 side cells of every grid cell in one number.
+
+    Two bits for each, row by row from the lowest: 0 unknown, 1 drivable, 2 not drivable.
+    """
+    count = len(side) // SPLIT
+    blocks = side.reshape(count, SPLIT, count, SPLIT).swapaxes(1, 2).reshape(count * count, SPLIT * SPLIT)
+    codes = np.where(blocks < 0, NOT_DRIVABLE, blocks).astype(np.int32)
+    return np.bitwise_or.reduce(codes << np.arange(0, 2 * SPLIT * SPLIT, 2, dtype=np.int32), axis=1)
+
+
+def _in_reach(grid: Grid, edges: Segments) -> Bool[Array, " segment"]:
+    """Edges that a cell of the grid may hear; a source may hold a whole city's."""
+    reach = _REACH_M + grid.cell_m
+    middle = (edges.a[:, :2] + edges.b[:, :2]) / 2 - grid.origin
+    return np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
+
+
+def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Float[Array, " cell"]]:
+    """Side of the nearest edge (0: none in reach, or beyond its open end) and distance to it, of every cell centre."""
+    size, width = fine.side, fine.cell_m
+    reach = int(np.ceil(_REACH_M / width))
     steps = np.arange(-reach, reach + 1)
     dx, dy = (part.ravel() for part in np.meshgrid(steps, steps))
-    a, b = edges.a[:, :2] - grid.origin, edges.b[:, :2] - grid.origin
-    base = np.round((a + b) / (2 * _SPACING_M)).astype(np.int64)
+    a, b = edges.a[:, :2] - fine.origin, edges.b[:, :2] - fine.origin
+    base = np.floor((a + b) / (2 * width)).astype(np.int64)
     column, row = base[:, :1] + dx, base[:, 1:] + dy
     inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
-    # Samples outside the grid share one place behind the others.
-    sample = np.where(inside, row * size + column, size * size)
-    squared = _squared_distances(column * _SPACING_M, row * _SPACING_M, a, b)
+    # Cells outside the grid share one place behind the others.
+    cell = np.where(inside, row * size + column, size * size)
+    x, y = (column + 0.5) * width, (row + 0.5) * width
+    squared = _squared_distances(x, y, a, b)
     nearest = np.full(size * size + 1, np.inf)
-    np.minimum.at(nearest, sample.ravel(), squared.ravel())
-    segment, place = np.nonzero(inside & (squared <= nearest[sample] * (1 + 1e-6) + 1e-6))
-    at = sample[segment, place]
+    np.minimum.at(nearest, cell.ravel(), squared.ravel())
+    segment, place = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
+    at = cell[segment, place]
     u = b[segment] - a[segment]
-    w = np.stack([column[segment, place], row[segment, place]], axis=-1) * _SPACING_M - a[segment]
+    w = np.stack([x[segment, place], y[segment, place]], axis=-1) - a[segment]
     length = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-6)
     along = (u * w).sum(axis=1) / length**2
     left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
@@ -98,38 +114,23 @@ def _squared_distances(
     u = b - a
     squared = np.maximum((u * u).sum(axis=1), 1e-12)[:, None]
     x, y = x - a[:, :1], y - a[:, 1:]
-    along = np.clip((x * u[:, :1] + y * u[:, 1:]) / squared, 0.0, 1.0)
-    return (x - along * u[:, :1]) ** 2 + (y - along * u[:, 1:]) ** 2
+    along = x * (u[:, :1] / squared)
+    along += y * (u[:, 1:] / squared)
+    np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)
+    x -= along * u[:, :1]
+    y -= along * u[:, 1:]
+    x *= x
+    y *= y
+    x += y
+    return x
 
 
 def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:
     """Whether nothing ends where a segment begins, and whether nothing begins where it ends."""
     both = np.round(np.concatenate((a, b)) / _JOINED_M).astype(np.int64)
-    name = np.unique(both, axis=0, return_inverse=True)[1].ravel()
+    name = both[:, 0] * 2**32 + both[:, 1]  # edges in reach of a grid are few kilometres from its corner
     first, last = name[: len(a)], name[len(a) :]
     return ~np.isin(first, last), ~np.isin(last, first)
-
-
-def _lanes_beyond(
-    grid: Grid, lanes: Float[Array, "point 2"], distance: Float[Array, " sample"], size: int
-) -> Bool[Array, " cell"]:
-    """Cells with a lane centre that is beyond the cut-off of every edge (as its nearest sample tells)."""
-    here = lanes[grid.contains(lanes)]
-    at = np.round((here - grid.origin) / _SPACING_M).astype(np.int64)
-    # A sample is at most 1.8 m away from the point that it stands for.
-    far = distance[at[:, 1] * size + at[:, 0]] > CUTOFF_M + _SPACING_M
-    cells = np.zeros(grid.side**2, dtype=bool)
-    cells[grid.cell(here[far])] = True
-    return cells
-
-
-def _any_in_cell(samples: Bool[Array, "row column"], side: int, count: int) -> Bool[Array, "side side"]:
-    """Whether any sample of a cell holds, its border included."""
-    result = np.zeros((side, side), dtype=bool)
-    for dy in range(count + 1):
-        for dx in range(count + 1):
-            result |= samples[dy : dy + side * count : count, dx : dx + side * count : count]
-    return result
 
 
 def _sides_within_rings(grid: Grid, edges: Segments) -> Int8[Array, " cell"]:

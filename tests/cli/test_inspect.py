@@ -1,0 +1,163 @@
+"""``drivax inspect``: one set in full, several side by side, filters, JSON and the page with histograms."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivax.cli import main
+from drivax.scenario.assemble import assemble
+from drivax.scenario.schema import CAPACITIES
+from drivax.scenario.store import ScenarioWriter
+from drivax.show.inspection import Inspection
+from drivax.show.inspection_tables import finding_text
+from scenes import car, straight_road
+
+COLUMNS = 100
+
+
+def write(path, places, clean):
+    """A set of one scenario per place: k others, ego drives 8 k metres, the audit as given."""
+    with ScenarioWriter(path, CAPACITIES["default"]) as writer:
+        for k, (place, good) in enumerate(zip(places, clean, strict=True)):
+            cars = [car(0, 0, 0, k), *(car(10 + 10 * i, 3.7, 0, 0) for i in range(k))]
+            tags = {} if place is None else {"place": place}
+            recording = replace(straight_road(cars), scenario_id=f"s{k}", segment=f"rec{k // 2}", tags=tags)
+            audit = {
+                "log_collides": not good,
+                "distance_m": 8.0 * k,
+                "first_offroad_step": None,
+                "clean": good,
+            }
+            scenario = replace(assemble(recording), audit=audit)
+            writer.add(replace(scenario, tags={**scenario.tags, "fleet": "a" if k else "b"}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inspect")
+    one = write(folder / "one", ["boston", "boston", "pittsburgh", None], [True, True, True, False])
+    two = write(folder / "two", ["singapore", "singapore"], [True, True])
+    return one, two
+
+
+@pytest.fixture
+def inspect(capsys):
+    def call(*words, status=0):
+        assert main(["inspect", *map(str, words)]) == status
+        captured = capsys.readouterr()
+        return captured.err if status else captured.out
+
+    return call
+
+
+def cells(text, name):
+    """The rest of the line that begins with ``name``, its runs of spaces joined."""
+    (line,) = [line for line in text.splitlines() if line.startswith(f"{name} ")]
+    return " ".join(line.removeprefix(name).split())
+
+
+def test_one_set_in_full(sets, inspect):
+    out = inspect(sets[0])
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert cells(out, "scenarios") == "4 (recorded segments: 2, shards: 1)"
+    assert cells(out, "place") == "boston (2 of 4), pittsburgh (1 of 4)"
+    assert cells(out, "duration") == "0.60 min at 10 Hz"  # 4 times 9.0 s
+    assert cells(out, "integrity") == "every checksum is right"
+    assert cells(out, "log_collides") == "1 of 4 (25 %) 4"
+    assert cells(out, "distance_m") == "mean 12, median 12, most 24 4"
+    assert "first_offroad_step" not in out
+    assert cells(out, "s3").split()[:3] == ["91", "4", "4"]
+
+
+def test_metres_are_not_summed():
+    assert finding_text([1.0, 2.0, 6.0]) == "mean 3, median 2, most 6"
+    assert finding_text([True, False, True, True]) == "3 of 4 (75 %)"
+    assert (
+        finding_text(["measured", "measured", "differentiated"])
+        == "differentiated (1 of 3), measured (2 of 3)"
+    )
+
+
+def test_several_sets_side_by_side(sets, inspect):
+    out = inspect(*sets)
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert out.split()[:2] == ["one", "two"]
+    assert cells(out, "scenarios") == "4 2"
+    assert cells(out, "recordings") == "2 1"
+    assert cells(out, "places") == "boston, pittsburgh singapore"
+    assert cells(out, "rate") == "10 Hz 10 Hz"
+    assert cells(out, "duration") == "0.60 min 0.30 min"
+    assert cells(out, "agents now") == "2.50 1.50"
+    assert cells(out, "lanes") == "3 3"
+    assert cells(out, "ego drives, m") == "12 4"
+    assert cells(out, "log_collides") == "25 % 0 %"
+    assert cells(out, "fleet a") == "75 % 50 %"
+
+
+def test_many_sets_still_fit_the_terminal(sets, inspect):
+    out = inspect(*sets, *sets, *sets)
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert len([line for line in out.splitlines() if line.startswith("scenarios ")]) == 2
+
+
+def test_filters(sets, inspect):
+    out = inspect(sets[0], "--filter", "place=boston|pittsburgh", "--filter", "audit.distance_m>0")
+    assert cells(out, "scenarios") == "2 of 4 (recorded segments: 2, shards: 1)"
+    assert "1 do not know what 'place=boston|pittsburgh' asks for" in out
+    assert cells(out, "distance_m") == "mean 12, median 12, most 16 2"
+    chosen = json.loads(inspect(sets[0], "--json", "--filter", "agents>=3"))
+    assert [row["scenario_id"] for row in chosen["scenarios"]] == ["s2", "s3"]
+    line = inspect(sets[0], "--filter", "place=singapore", status=1)
+    assert len(line.splitlines()) == 1 and "none of 4 scenarios has place=singapore (1 lack" in line
+    line = inspect(sets[0], "--filter", "plce=singapore", status=2)
+    assert len(line.splitlines()) == 1 and "did you mean 'place'?" in line
+
+
+def test_json_of_one_set_and_of_several(sets, inspect):
+    one = json.loads(inspect(sets[0], "--json"))
+    both = json.loads(inspect(*sets, "--json"))
+    assert list(one) == ["scenarios"] and len(one["scenarios"]) == 4
+    assert [row["set"] for row in both] == [str(path) for path in sets]
+    assert both[0]["scenarios"] == one["scenarios"] and len(both[1]["scenarios"]) == 2
+
+
+def test_page(sets, inspect, tmp_path):
+    page = tmp_path / "page.html"
+    assert inspect(*sets, "--html", page).split() == [str(page)]
+    text = page.read_text()
+    assert "<svg" in text and "boston" in text and "speed of ego" in text
+    again = inspect(*sets, "--html", page, status=2)
+    assert "--overwrite" in again and len(again.splitlines()) == 1
+    inspect(*sets, "--html", page, "--overwrite")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "status"),
+    [
+        ([], "no scenario set", 2),
+        (["ONE", "--json", "--html", "x.html"], "exclude", 2),
+        (["gone"], "gone", 1),
+    ],
+)
+def test_wrong_calls_get_one_line(words, said, status, sets, inspect):
+    line = inspect(*(sets[0] if word == "ONE" else word for word in words), status=status)
+    assert said in line and len(line.splitlines()) == 1
+
+
+def test_a_sample_is_spread_evenly(sets, monkeypatch):
+    from drivax.scenario.selection import Selection
+    from drivax.show import inspection
+
+    one = Inspection.open(sets[0], Selection())
+    assert [scenario.id for scenario in one.sample()] == ["s0", "s1", "s2", "s3"]
+    monkeypatch.setattr(inspection, "SAMPLE", 2)
+    assert [scenario.id for scenario in one.sample()] == ["s0", "s3"]
+    speeds = inspection.speeds(one)
+    assert speeds.scenarios == 2
+    np.testing.assert_allclose(speeds.ego, [0.0] * 91 + [3.0] * 91, atol=1e-5)

@@ -1,0 +1,201 @@
+"""The audit against hand-worked scenes, and against the evaluation of the exact expert."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivax.api import load
+from drivax.datasets.formats import detect, find_files
+from drivax.datasets.reader import BadRecord
+from drivax.evaluation.audit import audit
+from drivax.evaluation.runner import BATCH, evaluate
+from drivax.planners.simple import Expert
+from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.recording import Light
+from drivax.scenario.schema import CURRENT_STEP, Flag, LightState
+from drivax.scenario.selection import FINDINGS
+from drivax.synthetic.world import generate_recording
+from scenes import GREEN, RED, car, straight_road
+
+
+def audited(*recordings):
+    return audit([assemble(recording) for recording in recordings])
+
+
+@pytest.fixture(scope="module")
+def world():
+    return load([assemble(generate_recording(9, i)) for i in range(6)])
+
+
+@pytest.fixture(scope="module")
+def found(world):
+    return audit(world.scenarios)
+
+
+def test_every_finding_is_one_that_filters_know(found):
+    kinds = {"truth": bool, "number": int | float, "word": str}
+    for finding in found:
+        assert set(finding) == set(FINDINGS)
+        for name, value in finding.items():
+            quantity = FINDINGS[name]
+            assert value is None or isinstance(value, kinds[quantity.kind])
+            assert not quantity.words or value in quantity.words
+
+
+def test_it_agrees_with_the_evaluation_of_the_expert(world, found):
+    results = evaluate(Expert(), world.bank, world.names)
+    for row, finding in enumerate(found):
+        metric = {name: values[row] for name, values in results.metrics.items()}
+        assert finding["log_collides"] == (metric["collision"] > 0)
+        assert finding["log_left_map"] == (metric["left_map"] > 0)
+        assert finding["clean"] == (metric["accuracy"] > 0)
+        assert finding["log_offroad_fraction"] == pytest.approx(results.offroad_steps[row] / 80, abs=1e-4)
+        assert finding["distance_m"] == pytest.approx(metric["distance"], abs=1e-2)
+        assert finding["route_deviation_mean_m"] == pytest.approx(metric["route_deviation_mean"], abs=1e-2)
+        assert finding["route_deviation_max_m"] == pytest.approx(metric["route_deviation_max"], abs=1e-2)
+        assert finding["route_reaches_goal"] == (metric["goal_distance"] <= 3.0)
+
+
+def test_companions_and_batches_change_nothing(world, found):
+    scenarios = list(world.scenarios)
+    assert audit(scenarios * 12) == found * 12 and len(found) * 12 > BATCH
+    assert audit(scenarios[::-1]) == found[::-1]
+    assert audit([]) == []
+
+
+def test_a_collision_is_dated():
+    # Bumper to bumper 30 - 4.8 = 25.2 m at 8 m/s: 3.15 s after the current step, so seen at the 32nd step after it.
+    (finding,) = audited(straight_road([car(0, 0, 0, 8), car(30, 0, 0, 0)]))
+    assert (finding["log_collides"], finding["first_collision_step"]) == (True, CURRENT_STEP + 32)
+    assert finding["clean"] is False and finding["log_offroad_fraction"] == 0.0
+
+
+def test_who_overlaps_at_first_is_ignored_and_counted():
+    (finding,) = audited(straight_road([car(0, 0, 0, 5), car(1, 0.5, 0, 5)]))
+    assert finding["ignored_overlaps"] == 1 and finding["clean"] is True
+
+
+def test_leaving_and_entering_the_road_are_dated():
+    # The edge is at y = -1.85, tolerance 0.3 m. A car of 4.8 x 2.0 m that points along the road and slides across it
+    # has its corners at y -+ 1.0: off the road while y < -1.15.
+    def slides(y, speed):
+        across = car(0, y, np.pi / 2, speed)
+        return straight_road([{**across, "heading": np.zeros(91)}])
+
+    # Nothing is mapped below the edge: a centre below y = -1.85 has left the map, which is counted apart.
+    # y = -0.525 - 0.05 k: off the road for k = 13 to 26. y = -2.975 + 0.05 k: off it for k = 23 to 36, then on it.
+    leaves, enters = audited(slides(-0.525, -0.5), slides(-2.975, 0.5))
+    assert leaves["first_offroad_step"] == CURRENT_STEP + 13
+    assert leaves["log_offroad_fraction"] == 14 / 80
+    assert leaves["first_onroad_step"] == CURRENT_STEP
+    assert enters["first_offroad_step"] == CURRENT_STEP + 23
+    assert enters["first_onroad_step"] == CURRENT_STEP + 37
+    assert enters["log_offroad_fraction"] == 14 / 80
+    assert leaves["log_left_map"] is True and enters["log_left_map"] is True
+    assert leaves["clean"] is enters["clean"] is False
+
+
+def test_distance_and_distance_to_the_route():
+    (finding,) = audited(straight_road([car(0, 0.6, 0, 10)]))
+    assert finding["distance_m"] == pytest.approx(80.0, abs=0.05)
+    assert finding["route_deviation_mean_m"] == pytest.approx(0.6, abs=0.02)
+    assert finding["route_deviation_max_m"] == pytest.approx(0.6, abs=0.02)
+    assert finding["route_reaches_goal"] is True
+
+
+def test_a_route_that_ends_elsewhere_does_not_reach_the_goal():
+    # The route is given along lanes 1 and 3; the log drives away from them at 45 degrees for 8 s.
+    recording = straight_road([car(0, 0, np.pi / 4, 6)])
+    (finding,) = audited(recording)
+    assert finding["route_reaches_goal"] is False
+    assert finding["route_deviation_max_m"] == pytest.approx(8 * 6 * np.sin(np.pi / 4), abs=0.2)
+
+
+def test_what_the_log_does_not_know_is_not_judged():
+    # Ego is lost after step 30; another car later drives through the place where it was seen last.
+    seen = straight_road([car(0, 0, 0, 8), car(-60, 0, 0, 20)])
+    gone = straight_road([car(0, 0, 0, 8, steps=range(31)), car(-60, 0, 0, 20, steps=range(91))])
+    whole, part = audited(seen, gone)
+    assert whole["log_collides"] is True
+    assert part["log_collides"] is False and part["clean"] is True
+    assert part["distance_m"] == pytest.approx(16.0, abs=0.05)
+
+
+def test_red_lights_count_only_where_lights_are_known():
+    red, green, none = (straight_road([car(0, 0, 0, 10)], light=state) for state in (RED, GREEN, None))
+    found = audited(red, green, replace(none, flags=none.flags & ~Flag.LIGHTS))
+    assert [finding["log_runs_red"] for finding in found] == [True, False, None]
+    assert [finding["lights_seen"] for finding in found] == [1, 1, 0]
+    assert [finding["clean"] for finding in found] == [False, True, True]
+
+
+def test_lights_that_nobody_observed_are_not_seen():
+    recording = straight_road([car(0, 0, 0, 0)], light=GREEN)
+    unseen = Light(1, np.array([20.0, 0.0, 0.0]), np.full(91, LightState.UNOBSERVED, np.int8))
+    (finding,) = audited(replace(recording, lights=(*recording.lights, unseen)))
+    assert finding["lights_seen"] == 1
+
+
+def test_sources_of_sizes_velocities_and_time():
+    plain = straight_road([car(0, 0, 0, 8)])
+    flags = Flag.DEFAULT_SIZES | Flag.DIFFERENTIATED_VELOCITY
+    times = np.arange(91) * 0.1
+    times[40] += 0.003
+    rough = replace(plain, flags=plain.flags | flags, timestamps_s=times)
+    one, other = audited(plain, rough)
+    names = ("default_sizes", "velocity", "dt_jitter")
+    assert [one[name] for name in names] == [False, "measured", False]
+    assert [other[name] for name in names] == [True, "differentiated", True]
+
+
+def test_without_a_map_nothing_is_said_about_it():
+    recording = straight_road([car(0, 0, 0, 8)])
+    (finding,) = audited(replace(recording, features=(), route_lanes=(), flags=Flag.NONE))
+    unknown = {name for name, value in finding.items() if value is None and not name.startswith("first_coll")}
+    assert unknown == {
+        "log_offroad_fraction", "first_offroad_step", "first_onroad_step", "log_left_map", "log_runs_red", "clean",
+        "route_deviation_mean_m", "route_deviation_max_m", "route_reaches_goal",
+    }  # fmt: skip
+    assert finding["log_collides"] is False and finding["distance_m"] == pytest.approx(64.0, abs=0.05)
+
+
+def test_a_test_split_gets_what_needs_no_replay():
+    recording = straight_road([car(0, 0, 0, 8)], light=GREEN)
+    tracks = recording.tracks
+    part = {
+        name: getattr(tracks, name)[:, :11] for name in ("xy", "z", "heading", "velocity", "size", "valid")
+    }
+    lights = tuple(replace(light, states=light.states[:11]) for light in recording.lights)
+    short = replace(
+        recording, scenario_id="short", timestamps_s=recording.timestamps_s[:11], tracks=replace(tracks, **part),
+        lights=lights,
+    )  # fmt: skip
+    one, other = audited(short, recording)
+    assert one == {"lights_seen": 1, "default_sizes": False, "velocity": "measured", "dt_jitter": False}
+    assert set(other) == set(FINDINGS)
+
+
+def test_a_level_above_is_no_collision():
+    # The overpass: another car crosses ego's way 6 m higher.
+    recording = straight_road([car(0, 0, 0, 8), car(32, -32, np.pi / 2, 8)])
+    z = np.zeros((2, 91))
+    z[1] = 6.0
+    above = replace(recording, tracks=replace(recording.tracks, z=z))
+    same, other = audited(recording, above)
+    assert same["log_collides"] is True and other["log_collides"] is False
+
+
+def test_the_ego_of_every_real_file_is_clean(real_data):
+    """No collision, at most 1 % of the steps off the road, no false finding through z on the overpass."""
+    scenarios = []
+    for file in find_files(real_data)[0]:
+        for recording in detect(file).read(file):
+            assert not isinstance(recording, BadRecord), recording
+            scenarios += [assemble(window) for window in windows(recording)]
+    assert len({bytes(scenario.segment[()]) for scenario in scenarios}) >= 10
+    for scenario, finding in zip(scenarios, audit(scenarios), strict=True):
+        assert finding["log_collides"] is False, scenario.id
+        assert finding["log_offroad_fraction"] <= 0.01, scenario.id
+        assert finding["clean"] is True and finding["log_left_map"] is False, scenario.id
+        assert finding["first_onroad_step"] == CURRENT_STEP, scenario.id
