@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import gzip
+import importlib
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
-from drivax.datasets.formats import READERS, detect, find_files, reader_named
+from datasets import samples
+from drivax.datasets.convert import convert
+from drivax.datasets.formats import READERS, detect, find_files, reader_named, survey
+from drivax.datasets.womd_scenario import WomdScenario
 from drivax.errors import DataError, UsageError
 
 
@@ -15,19 +21,95 @@ def test_content_decides_not_the_name(wire, write_records):
     assert detect(write_records("scenario.bin", wire.example())).name == "womd-example"
 
 
-def test_each_reader_recognises_only_its_own(wire, write_records, tmp_path):
+SAMPLES = sorted(path.stem for path in Path(samples.__file__).parent.glob("[a-z]*.py"))
+
+
+def test_every_reader_has_a_sample():
+    assert {reader.name.replace("-", "_") for reader in READERS} == set(SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory):
+    """Where the sample of every format lies: its own folder, and the file that is read."""
+    folder = tmp_path_factory.mktemp("samples")
+    paths = {}
+    for name in SAMPLES:
+        (folder / name).mkdir()
+        paths[name] = importlib.import_module(f"datasets.samples.{name}").write(folder / name)
+    return folder, paths
+
+
+def test_each_reader_recognises_only_its_own(sampled, write_records, tmp_path):
+    """Not the other formats' files, their companions, or what is no recording at all."""
     (tmp_path / "text").write_text("no recording")
     (tmp_path / "empty").touch()
-    files = {
-        "womd-scenario": write_records("s", wire.scenario()),
-        "womd-example": write_records("e", wire.example()),
-        "": write_records("o", b"\x0a\x03abc"),
-        "text": tmp_path / "text",
-        "empty": tmp_path / "empty",
-        "missing": tmp_path / "missing",
-    }
+    others = [
+        write_records("o", b"\x0a\x03abc"),
+        tmp_path / "text",
+        tmp_path / "empty",
+        tmp_path / "missing",
+        tmp_path,
+    ]
+    files = [path for path in sorted(sampled[0].rglob("*")) if path.is_file()] + others
     for reader in READERS:
-        assert [name for name, path in files.items() if reader.recognise(path)] == [reader.name]
+        assert [path for path in files if reader.recognise(path)] == [
+            sampled[1][reader.name.replace("-", "_")]
+        ]
+
+
+def test_a_mixed_folder_is_sorted_by_content(sampled):
+    """Companions (maps, poses, tables) are neither recordings nor ignored files."""
+    found = survey(sampled[0])
+    assert {one.path: one.format for one in found.inputs} == {
+        path: name.replace("_", "-") for name, path in sampled[1].items()
+    }
+    every = sum(path.is_file() for path in sampled[0].rglob("*"))
+    assert found.ignored == 0 and found.companions == every - len(READERS) > 0
+    assert find_files(sampled[0]) == ([one.path for one in found.inputs], 0)
+
+
+def test_names_are_relative_to_what_was_given(sampled, tmp_path):
+    found = survey(sampled[0])
+    assert "gpudrive/tfrecord-00000-of-01000_1.json" in {found.relative(one.path) for one in found.inputs}
+    assert found.relative(tmp_path / "elsewhere" / "map.json") == "map.json"
+    one = survey(sampled[1]["gpudrive"])
+    assert one.relative(sampled[1]["gpudrive"]) == "tfrecord-00000-of-01000_1.json"
+
+
+def test_sensor_data_is_not_opened(tmp_path, wire, write_records, monkeypatch):
+    """Camera images and sweeps lie beside nuScenes' tables by the hundred thousand."""
+    good = write_records("a.tfrecord", wire.scenario())
+    for name in ("image.JPG", "sweep.pcd.bin", "blob.png"):
+        (tmp_path / name).write_bytes(b"content")
+    asked = []
+    monkeypatch.setattr(
+        "drivax.datasets.formats.recognise", lambda path: asked.append(path) or WomdScenario()
+    )
+    found = survey(tmp_path)
+    assert asked == [good] and found.ignored == 3
+
+
+def test_a_missing_extra_is_told_for_the_files_that_need_it_only(sampled, tmp_path, monkeypatch):
+    def fail():
+        raise UsageError("reading TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'")
+
+    monkeypatch.setattr("drivax.datasets.tfrecord._crc32c", fail)
+    others = survey(sampled[0]).formats - Counter({"womd-scenario": 9})
+    assert set(others) == {name.replace("_", "-") for name in SAMPLES if not name.startswith("womd")} - {
+        "scenariomax"
+    }
+    convert(sampled[1]["gpudrive"], tmp_path / "set")
+    with pytest.raises(UsageError, match=r"drivax\[womd\]"):
+        convert(sampled[1]["womd_example"], tmp_path / "other")
+    noise = tmp_path / "noise"
+    noise.write_bytes(bytes(range(1, 99)))
+    assert detect_error(noise).cure == "pip install 'drivax[womd]'"
+
+
+def detect_error(path):
+    with pytest.raises(DataError) as caught:
+        detect(path)
+    return caught.value
 
 
 def test_first_record_may_be_damaged(wire, tmp_path):
@@ -43,7 +125,8 @@ def test_first_record_may_be_damaged(wire, tmp_path):
     [
         (b"", "empty"),
         (gzip.compress(b"some shard" * 50), "gzip-compressed"),
-        (b"PK\x03\x04" + bytes(60), "not a TFRecord file"),
+        (b"PK\x03\x04" + bytes(60), "zip archive"),
+        (bytes(range(1, 99)), "not a TFRecord file"),
         (None, "No such file"),
     ],
 )
@@ -58,14 +141,14 @@ def test_unrecognised_files_say_why(content, problem, tmp_path):
 
 def test_other_tfrecords_say_what_drivax_reads(wire, write_records):
     images = wire.blob(1, wire.entry("image/encoded", wire.blob(1, wire.blob(1, b"jpeg"))))
-    with pytest.raises(DataError, match=r"does not know.*womd-scenario, womd-example"):
+    with pytest.raises(DataError, match=r"without the features of motion data.*motion data set"):
         detect(write_records("images.tfrecord", images))
 
 
 def test_unknown_format_suggests():
     with pytest.raises(UsageError, match="did you mean 'womd-scenario'"):
         reader_named("womd_scenario")
-    with pytest.raises(UsageError, match="use one of auto, womd-scenario"):
+    with pytest.raises(UsageError, match=r"use one of auto, av2-motion, .*womd-scenario"):
         reader_named("parquet")
 
 
@@ -82,7 +165,7 @@ def test_folder_is_searched_to_any_depth_in_order(wire, write_records, tmp_path)
 
 
 def test_folder_without_recordings(tmp_path):
-    (tmp_path / "a.parquet").write_bytes(b"PAR1")
+    (tmp_path / "a.csv").write_bytes(b"1,2")
     with pytest.raises(DataError, match="none of the 1 files") as caught:
         find_files(tmp_path)
     assert caught.value.file == tmp_path and caught.value.cure

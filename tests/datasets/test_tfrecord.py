@@ -9,7 +9,7 @@ import zlib
 
 import pytest
 
-from drivax.datasets.tfrecord import masked, read_records
+from drivax.datasets.tfrecord import count_records, looks_framed, masked, read_records
 from drivax.errors import DataError, UsageError
 
 PAYLOADS = (b"first", b"", b"third record", b"x" * 300)
@@ -101,11 +101,40 @@ def test_other_file(read):
 
 
 @pytest.mark.parametrize("length", [2**31 - 1, 2**31, 2**62, 2**64 - 1])
-def test_huge_length_is_not_allocated(length, good, read, wire):
+def test_18_huge_length_is_not_allocated(length, good, read, wire):
+    """Check-list 18, size limits: a length is compared with the file's size before anything is read."""
     header = struct.pack("<Q", length)
     records, _ = read(good + header + wire.masked_crc(header) + b"some bytes")
     number, error = one_error(records)
     assert number == len(PAYLOADS) and "truncated" in str(error)
+
+
+def test_counts_by_lengths_alone(good, tmp_path, wire):
+    path = tmp_path / "some.tfrecord"
+    path.write_bytes(good)
+    assert count_records(path) == len(PAYLOADS)
+    path.write_bytes(good[:-1])
+    assert count_records(path) == len(PAYLOADS) - 1  # the last one is cut off
+    header = struct.pack("<Q", 2**63)
+    path.write_bytes(good + header + wire.masked_crc(header) + bytes(40))
+    assert count_records(path) == len(PAYLOADS)
+    path.write_bytes(b"")
+    assert count_records(path) == count_records(tmp_path / "none") == count_records(tmp_path) == 0
+
+
+def test_framing_is_told_by_the_first_header(good, tmp_path):
+    path = tmp_path / "some.tfrecord"
+    path.write_bytes(good)
+    assert looks_framed(path)
+    for place in range(12):
+        data = bytearray(good)
+        data[place] ^= 4
+        path.write_bytes(bytes(data))
+        assert not looks_framed(path)
+    for content in (b"", good[:11], b"SQLite format 3\0" * 4):
+        path.write_bytes(content)
+        assert not looks_framed(path)
+    assert not looks_framed(tmp_path / "none") and not looks_framed(tmp_path)
 
 
 def test_missing_file(tmp_path):

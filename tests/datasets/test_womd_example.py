@@ -8,9 +8,10 @@ import random
 import numpy as np
 import pytest
 
-from drivax.datasets.reader import BadRecord
+from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd_example import WomdExample, decode
 from drivax.errors import DataError
+from drivax.scenario.assemble import assemble
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
 
@@ -20,7 +21,8 @@ def recording(wire) -> Recording:
     return decode(wire.example())
 
 
-def test_rows(recording):
+def test_19_rows(recording):
+    """Check-list 19: the ego is not row 0; rows to predict and of interest are numbered without padding."""
     assert recording.scenario_id == recording.segment == "fedcba9876543210"
     assert recording.tracks.track_id.tolist() == [17, 33, 2406, 900]  # padding is dropped
     assert recording.ego == 2
@@ -41,7 +43,8 @@ def test_states_join_past_current_and_future(recording):
     np.testing.assert_allclose(tracks.heading[2], 7 - 2 * math.pi, atol=1e-6)
 
 
-def test_minus_one_never_leaks(recording):
+def test_04_minus_one_never_leaks(recording):
+    """Check-list 4."""
     tracks = recording.tracks
     for values in (tracks.xy, tracks.z, tracks.heading, tracks.velocity, tracks.size):
         assert not values[~tracks.valid].any()
@@ -61,9 +64,50 @@ def test_points_become_features(recording):
     assert features[73].shape == (1, 3)
 
 
-def test_flags(recording, wire):
-    assert recording.flags == Flag.LIGHTS | Flag.ELEVATION  # no lane graph, no limits, not truncated
-    assert Flag.TRUNCATED_MAP in decode(wire.example(full=True)).flags
+def test_full_list_of_points_is_flagged(recording, wire):
+    """A list without padding has been cut off by its writer, of 20,000 points (v1.0, v1.1) or 30,000 (later)."""
+    assert recording.flags == Flag.NONE
+    assert decode(wire.example(full=True)).flags == Flag.TRUNCATED_MAP
+    assert Flag.TRUNCATED_MAP in assemble(decode(wire.example(full=True))).has
+
+
+def test_24_lanes_are_chained_by_geometry(wire):
+    """Check-list 24: the format has no lane graph; lanes that meet are chained by assembly, and flagged."""
+    lonely = assemble(decode(wire.example())).has
+    assert not lonely & (Flag.LANE_GRAPH | Flag.CHAINED_GRAPH)
+    points = [(70, i - 30.0) for i in range(60)] + [(71, 29.0 + i) for i in range(60)]
+    count = len(points)
+    chained = assemble(decode(wire.example(**{
+        "roadgraph_samples/xyz": wire.floats(v for _, x in points for v in (x, 0.0, 30.0)),
+        "roadgraph_samples/id": wire.integers(i for i, _ in points),
+        "roadgraph_samples/type": wire.integers([2] * count),
+        "roadgraph_samples/valid": wire.integers([1] * count),
+    })))  # fmt: skip
+    assert Flag.LANE_GRAPH | Flag.CHAINED_GRAPH in chained.has
+    lanes = chained.lane_id.tolist()
+    assert chained.lane_successor[lanes.index(70)].tolist() == [lanes.index(71), -1, -1, -1]
+
+
+@pytest.mark.parametrize("lane", [2**24 + 1, 2**53 + 1])
+def test_22_lane_ids_never_pass_through_floats(wire, lane):
+    """Check-list 22: neighbouring ids beyond 2**24 (float32) and 2**53 (float64) stay apart."""
+    ids = [i if i not in (70, 71) else lane + i - 70 for i, _, _ in wire.example_points()] + [-1] * 7
+    states = {f"traffic_light_state/{span}/id": wire.integers([lane, lane + 1] * (stop - start))
+              for span, (start, stop) in wire.SPANS.items()}  # fmt: skip
+    recording = decode(wire.example(**{"roadgraph_samples/id": wire.integers(ids), **states}))
+    assert {lane, lane + 1, 72, 73} == {feature.feature_id for feature in recording.features}
+    assert {lane, lane + 1} == {light.lane_id for light in recording.lights}
+
+
+def test_paths_are_counted_not_used(recording):
+    assert recording.lost == {"paths": 2} and recording.route_lanes == ()
+
+
+def test_limits_of_points_are_read_where_a_writer_adds_them(wire):
+    count = len(wire.example_points())
+    table = {"roadgraph_samples/speed_limit": wire.floats([25.0] * count + [-1.0] * 7)}
+    limits = {f.feature_id: f.limit_mps for f in decode(wire.example(**table)).features}
+    assert limits == {70: pytest.approx(11.176), 71: None, 72: None, 73: None}
 
 
 @pytest.mark.parametrize(("spacing", "gap"), [(0.5, 1.0), (1.0, 2.0)])
@@ -71,7 +115,8 @@ def test_split_gap_is_twice_the_sampling(wire, spacing, gap):
     assert decode(wire.example(spacing=spacing)).split_gap_m == gap
 
 
-def test_lights_are_rekeyed_by_lane(recording):
+def test_10_lights_are_rekeyed_by_lane(recording):
+    """Check-list 10: a slot is used by different lanes over time."""
     lights = {light.lane_id: light for light in recording.lights}
     assert set(lights) == {70, 75}
     assert lights[70].states.tolist() == [4] * 91  # in slot 0 before step 30, in slot 1 after
@@ -80,12 +125,13 @@ def test_lights_are_rekeyed_by_lane(recording):
 
 
 @pytest.mark.parametrize("how", ["absent", "invalid"])
-def test_test_split(wire, how):
+def test_20_test_split(wire, how):
+    """Check-list 20."""
     cells = wire.ROWS * 80
     future = [name for name in example_names(wire) if name.startswith("state/future/")]
     changes = dict.fromkeys(future) if how == "absent" else {"state/future/valid": wire.integers([0] * cells)}
     recording = decode(wire.example(**changes))
-    assert Flag.NO_FUTURE in recording.flags
+    assert Flag.NO_FUTURE in assemble(recording).has
     assert recording.tracks.valid.shape == (4, 11) and recording.timestamps_s.shape == (11,)
     assert {len(light.states) for light in recording.lights} == {11}
 
@@ -125,6 +171,13 @@ BROKEN = {
     "marks 2 rows": lambda w: {"state/is_sdc": w.integers([1, 1, 0, 0, -1, -1])},
     "feature roadgraph_samples/xyz has 6 values": lambda w: {"roadgraph_samples/xyz": w.floats([0] * 6)},
     "not finite": lambda w: {"state/current/x": w.floats([math.nan] * 6)},
+    "feature roadgraph_samples/id holds floats": lambda w: {
+        "roadgraph_samples/id": w.floats([i for i, _, _ in w.example_points()] + [-1.0] * 7)
+    },
+    "names a track twice": lambda w: {"state/id": w.floats([17, 17, 2406, 900, -1, -1])},
+    "negatively": lambda w: {"state/id": w.floats([17, -5, 2406, 900, -1, -1])},
+    "no exact whole numbers": lambda w: {"state/id": w.floats([17, 2**24 + 2, 2406, 900, -1, -1])},
+    "exact": lambda w: {"state/id": w.floats([17, 0.5, 2406, 900, -1, -1])},
     "state/id holds": lambda w: {"state/id": w.floats([17, math.inf, 2406, 900, -1, -1])},
 }
 
@@ -158,6 +211,20 @@ def test_other_flavour_names_the_cure(wire, write_records):
     assert bad.error().cure == "use --format womd-scenario" and "Scenario protos" in bad.problem
 
 
+def test_describe_and_count(wire, write_records):
+    reader = WomdExample()
+    assert isinstance(reader, Reader) and reader.companions == ()
+    path = write_records("a", *(wire.example(str(i)) for i in range(3)))
+    told = reader.describe(path)
+    assert (told.recordings, reader.count(path), told.version) == (3, 3, "1.2 or later")  # points 1 m apart
+    assert [note for note in told.notes if "path_samples" in note] and "cut off" not in str(told.notes)
+    told = reader.describe(write_records("b", wire.example(full=True, spacing=0.5)))
+    assert told.version == "1.0 or 1.1" and "cut off" in str(told.notes)
+    with pytest.raises(DataError, match="use --format womd-scenario"):
+        reader.describe(write_records("c", wire.scenario()))
+    assert reader.count(write_records("d", wire.scenario())) == 0
+
+
 # --- The real file (shared/data/README.md counts it by an independent reader).
 
 
@@ -175,7 +242,7 @@ def test_real_counts(real):
     assert len(real.features) == 254 and sum(len(f.points) for f in real.features) == 20_000
     assert len(real.to_predict) == 8
     assert len(real.lights) == 21
-    assert Flag.TRUNCATED_MAP in real.flags and Flag.LANE_GRAPH not in real.flags
+    assert real.flags == Flag.TRUNCATED_MAP and real.lost == {"one_point_features": 1}
     assert real.split_gap_m == 1.0
 
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import builtins
 import math
 import random
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from drivax.datasets import messages
-from drivax.datasets.reader import BadRecord
+from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd_scenario import WomdScenario, decode
 from drivax.errors import DataError, UsageError
+from drivax.scenario.assemble import assemble, windows
 from drivax.scenario.recording import MapFeature, Recording
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
 
@@ -32,8 +35,14 @@ def test_identity_and_time(recording):
     )
     assert recording.current_step == 10
     np.testing.assert_allclose(recording.timestamps_s, np.arange(91) * 0.1)
-    assert recording.flags == Flag.LIGHTS | Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ELEVATION
+    assert recording.flags == Flag.NONE  # nothing that the reader alone knows; assembly measures the rest
     assert recording.split_gap_m == 1.0
+    assert recording.tags == {"source_format": "womd-scenario"}
+
+
+def test_assembled_flags(recording):
+    measured = Flag.LIGHTS | Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
+    assert assemble(recording).has & ~Flag.DEFAULT_LIMITS == measured
 
 
 def test_rows_are_rows_and_ids_are_ids(recording):
@@ -55,7 +64,8 @@ def test_states(recording, wire):
     np.testing.assert_array_equal(tracks.valid[1], (t % 3 != 1) & (t < 60))
 
 
-def test_headings_are_wrapped(recording):
+def test_01_headings_are_wrapped(recording):
+    """Check-list 1: the files hold up to 10 rad."""
     heading = recording.tracks.heading
     assert heading.min() >= -math.pi and heading.max() < math.pi
     assert heading[0, 0] == pytest.approx(7.0 - 2 * math.pi, abs=1e-6)
@@ -63,7 +73,8 @@ def test_headings_are_wrapped(recording):
     np.testing.assert_allclose(heading[2], 0.0, atol=1e-6)
 
 
-def test_invalid_states_are_zero(recording):
+def test_04_invalid_states_are_zero(recording):
+    """Check-list 4: the file keeps a z in them."""
     tracks = recording.tracks
     gone = ~tracks.valid
     assert gone.any()
@@ -71,11 +82,12 @@ def test_invalid_states_are_zero(recording):
         assert not values[gone].any()
 
 
-def test_lanes(recording, wire):
+def test_12_lanes_and_limits_in_mph(recording, wire):
+    """Check-list 12: 0.44704 m/s per mph, 0 is unknown."""
     lanes = by_id(recording)
     first, second, third = lanes[1], lanes[2], lanes[4]
     assert first.limit_mps == pytest.approx(25 * 1609.344 / 3600)
-    assert second.limit_mps is None  # 0 mph in the file means unknown
+    assert second.limit_mps is None
     assert (first.kind, third.kind) == (RoadKind.LANE_SURFACE, RoadKind.LANE_FREEWAY)
     assert first.successors == (2, 99)  # 99 dangles and is kept
     assert second.predecessors == (1,)  # written unpacked
@@ -105,7 +117,8 @@ def test_other_features(recording, wire):
     assert features[8].points[0, 0] > features[8].points[-1, 0]  # orientation is kept
 
 
-def test_lights_are_keyed_by_lane(recording, wire):
+def test_10_lights_are_keyed_by_lane(recording, wire):
+    """Check-list 10: -1 where nobody observed; the place in the list of a step means nothing."""
     lights = {light.lane_id: light for light in recording.lights}
     assert set(lights) == {2, 4}
     assert lights[2].states.tolist() == [4] * 50 + [6] * 41
@@ -120,34 +133,157 @@ def test_two_states_for_one_lane_keep_the_known_one(wire):
     assert [light.states[0] for light in lights] == [6, 0]  # a code of a later version is unknown
 
 
-def test_test_split_has_no_future(wire):
+def test_20_test_split_has_no_future(wire):
+    """Check-list 20: the test split has 11 steps; stored, the rest masked, with the flag."""
     recording = decode(wire.scenario(steps=11))
-    assert Flag.NO_FUTURE in recording.flags
     assert recording.tracks.xy.shape == (3, 11, 2) and len(recording.timestamps_s) == 11
+    scenario = assemble(recording)
+    assert Flag.NO_FUTURE in scenario.has and int(scenario.record["steps"]) == 11
+    assert scenario.agent_valid[:11, 0].all() and not scenario.agent_valid[11:].any()
 
 
-def test_twenty_second_file(wire):
-    recording = decode(wire.scenario(steps=199, now=wire.whole(10, 0)))
+def test_twenty_second_file_becomes_windows(wire, write_records):
+    path = write_records("a_20s.tfrecord", wire.scenario("long", steps=199, now=wire.whole(10, 0)))
+    (recording,) = WomdScenario().read(path)
     assert (recording.current_step, len(recording.timestamps_s)) == (0, 199)
-    assert Flag.NO_FUTURE not in recording.flags
+    parts = [assemble(part) for part in windows(recording)]
+    assert [part.id for part in parts] == ["long@0", "long@40", "long@80"]
+    assert {bytes(part.segment.item()).rstrip(b"\0") for part in parts} == {b"long"}
+    for start, part in zip((0, 40, 80), parts, strict=True):
+        assert int(part.current_step) == 10 and Flag.NO_FUTURE not in part.has
+        # Ego drives 1 m per step, so the origin says which step is the current one.
+        assert part.origin[0] == pytest.approx(wire.X0 + start)
+    assert WomdScenario().count(path) == len(parts)
 
 
 def test_no_lights_no_map(wire):
     recording = decode(wire.scenario(lights=b"", map=b""))
-    assert recording.flags == Flag.NONE and recording.features == () and recording.lights == ()
+    assert recording.features == () and recording.lights == () and recording.lost == {}
+    assert not assemble(recording).has & (Flag.LIGHTS | Flag.LANE_GRAPH)
 
 
-def test_fields_in_reverse_order_read_the_same(wire, recording):
-    """protobuf's Python writers emit fields from last to first."""
-    again = messages.scenario_class().FromString(wire.scenario()).SerializeToString()
-    assert again != wire.scenario()
-    other = decode(again)
-    np.testing.assert_array_equal(other.tracks.xy, recording.tracks.xy)
-    assert [f.successors for f in other.features] == [f.successors for f in recording.features]
+def test_what_is_left_out_is_counted(recording, wire):
+    assert recording.lost == {"unknown_features": 1, "empty_features": 1}
+    line = wire.feature(20, 4, wire.whole(1, 1) + wire.polyline(2, [(wire.X0, wire.Y0, 30.0)]))
+    again = wire.feature(1, 3, wire.lane(wire.line(9.0)))
+    bare = wire.feature(21, 7, wire.blob(1, wire.varint(1)))  # a stop sign without a position
+    parts = b"".join(wire.blob(8, f) for f in (*wire.features(), line, again, bare))
+    other = decode(wire.scenario(map=parts))
+    assert other.lost == {
+        "unknown_features": 1, "empty_features": 2, "duplicate_features": 1, "one_point_features": 1
+    }  # fmt: skip
+    np.testing.assert_array_equal(by_id(other)[1].points, by_id(recording)[1].points)  # the first one stays
+
+
+def test_06_features_of_one_point_are_dropped(wire):
+    """Check-list 6: the source counts keep them, nothing is drawn."""
+    only = wire.feature(20, 4, wire.whole(1, 1) + wire.polyline(2, [(wire.X0, wire.Y0, 30.0)]))
+    parts = b"".join(wire.blob(8, f) for f in wire.features())
+    plain, more = (assemble(decode(wire.scenario(map=m))) for m in (parts, parts + wire.blob(8, only)))
+    assert more.source.map_features["road_line"] == plain.source.map_features["road_line"] + 1
+    np.testing.assert_array_equal(more.segment_a, plain.segment_a)
+
+
+def test_interpolating_lanes_are_kept_and_marked(recording, wire):
+    turn = wire.whole(2, 2) + wire.whole(3, 1) + wire.polyline(8, wire.line(0.0, stop=0.0))
+    lanes = by_id(decode(wire.scenario(map=wire.blob(8, wire.feature(3, 3, turn)))))
+    assert lanes[3].interpolating and not by_id(recording)[1].interpolating
+
+
+def test_unknown_objects_of_interest_are_left_out(wire):
+    assert decode(wire.scenario(interest=wire.whole(4, 555) + wire.whole(4, 900))).of_interest == (0,)
+
+
+def test_11_dangling_links_lead_nowhere(recording):
+    """Check-list 11: lane 1 names lane 99, which is not in the file."""
+    scenario = assemble(recording)
+    lanes = scenario.lane_id.tolist()
+    row = lanes.index(1)
+    assert [lanes[i] for i in scenario.lane_successor[row] if i >= 0] == [2]
+
+
+def test_05_edges_are_cut_where_the_map_was_clipped(wire):
+    """Check-list 5: one edge leaves the clipped map and comes back 30 m further on; no wall crosses the gap."""
+    points = wire.line(-4.0, stop=0.0) + wire.line(-4.0, start=30.0)
+    edge = wire.feature(7, 5, wire.whole(1, 1) + wire.polyline(2, points))
+    others = [f for f in wire.features() if f != wire.features()[5]]
+    scenario = assemble(decode(wire.scenario(map=b"".join(wire.blob(8, f) for f in (*others, edge)))))
+    stop = int(scenario.segment_blocks[1])
+    a, b = scenario.segment_a[:stop, :2], scenario.segment_b[:stop, :2]
+    assert np.linalg.norm(b - a, axis=1).max() <= 4.0
+    middle = (a + b) / 2
+    right = middle[np.abs(middle[:, 1] + 4.0) < 0.1]
+    assert len(right) and not ((right[:, 0] > 0.0) & (right[:, 0] < 30.0)).any()
+
+
+def test_19_ego_comes_first_and_marks_move_with_the_rows(recording):
+    """Check-list 19: ego is the file's last row; a row to predict and ids of interest keep their tracks."""
+    scenario = assemble(recording)
+    flags = dict(zip(scenario.agent_id.tolist(), scenario.agent_flags.tolist(), strict=True))
+    flags |= {int(i): 0 for i in scenario.parked_id}  # the walker stands still
+    assert int(scenario.agent_id[0]) == 2406
+    assert (flags[2406], flags[17], flags[900]) == (1 | 4, 2 | 4, 0)
+
+
+def test_02_origin_is_subtracted_in_float64(wire):
+    """Check-list 2: at 5 km float32 is exact to 0.5 mm only; local positions are exact to 1e-5 m."""
+    scenario = assemble(decode(wire.scenario()))
+    np.testing.assert_array_equal(scenario.origin, [wire.X0, wire.Y0, 30.5])
+    np.testing.assert_allclose(scenario.agent_xy[:, 0, 0], np.arange(91) - 10.0, atol=1e-5)
+    step = b"".join(
+        wire.blob(3, wire.state(9000 + 1e-4 * t, 0, 0, 5, 2, 1.5, 0, 0.001, 0)) for t in range(91)
+    )
+    slow = assemble(
+        decode(
+            wire.scenario(
+                tracks=wire.blob(2, wire.whole(1, 1) + wire.whole(2, 1) + step),
+                sdc=wire.whole(6, 0),
+                interest=b"",
+                predict=b"",
+                map=b"",
+                lights=b"",
+            )
+        )
+    )
+    np.testing.assert_allclose(slow.agent_xy[:, 0, 0], 1e-4 * (np.arange(91) - 10.0), atol=1e-7)
+
+
+def test_03_sizes_are_medians(recording):
+    """Check-list 3: ego's length is 5.00, 5.01, 5.02, 5.00, ...: 31, 30 and 30 times."""
+    assert assemble(recording).agent_size[0].tolist() == pytest.approx([5.01, 2.0, 1.7])
+
+
+def test_23_jitter_is_flagged(wire):
+    """Check-list 23: steps differ from their median by more than 2 ms."""
+    times = 0.1 * np.arange(91)
+    calm, jittery = times + 0.0008 * (np.arange(91) % 2), times + 0.004 * (np.arange(91) % 2)
+    for values, flagged in ((calm, False), (jittery, True)):
+        scenario = assemble(decode(wire.scenario(times=b"".join(wire.double(1, t) for t in values))))
+        assert (Flag.JITTERED_TIME in scenario.has) == flagged
+
+
+def test_sensor_fields_are_skipped(wire, tmp_path):
+    """Lidar and camera tokens (fields 12 and 13) cost their bytes, nothing more, and change nothing."""
+    sensors = wire.blob(12, bytes(range(256)) * 160_000) + wire.blob(13, b"\xff" * 1000)
+    payload = wire.scenario(laser=sensors)
+    np.testing.assert_array_equal(decode(payload).tracks.xy, decode(wire.scenario()).tracks.xy)
+    path = tmp_path / "payload"
+    path.write_bytes(payload)
+    program = (
+        "import resource, sys; from pathlib import Path; from drivax.datasets.womd_scenario import decode\n"
+        "payload = Path(sys.argv[1]).read_bytes()\n"
+        "def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
+        "before = peak(); decode(payload); print((peak() - before) / len(payload))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
+    )
+    assert float(done.stdout) < 2.5
 
 
 BROKEN = {
     "no id": {"id": b""},
+    "scenario_id is no text": lambda w: {"id": w.blob(5, b"\xff\xfe")},
     "no tracks": {"tracks": b""},
     "no steps": {"times": b""},
     "current": lambda w: {"now": w.whole(10, 91)},
@@ -159,6 +295,12 @@ BROKEN = {
         "tracks": b"".join(
             w.blob(2, t) for t in [*w.tracks(), w.track(5, 1, [w.state(0, 0, 0, 1, 1, 1, 0, 0, 0)] * 3)]
         )
+    },
+    "two tracks have the id 17": lambda w: {
+        "tracks": b"".join(w.blob(2, t) for t in [*w.tracks(), w.tracks()[1]])
+    },
+    "a message ObjectState is damaged": lambda w: {
+        "tracks": b"".join(w.blob(2, t) for t in [*w.tracks(), w.track(5, 1, [b"\x11abc"] * 91)])
     },
     "not finite": lambda w: {
         "tracks": b"".join(
@@ -215,10 +357,62 @@ def test_missing_protobuf_names_the_extra(wire, monkeypatch):
             raise ImportError(name)
         return found(name, *args, **kwargs)
 
-    messages._classes.cache_clear()
+    messages._class.cache_clear()
+    messages._pool.cache_clear()
     monkeypatch.setattr(builtins, "__import__", without_protobuf)
     with pytest.raises(UsageError, match=r"pip install 'drivax\[womd\]'"):
         decode(wire.scenario())
+
+
+def test_describe_and_count(wire, write_records):
+    reader = WomdScenario()
+    assert isinstance(reader, Reader) and reader.companions == ()
+    path = write_records("a.tfrecord", *(wire.scenario(str(i)) for i in range(3)))
+    told = reader.describe(path)
+    assert (told.recordings, reader.count(path), told.version) == (3, 3, "1.2 or later")  # it has a driveway
+    assert told.notes == ("91 steps, current step 10",)
+    early = [f for f in wire.features() if f[2:3] != b"\x52"]  # field 10 of a map feature is a driveway
+    unlinked = wire.scenario(map=wire.blob(8, wire.feature(1, 3, wire.lane(wire.line(0.0)))), lights=b"")
+    older = wire.scenario(map=b"".join(wire.blob(8, f) for f in early))
+    assert reader.describe(write_records("b", older)).version == "1.1 or later"
+    told = reader.describe(write_records("c", unlinked))
+    assert told.version is None and len(told.notes) == 3 and "no lane graph" in told.notes[2]
+    assert "no future" in reader.describe(write_records("d", wire.scenario(steps=11))).notes[1]
+    assert "3 windows" in reader.describe(write_records("e", wire.scenario(steps=199))).notes[1]
+
+
+def test_describe_names_the_damage(wire, write_records, tmp_path):
+    with pytest.raises(DataError, match="use --format womd-example"):
+        WomdScenario().describe(write_records("a", wire.example()))
+    empty = tmp_path / "empty"
+    empty.touch()
+    with pytest.raises(DataError, match="empty"):
+        WomdScenario().describe(empty)
+    assert WomdScenario().count(empty) == WomdScenario().count(tmp_path / "none") == 0
+    first = bytearray(wire.frame(wire.scenario("a")))
+    first[500] ^= 1
+    half = tmp_path / "half"
+    half.write_bytes(bytes(first) + wire.frame(wire.scenario("b", steps=131)))
+    assert WomdScenario().describe(half).recordings == 2  # the second one is looked at
+    assert WomdScenario().count(half) == 4
+
+
+def test_without_packages_a_tfrecord_is_recognised_so_that_reading_names_them(
+    wire, write_records, monkeypatch
+):
+    path, other = write_records("a.tfrecord", wire.example()), write_records("b").with_name("c")
+    other.write_bytes(b"SQLite format 3\0")
+    found = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith(("google.protobuf", "google_crc32c")):
+            raise ImportError(name)
+        return found(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    assert WomdScenario().recognise(path) and not WomdScenario().recognise(other)
+    with pytest.raises(UsageError, match=r"pip install 'drivax\[womd\]'"):
+        next(WomdScenario().read(path))
 
 
 # --- The real file (shared/data/README.md counts it by an independent reader).

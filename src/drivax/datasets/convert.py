@@ -1,38 +1,40 @@
 """Public data set -> scenario set: files are read and assembled in worker processes, written by one.
 
-The result does not depend on the number of workers: files are taken in the order of their paths, records in file
-order. Nothing here imports JAX, so that workers start in a fraction of a second; an audit that needs it is handed in.
+The result does not depend on the number of workers, nor on how often the conversion was killed and begun again: files
+are taken in the order of their paths, records in file order, and a closed shard of the set is never touched again.
+Nothing here imports JAX, so that workers start in a fraction of a second; an audit that needs it is handed in.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import multiprocessing
-import signal
+import hashlib
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from importlib import metadata
+from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from drivax.datasets.formats import AUTO, detect, find_files, reader_named
-from drivax.datasets.reader import BadRecord, Reader
-from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble, windows
-from drivax.scenario.recording import Recording
-from drivax.scenario.schema import CAPACITIES, Capacity, Scenario
+from drivax.datasets.conversion import Conversion, convert_file
+from drivax.datasets.estimate import Estimate, estimate
+from drivax.datasets.formats import Survey, survey
+from drivax.datasets.reader import BadRecord
+from drivax.datasets.spool import converted_ahead
+from drivax.errors import DataError
+from drivax.scenario.manifest import manifest_entry
+from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Scenario
+from drivax.scenario.selection import Selection
 from drivax.scenario.store import ScenarioWriter
+
+__all__ = ["Conversion", "Converted", "Plan", "convert", "convert_file"]
 
 #: Scenarios that are audited together.
 _BATCH = 64
 
-_Result = TypeVar("_Result")
-
+#: A scenario or bad record, and the place after it: file number, items read of that file.
+_Placed = tuple[Scenario | BadRecord, tuple[int, int]]
 #: Called with (files done, files, scenarios so far).
 Progress = Callable[[int, int, int], None]
 #: Fills the audit of scenarios: one dictionary each.
@@ -40,41 +42,18 @@ Audit = Callable[[list[Scenario]], list[dict[str, Any]]]
 
 
 @dataclass(frozen=True)
-class Conversion:
-    """How to convert.
+class Plan:
+    """What a conversion is about to do.
 
     Attributes:
-        format: Name of a format, or ``auto``: each file by its content.
-        capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
-        limit: Stop after so many scenarios; None: all.
-        workers: Processes; with 1 everything happens in this one.
-        strict: Fail at the first record that cannot be read instead of skipping it.
-        overwrite: Replace an existing scenario set.
+        found: The files.
+        estimate: How large the set will be.
+        written: How many scenarios an earlier, interrupted conversion has written already.
     """
 
-    format: str = AUTO
-    capacity: str = "default"
-    limit: int | None = None
-    workers: int = 1
-    strict: bool = False
-    overwrite: bool = False
-
-    def check(self) -> None:
-        """Refuse options that cannot be meant.
-
-        Raises:
-            UsageError: The first of them.
-        """
-        if self.format != AUTO:
-            reader_named(self.format)
-        if self.capacity not in CAPACITIES:
-            raise UsageError(
-                f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
-            )
-        if self.limit is not None and self.limit < 1:
-            raise UsageError(f"limit is {self.limit}", cure="use 1 or more")
-        if self.workers < 1:
-            raise UsageError(f"workers is {self.workers}", cure="use 1 or more")
+    found: Survey
+    estimate: Estimate
+    written: int
 
 
 @dataclass(frozen=True)
@@ -84,17 +63,23 @@ class Converted:
     Attributes:
         path: The scenario set.
         scenarios: How many it holds.
+        written: How many of them an earlier, interrupted conversion wrote.
         files: How many files were read.
         ignored: How many files of the folder are of no known format.
+        formats: Number of files by format.
         skipped: The records that could not be read or converted, duplicates included.
+        filtered: How many scenarios the filters left out.
         seconds: Wall time.
     """
 
     path: Path
     scenarios: int
+    written: int
     files: int
     ignored: int
+    formats: dict[str, int]
     skipped: tuple[BadRecord, ...]
+    filtered: int
     seconds: float
 
 
@@ -104,11 +89,13 @@ def convert(
     options: Conversion | None = None,
     progress: Progress | None = None,
     audit: Audit | None = None,
+    announce: Callable[[Plan], None] | None = None,
 ) -> Converted:
     """Convert a file or folder of a public data set to a scenario set.
 
     Recordings longer than 91 steps become windows. Records that cannot be read are skipped and reported. The set
-    appears under ``out`` when it is complete.
+    appears under ``out`` when it is complete. A conversion that was killed is continued after its last closed shard
+    by one of the same data with the same options, to the same bytes.
 
     Args:
         src: A file, or a folder that is searched to any depth.
@@ -116,198 +103,245 @@ def convert(
         options: How.
         progress: Called after every scenario and every file.
         audit: Called in this process with batches of scenarios; what it returns is stored with them.
+        announce: Called once before the work begins.
 
     Raises:
-        UsageError: Options that cannot be meant, ``out`` exists, or a package that the format needs is missing.
-        DataError: ``src`` holds nothing that can be converted, or with ``strict`` a record cannot be read.
+        UsageError: Options that cannot be meant, ``out`` exists, is being written, or was begun with other options, or
+            a package that the format needs is missing.
+        DataError: ``src`` holds nothing that can be converted, the disk is too small, or with ``strict`` a record
+            cannot be read.
     """
     options = options or Conversion()
     options.check()
     begin = time.monotonic()
-    files, ignored = find_files(src, options.format)
+    found = survey(src, options.format)
     capacity = CAPACITIES[options.capacity]
-    source = {"command": "convert", "format": options.format, "folder": Path(src).name, "files": len(files)}
-    with ScenarioWriter(out, capacity, source=source, overwrite=options.overwrite) as writer:
-        sink = _Sink(writer, options, audit)
-        with closing(_results(files, options)) as results:
-            done = _drain(results, sink, len(files), progress)
-        sink.flush()
-        if sink.scenarios == 0:
-            raise _nothing(sink.skipped)
-    return Converted(Path(out), sink.scenarios, done, ignored, tuple(sink.skipped), time.monotonic() - begin)
+    with ScenarioWriter(
+        out, capacity, _source(found, options), options.shard_size, options.overwrite, options.shares,
+        _identity(found, options, audited=audit is not None),
+    ) as writer:  # fmt: skip
+        written = len(writer)
+        sink = _Sink(writer, found, options, audit)
+        expected = estimate(found, Path(out), capacity, options.stride, options.limit)
+        if announce is not None:
+            announce(Plan(found, expected, written))
+        if not options.filters:  # with them nobody knows how many will be left
+            expected.check(Path(out), written)
+        done = _drain(found, options, sink, writer, progress)
+        if not len(writer):
+            raise _nothing(found, sink)
+        writer.source |= sink.left_out()
+    seconds = time.monotonic() - begin
+    return Converted(
+        Path(out), len(writer), written, done, found.ignored, dict(found.formats), tuple(sink.skipped),
+        sink.filtered, seconds,
+    )  # fmt: skip
+
+
+def _source(found: Survey, options: Conversion) -> dict[str, Any]:
+    """Where the set comes from, for its manifest."""
+    return {
+        "command": "convert",
+        "format": options.format,
+        "folder": found.root.name,
+        "files": len(found.inputs),
+        "formats": dict(sorted(found.formats.items())),
+        **{name: getattr(options, name) for name in ("limit", "filters", "routes", "stride", "split")},
+    }
+
+
+def _identity(found: Survey, options: Conversion, audited: bool) -> dict[str, Any]:
+    """All that the bytes of the set depend on; only a conversion with the same may continue another."""
+    digest = hashlib.sha256()
+    for one in found.inputs:
+        digest.update(f"{found.relative(one.path)}\t{one.path.stat().st_size}\t{one.format}\n".encode())
+    names = ("format", "capacity", "limit", "filters", "routes", "stride", "split", "shard_size")
+    return {
+        "drivax": metadata.version("drivax"),
+        "schema": SCHEMA_VERSION,
+        "files": digest.hexdigest(),
+        "audit": audited,
+        **{name: getattr(options, name) for name in names},
+    }
 
 
 class _Sink:
-    """Takes results in order: counts what is bad, leaves out duplicates, audits in batches, writes them."""
+    """Takes results in order: audits in batches, filters, leaves out duplicates, counts what is bad, writes the rest.
 
-    def __init__(self, writer: ScenarioWriter, options: Conversion, audit: Audit | None) -> None:
+    Batches end where a shard ends: so does everything that depends on what came before.
+    """
+
+    def __init__(
+        self, writer: ScenarioWriter, found: Survey, options: Conversion, audit: Audit | None
+    ) -> None:
         self._writer = writer
+        self._found = found
         self._options = options
         self._audit = audit
-        self._batch: list[Scenario] = []
-        self._known: set[tuple[bytes, bytes]] = set()
-        self.scenarios = 0
+        self._selection = Selection.parse(options.filters)
+        self._waiting: list[_Placed] = []
+        self._scenarios_waiting = 0
+        self._noted = 0
         self.skipped: list[BadRecord] = []
+        self.filtered = 0
+        self.place = (0, 0)
+        for note in writer.notes:
+            self.place = tuple(note["place"])
+            self.filtered = note["filtered"]
+            self.skipped += [_bad_record(found, row) for row in note["skipped"]]
+        self._noted = len(self.skipped)
+        if options.strict and self.skipped:
+            raise self.skipped[0].error()
+
+    @property
+    def scenarios(self) -> int:
+        """Scenarios taken so far, those that wait included."""
+        return len(self._writer) + self._scenarios_waiting
 
     @property
     def full(self) -> bool:
         """Whether the limit is reached."""
-        return self._options.limit is not None and self.scenarios >= self._options.limit
+        return self._options.limit is not None and len(self._writer) >= self._options.limit
 
-    def take(self, item: Scenario | BadRecord, file: Path) -> None:
+    def take(self, item: Scenario | BadRecord, place: tuple[int, int]) -> None:
         """Keep a scenario, or note a bad record (fail, if strict)."""
-        if isinstance(item, Scenario):
-            key = (bytes(item.record["dataset"][()]), bytes(item.record["scenario_id"][()]))
-            if key not in self._known:
-                self._known.add(key)
-                self._add(item)
-                return
-            item = BadRecord(file, item.id, "the scenario is in the set already", "give each recording once")
-        if self._options.strict:
+        if isinstance(item, BadRecord) and self._options.strict:
             raise item.error()
-        self.skipped.append(item)
-
-    def _add(self, scenario: Scenario) -> None:
-        self.scenarios += 1
-        self._batch.append(scenario)
-        if self._audit is None or len(self._batch) == _BATCH:
-            self.flush()
+        self._waiting.append((item, place))
+        self._scenarios_waiting += isinstance(item, Scenario)
+        if self._scenarios_waiting >= self._batch_size():
+            self._write_batch()
 
     def flush(self) -> None:
         """Audit and write what is waiting."""
-        if self._audit is not None and self._batch:
-            audits = self._audit(self._batch)
-            pairs = zip(self._batch, audits, strict=True)
-            self._batch = [dataclasses.replace(scenario, audit=findings) for scenario, findings in pairs]
-        for scenario in self._batch:
-            self._writer.add(scenario)
-        self._batch = []
+        while self._waiting and not self.full:
+            self._write_batch()
+
+    def left_out(self) -> dict[str, Any]:
+        """What is not in the set, for its manifest."""
+        rows = [_row(self._found, bad) for bad in self.skipped]
+        for row in rows:
+            del row["cure"]
+        return {"skipped": len(rows), "skipped_records": rows, "filtered": self.filtered}
+
+    def _batch_size(self) -> int:
+        if self._audit is None:
+            return 1
+        if self._options.filters:  # nobody knows how many of them will be kept
+            return _BATCH
+        left = _BATCH if self._options.limit is None else self._options.limit - len(self._writer)
+        return min(_BATCH, self._writer.room, left)
+
+    def _write_batch(self) -> None:
+        batch, self._waiting, self._scenarios_waiting = self._waiting, [], 0
+        items = self._without_duplicates(batch)
+        scenarios = [item for item in items if isinstance(item, Scenario)]
+        findings = [{} for _ in scenarios] if self._audit is None else self._audit(scenarios)
+        audited = iter(
+            [replace(scenario, audit=finding) for scenario, finding in zip(scenarios, findings, strict=True)]
+        )
+        for number, item in enumerate(items):
+            if isinstance(item, BadRecord):
+                self._skip(item)
+            elif self._write(next(audited), batch[number][1]) or self.full:
+                # A shard is closed: the rest begins a new batch, as it would after a kill.
+                self._waiting = batch[number + 1 :]
+                self._scenarios_waiting = sum(isinstance(item, Scenario) for item, _ in self._waiting)
+                return
+
+    def _without_duplicates(self, batch: list[_Placed]) -> list[Scenario | BadRecord]:
+        """The items of a batch, with a bad record in the place of a scenario that is in the set or earlier in it."""
+        items: list[Scenario | BadRecord] = []
+        seen: set[tuple[str, str]] = set()
+        for item, (file, _) in batch:
+            if isinstance(item, Scenario):
+                key = bytes(item.record["dataset"][()]).decode(), item.id
+                if key in self._writer or key in seen:
+                    path = self._found.inputs[file].path
+                    item = BadRecord(
+                        path, item.id, "the scenario is in the set already", "give each file once"
+                    )
+                else:
+                    seen.add(key)
+            items.append(item)
+        return items
+
+    def _write(self, scenario: Scenario, place: tuple[int, int]) -> bool:
+        """Write a scenario unless it is filtered out; whether that closed a shard."""
+        if not self._selection.matches(manifest_entry(scenario)):
+            self.filtered += 1
+            return False
+        closes = self._writer.room == 1
+        self._writer.add(scenario, self._note(place) if closes else None)
+        return closes
+
+    def _note(self, place: tuple[int, int]) -> dict[str, Any]:
+        new, self._noted = self.skipped[self._noted :], len(self.skipped)
+        rows = [_row(self._found, bad) for bad in new]
+        return {"place": place, "filtered": self.filtered, "skipped": rows}
+
+    def _skip(self, bad: BadRecord) -> None:
+        if self._options.strict:
+            raise bad.error()
+        self.skipped.append(bad)
+
+
+def _row(found: Survey, bad: BadRecord) -> dict[str, Any]:
+    """A bad record as JSON values."""
+    return {"file": found.relative(bad.file), "record": bad.record, "problem": bad.problem, "cure": bad.cure}
+
+
+def _bad_record(found: Survey, row: dict[str, Any]) -> BadRecord:
+    file = found.root / row["file"] if found.root.is_dir() else found.root.with_name(row["file"])
+    return BadRecord(file, row["record"], row["problem"], row["cure"])
 
 
 def _drain(
-    results: Iterator[tuple[Path, Iterator[Scenario | BadRecord]]],
-    sink: _Sink,
-    files: int,
-    progress: Progress | None,
+    found: Survey, options: Conversion, sink: _Sink, writer: ScenarioWriter, progress: Progress | None
 ) -> int:
     """Moves results into the sink until they or the limit end; returns the number of files read."""
     report = progress or (lambda done, total, scenarios: None)
-    done = 0
-    for file, items in results:
-        for item in items:
-            sink.take(item, file)
-            report(done, files, sink.scenarios)
-            if sink.full:
-                return done + 1
-        done += 1
-        report(done, files, sink.scenarios)
-    return done
+    first, skip = sink.place
+    total = len(found.inputs)
+    with closing(_results(found, options, first, writer.folder)) as results:
+        for number, items in enumerate(results, start=first):
+            for place, item in islice(enumerate(items, start=1), skip, None):
+                sink.take(item, (number, place))
+                report(number, total, sink.scenarios)
+                if sink.full:
+                    return number + 1
+            skip = 0
+            report(number + 1, total, sink.scenarios)
+    sink.flush()
+    return total
 
 
-def _nothing(skipped: list[BadRecord]) -> DataError:
-    first = skipped[0]
-    if len(skipped) == 1:
+def _results(
+    found: Survey, options: Conversion, first: int, folder: Path
+) -> Generator[Iterator[Scenario | BadRecord], None, None]:
+    """Scenarios and bad records of every file from number ``first`` on."""
+    tasks = [
+        (one.path, replace(options, format=one.format or options.format)) for one in found.inputs[first:]
+    ]
+    if options.workers == 1 or len(tasks) <= 1:
+        yield from (convert_file(*task) for task in tasks)
+        return
+    yield from converted_ahead(tasks, convert_file, CAPACITIES[options.capacity], options.workers, folder)
+
+
+def _nothing(found: Survey, sink: _Sink) -> DataError:
+    if sink.filtered:
+        problem = f"none of the {sink.filtered} scenarios satisfies the filters"
+        return DataError(problem, file=found.root, cure="use wider filters")
+    if not sink.skipped:
+        return DataError("holds no recording", file=found.root, cure="look at it with drivax doctor")
+    first = sink.skipped[0]
+    if len(sink.skipped) == 1:
         return first.error()
+    others = len(sink.skipped) - 1
     return DataError(
-        f"{first.problem} (and none of the other {len(skipped) - 1} records could be converted)",
+        f"{first.problem} (and none of the other {others} record{'s' if others > 1 else ''} could be converted)",
         file=first.file,
         record=first.record,
         cure=first.cure,
     )
-
-
-def _results(
-    files: list[Path], options: Conversion
-) -> Generator[tuple[Path, Iterator[Scenario | BadRecord]], None, None]:
-    if options.workers == 1 or len(files) == 1:
-        for file in files:
-            yield file, convert_file(file, options)
-        return
-    _reader(files[0], options.format)  # a missing package is told here, in one line, not by every worker
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(
-        min(options.workers, len(files)), mp_context=context, initializer=_start_worker
-    )
-    waiting: deque[tuple[Path, Future[list[Scenario | BadRecord]]]] = deque()
-    todo = iter(files)
-    try:
-        while True:
-            # Two files ahead keep everyone busy and bound what is held in memory.
-            while len(waiting) < options.workers + 2 and (file := next(todo, None)) is not None:
-                waiting.append((file, pool.submit(_convert_whole_file, file, options)))
-            if not waiting:
-                return
-            file, future = waiting.popleft()
-            yield file, iter(_finished(file, future))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _finished(file: Path, future: Future[list[Scenario | BadRecord]]) -> list[Scenario | BadRecord]:
-    try:
-        return future.result()
-    except BrokenProcessPool as error:
-        raise DataError(
-            "a worker process died (out of memory, or a script without a main guard)",
-            file=file,
-            cure="use fewer --workers",
-        ) from error
-
-
-def _start_worker() -> None:
-    # On Ctrl-C workers die at once and silently; this process cleans up.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _convert_whole_file(path: Path, options: Conversion) -> list[Scenario | BadRecord]:
-    return list(convert_file(path, options))
-
-
-def convert_file(path: Path, options: Conversion) -> Iterator[Scenario | BadRecord]:
-    """The scenarios of one file in file order, and bad records in their places; at most ``limit`` scenarios.
-
-    Args:
-        path: The file.
-        options: ``format``, ``capacity`` and ``limit`` are used.
-
-    Yields:
-        Assembled scenarios without audit, or what could not be read or assembled and why.
-    """
-    reader = _reader(path, options.format)
-    if isinstance(reader, BadRecord):
-        yield reader
-        return
-    capacity = CAPACITIES[options.capacity]
-    count = 0
-    for item in reader.read(path):
-        for result in [item] if isinstance(item, BadRecord) else _scenarios(item, path, capacity):
-            yield result
-            count += isinstance(result, Scenario)
-            if count == options.limit:
-                return
-
-
-def _reader(path: Path, name: str) -> Reader | BadRecord:
-    try:
-        return detect(path) if name == AUTO else reader_named(name)
-    except DataError as error:
-        return BadRecord.of(error, path)
-
-
-def _scenarios(recording: Recording, path: Path, capacity: Capacity) -> Iterator[Scenario | BadRecord]:
-    parts = _attempt(lambda: list(windows(recording)), path, recording.scenario_id)
-    if isinstance(parts, BadRecord):
-        yield parts
-        return
-    for part in parts:
-        yield _attempt(partial(assemble, part, capacity), path, part.scenario_id)
-
-
-def _attempt(call: Callable[[], _Result], path: Path, record: str) -> _Result | BadRecord:
-    try:
-        return call()
-    except DataError as error:
-        return BadRecord.of(error, path, record)
-    except Exception as error:  # one odd recording must not end a conversion of a hundred thousand
-        problem = f"assembling failed ({type(error).__name__}: {error})"
-        return BadRecord(path, record, problem, "report it with this file and record")

@@ -6,17 +6,39 @@ A format is told by content, not by name: public data sets use the same names fo
 from __future__ import annotations
 
 import difflib
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
+from drivax.datasets import unsupported
+from drivax.datasets.argoverse_motion import ArgoverseMotion
+from drivax.datasets.argoverse_sensor import ArgoverseSensor
+from drivax.datasets.gpudrive import GpuDrive
+from drivax.datasets.nuplan import NuPlan
+from drivax.datasets.nuscenes import NuScenes
 from drivax.datasets.reader import Reader
-from drivax.datasets.tfrecord import read_records
+from drivax.datasets.scenariomax import ScenarioMax
+from drivax.datasets.scenarionet import ScenarioNet
 from drivax.datasets.womd_example import WomdExample
 from drivax.datasets.womd_scenario import WomdScenario
 from drivax.errors import DataError, UsageError
 
-#: Every reader; a new format is one module and one entry here.
-READERS: tuple[Reader, ...] = (WomdScenario(), WomdExample())
+#: Every reader; a new format is one module and one entry here. Files are shown to them in this order, so those that
+#: look at a name or at a few bytes come first.
+READERS: tuple[Reader, ...] = (
+    ArgoverseMotion(),
+    ArgoverseSensor(),
+    ScenarioNet(),
+    NuPlan(),
+    NuScenes(),
+    GpuDrive(),
+    WomdScenario(),
+    WomdExample(),
+    ScenarioMax(),
+)
 AUTO = "auto"
+#: Sensor data and texts, which data sets hold by the hundred thousand.
+_NEVER = (".jpg", ".jpeg", ".png", ".pcd", ".pcd.bin", ".npz", ".md", ".txt", ".csv", ".html", ".pdf")
 
 
 def reader_named(name: str) -> Reader:
@@ -33,6 +55,15 @@ def reader_named(name: str) -> Reader:
     raise UsageError(f"there is no format {name!r}", cure=cure)
 
 
+def recognise(path: Path) -> Reader | None:
+    """The reader whose format a file's content is, if there is one."""
+    # Those first whose files are called so: most files of a large folder are opened once.
+    for reader in sorted(READERS, key=lambda reader: not _called(path, reader.patterns)):
+        if reader.recognise(path):
+            return reader
+    return None
+
+
 def detect(path: str | Path) -> Reader:
     """The reader whose format a file's content is.
 
@@ -40,25 +71,57 @@ def detect(path: str | Path) -> Reader:
         DataError: The file is missing, damaged at its beginning, or of no format that drivax reads.
     """
     path = Path(path)
-    for reader in READERS:
-        if reader.recognise(path):
-            return reader
-    for _, record in read_records(path):
-        if isinstance(record, DataError):
-            raise record
-        break
-    raise DataError(
-        "a TFRecord file whose records drivax does not know",
-        file=path,
-        cure=f"drivax reads {', '.join(reader.name for reader in READERS)} (WOMD's motion data set, not perception)",
-    )
+    reader = recognise(path)
+    if reader is None:
+        raise unsupported.explain(path)
+    return reader
 
 
-def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
-    """The files to read, sorted by path, and how many others a folder holds.
+@dataclass(frozen=True)
+class Input:
+    """One file to read.
 
-    A file given by name is always read. In a folder (searched to any depth, hidden names left out) those count that
-    are called as the format's files are, damaged ones included, or whose content is of the format.
+    Attributes:
+        path: The file.
+        format: Its format; None where it is only called as the files of a format are.
+    """
+
+    path: Path
+    format: str | None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a file or folder holds.
+
+    Attributes:
+        root: The file or folder.
+        inputs: The files to read, sorted by path.
+        companions: How many files are read along with them (maps, poses).
+        ignored: How many other files there are.
+    """
+
+    root: Path
+    inputs: tuple[Input, ...]
+    companions: int = 0
+    ignored: int = 0
+
+    @property
+    def formats(self) -> Counter[str]:
+        """Number of files by format, recognised ones only."""
+        return Counter(one.format for one in self.inputs if one.format is not None)
+
+    def relative(self, path: Path) -> str:
+        """A file's name for people and manifests: its path below the root, or its own name."""
+        inside = self.root.is_dir() and path.is_relative_to(self.root)
+        return path.relative_to(self.root).as_posix() if inside else path.name
+
+
+def survey(src: str | Path, name: str = AUTO) -> Survey:
+    """Which files of a folder can be read, and as what.
+
+    A file given by name is always read. In a folder (searched to any depth, hidden names left out) those count whose
+    content is of a format, and those that are called as a format's files are: damaged ones shall be reported.
 
     Args:
         src: A file or a folder.
@@ -69,28 +132,72 @@ def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
         UsageError: There is no such format.
     """
     src = Path(src)
-    readers = READERS if name == AUTO else (reader_named(name),)
+    only = None if name == AUTO else reader_named(name)
     if not src.exists():
         raise DataError("does not exist", file=src, cure="check the path")
     if not src.is_dir():
-        return [src], 0
+        return Survey(src, (_input(src, only),))
     inside = [
         path for path in sorted(src.rglob("*")) if path.is_file() and not _hidden(path.relative_to(src))
     ]
-    files = [path for path in inside if any(_belongs(path, reader) for reader in readers)]
-    if not files:
-        known = ", ".join(reader.name for reader in readers)
-        raise DataError(
-            f"none of the {len(inside)} files in it is of a known format ({known})",
-            file=src,
-            cure="name the folder that holds the downloaded shards",
-        )
-    return files, len(inside) - len(files)
+    inputs, companions = [], 0
+    for path in inside:
+        kind = _kind(path, READERS if only is None else (only,))
+        if isinstance(kind, Input):
+            inputs.append(kind)
+        companions += kind == "companion"
+    if not inputs:
+        raise _nothing_in(src, len(inside), only)
+    return Survey(src, tuple(inputs), companions, len(inside) - len(inputs) - companions)
+
+
+def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
+    """The files that :func:`survey` finds, and how many others that belong to no format.
+
+    Raises:
+        DataError: ``src`` does not exist, or the folder holds no file of a known format.
+        UsageError: There is no such format.
+    """
+    found = survey(src, name)
+    return [one.path for one in found.inputs], found.ignored
+
+
+def _input(path: Path, only: Reader | None) -> Input:
+    reader = only or recognise(path)
+    return Input(path, None if reader is None else reader.name)
+
+
+def _kind(path: Path, readers: tuple[Reader, ...]) -> Input | str:
+    """What a file of a folder is: an input, a companion of one, or nothing that is known."""
+    if path.name.lower().endswith(_NEVER):
+        return "ignored"
+    called = any(_called(path, reader.patterns) for reader in readers)
+    if len(readers) == 1:
+        # The reader says record by record what is wrong with a file that only bears the name.
+        if called or readers[0].recognise(path):
+            return Input(path, readers[0].name)
+    elif (reader := recognise(path)) is not None:
+        return Input(path, reader.name)
+    if any(_called(path, reader.companions) for reader in readers):
+        return "companion"
+    return Input(path, None) if called else "ignored"
+
+
+def _called(path: Path, patterns: tuple[str, ...]) -> bool:
+    return any(path.match(pattern) for pattern in patterns)
 
 
 def _hidden(path: Path) -> bool:
     return any(part.startswith(".") for part in path.parts)
 
 
-def _belongs(path: Path, reader: Reader) -> bool:
-    return any(path.match(pattern) for pattern in reader.patterns) or reader.recognise(path)
+def _nothing_in(folder: Path, files: int, only: Reader | None) -> DataError:
+    found = unsupported.explain_folder(folder)
+    if found is not None:
+        return found
+    known = ", ".join(reader.name for reader in (READERS if only is None else (only,)))
+    return DataError(
+        f"none of the {files} files in it is of a known format ({known})",
+        file=folder,
+        cure="name the folder that holds the downloaded data; drivax doctor tells more",
+    )

@@ -16,7 +16,8 @@ from drivax.errors import UsageError
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
-_SCENARIO: dict[str, tuple[_Field, ...]] = {
+#: Messages of the Scenario proto. States and points of polylines are kept as bytes (``womd_tables`` reads them).
+MESSAGES: dict[str, tuple[_Field, ...]] = {
     "Scenario": (
         ("timestamps_seconds", 1, "double*"),
         ("tracks", 2, "Track*"),
@@ -29,7 +30,7 @@ _SCENARIO: dict[str, tuple[_Field, ...]] = {
         ("tracks_to_predict", 11, "RequiredPrediction*"),
     ),
     "RequiredPrediction": (("track_index", 1, "int32"), ("difficulty", 2, "int32")),
-    "Track": (("id", 1, "int32"), ("object_type", 2, "int32"), ("states", 3, "ObjectState*")),
+    "Track": (("id", 1, "int32"), ("object_type", 2, "int32"), ("states", 3, "bytes*")),
     "ObjectState": (
         ("center_x", 2, "double"),
         ("center_y", 3, "double"),
@@ -59,16 +60,16 @@ _SCENARIO: dict[str, tuple[_Field, ...]] = {
         ("speed_limit_mph", 1, "double"),
         ("type", 2, "int32"),
         ("interpolating", 3, "bool"),
-        ("polyline", 8, "MapPoint*"),
+        ("polyline", 8, "bytes*"),
         ("entry_lanes", 9, "int64*"),
         ("exit_lanes", 10, "int64*"),
         ("left_neighbors", 11, "LaneNeighbor*"),
         ("right_neighbors", 12, "LaneNeighbor*"),
     ),
     "LaneNeighbor": (("feature_id", 1, "int64"),),
-    "Polyline": (("type", 1, "int32"), ("polyline", 2, "MapPoint*")),
-    "StopSign": (("lane", 1, "int64*"), ("position", 2, "MapPoint")),
-    "Polygon": (("polygon", 1, "MapPoint*"),),
+    "Polyline": (("type", 1, "int32"), ("polyline", 2, "bytes*")),
+    "StopSign": (("lane", 1, "int64*"), ("position", 2, "bytes")),
+    "Polygon": (("polygon", 1, "bytes*"),),
 }
 
 #: A map field is on the wire a repeated message of key and value; lists are packed or not, parsers take both.
@@ -86,14 +87,16 @@ _EXAMPLE: dict[str, tuple[_Field, ...]] = {
     "Int64List": (("value", 1, "int64*"),),
 }
 
+_PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE}
 
-def scenario_class() -> Any:
-    """The message class of a WOMD ``Scenario``.
+
+def scenario_class(name: str = "Scenario") -> Any:
+    """The message class of a WOMD ``Scenario``, or of one of its parts.
 
     Raises:
         UsageError: protobuf is not installed.
     """
-    return _classes("drivax.womd", "Scenario")
+    return _class("drivax.womd", name)
 
 
 def example_class() -> Any:
@@ -102,7 +105,7 @@ def example_class() -> Any:
     Raises:
         UsageError: protobuf is not installed.
     """
-    return _classes("drivax.example", "Example")
+    return _class("drivax.example", "Example")
 
 
 def parse(message_class: Any, payload: bytes) -> Any | None:
@@ -116,18 +119,25 @@ def parse(message_class: Any, payload: bytes) -> Any | None:
 
 
 @cache
-def _classes(package: str, name: str) -> Any:
+def _class(package: str, name: str) -> Any:
+    found = _pool(package).FindMessageTypeByName(f"{package}.{name}")
+    from google.protobuf import message_factory
+
+    return message_factory.GetMessageClass(found)
+
+
+@cache
+def _pool(package: str) -> Any:
     try:
-        from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+        from google.protobuf import descriptor_pb2, descriptor_pool
     except ImportError as error:
         raise UsageError("reading WOMD needs protobuf", cure="pip install 'drivax[womd]'") from error
-    messages = _SCENARIO if name == "Scenario" else _EXAMPLE
     file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto2")
-    for message_name, fields in messages.items():
+    for message_name, fields in _PACKAGES[package].items():
         _declare(file.message_type.add(name=message_name), fields, package)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}"))
+    return pool
 
 
 def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
