@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 
 import pytest
 
@@ -61,3 +62,58 @@ def test_every_track_of_the_proto_file_is_placed(converted):
     assert placed == 83
     now = int(scenario.agent_valid[10].sum() + scenario.parked_valid[10].sum())
     assert now == 50
+
+
+#: Files by format, and the scenarios that they become (windows of 91 steps every 40).
+FORMATS = {
+    "av2-motion": (1, 1), "av2-sensor": (1, 2), "gpudrive": (2, 2), "scenarionet": (4, 12), "womd-example": (1, 1),
+    "womd-scenario": (1, 1),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def everything(real_data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("real") / "set"
+    return out, drivax("convert", real_data, out, "--split", "60/20/20")
+
+
+def test_a_folder_of_all_real_files(everything):
+    out, said = everything
+    found = ", ".join(
+        f"{name} ({files} file{'s'[: files > 1]})" for name, (files, _) in sorted(FORMATS.items())
+    )
+    assert said.startswith(f"found {found}: about 19 scenarios, 1")
+    assert ": 19 scenarios from 10 files in " in said and "0 records skipped" in said
+    entries = ScenarioSet.open(out).entries
+    assert Counter(entry["tags"]["source_format"] for entry in entries) == {
+        name: scenarios for name, (_, scenarios) in FORMATS.items()
+    }
+    ScenarioSet.open(out).check()
+
+
+def test_real_windows_of_a_recording_share_a_split(everything):
+    out, _ = everything
+    entries = {
+        (entry["dataset"], entry["scenario_id"]): entry["segment"] for entry in ScenarioSet.open(out).entries
+    }
+    splits = {}
+    for name in ("train", "validation", "test"):
+        for line in (out / "splits" / f"{name}.txt").read_text().splitlines():
+            segment = entries.pop(tuple(line.split("\t")))
+            assert splits.setdefault(segment, name) == name
+    assert not entries and len(splits) == 10
+
+
+def test_doctor_agrees_with_the_conversion(real_data):
+    said = " ".join(drivax("doctor", real_data).split())
+    assert "about 19 scenarios" in said and "missing" not in said
+    for name, (files, _) in FORMATS.items():
+        assert f"format {name}: " in said and files
+
+
+def test_filters_of_the_command_line(real_data, tmp_path):
+    said = drivax(
+        "convert", real_data / "scenarionet", tmp_path / "set", "--filter", "dataset=nuscenes", "--limit", "2"
+    )
+    assert ": 2 scenarios from " in said
+    assert {entry["dataset"] for entry in ScenarioSet.open(tmp_path / "set").entries} == {"nuscenes"}

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.schema import Capacity, Flag, Scenario, SourceCounts, record_dtype
+from drivax.scenario.partial import begun
+from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Flag, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 SMALL = Capacity(
@@ -42,7 +43,7 @@ def make_scenario(number: int, capacity: Capacity = SMALL) -> Scenario:
     record["segment"] = f"segment-{number // 2}".encode()
     record["flags"] = int(Flag.LIGHTS | Flag.ROUTE)
     record["segment_blocks"] = (0, 2, 5, 7)
-    source = SourceCounts(5, number, number // 2, {"lane": 3}, 40, 1)
+    source = SourceCounts(5, number, number // 2, {"lane": 3}, 40, 1, {"dangling_links": 2})
     return Scenario(record, capacity, source, {"agents": 2}, {"collision": False}, {"domain": "urban"})
 
 
@@ -95,7 +96,7 @@ def test_manifest(scenario_set: Path):
         "segments": 7,
         "source": {
             "steps": 5, "tracks": 3, "tracks_valid_now": 1, "map_features": {"lane": 3}, "map_points": 40,
-            "lights": 1,
+            "lights": 1, "lost": {"dangling_links": 2},
         },
         "overflow": {"agents": 2},
         "audit": {"collision": False},
@@ -162,6 +163,10 @@ def test_records_are_batches_in_the_order_asked_for(scenario_set: Path):
         opened.records([7])
     records["agent_xy"] = 0.0  # copies: the set must not change
     assert np.any(opened[0].agent_xy)
+    assert opened.records([2, 3, 1, 0, 5, 6], out=records) is records
+    np.testing.assert_array_equal(records["agent_xy"][3], make_scenario(0).record["agent_xy"])
+    with pytest.raises(UsageError, match="size and type"):
+        opened.records([1, 2], out=records)
 
 
 def test_scenarios_are_read_only_views(scenario_set: Path):
@@ -336,7 +341,9 @@ def test_no_set(tmp_path: Path, scenario_set: Path):
         ScenarioSet.open(scenario_set)
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"schema_version": 1}', "null", "\\x00\\xff"])
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", "{}", f'{{"schema_version": {SCHEMA_VERSION}}}', "null", "\\x00\\xff"]
+)
 def test_damaged_manifest(scenario_set: Path, content: str):
     (scenario_set / "manifest.json").write_text(content)
     with pytest.raises(DataError, match=r"manifest\.json: manifest is damaged.*; convert"):
@@ -346,8 +353,11 @@ def test_damaged_manifest(scenario_set: Path, content: str):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schema_version": 2}, "schema version 2, this drivax reads 1; upgrade drivax"),
-        ({"schema_version": 0}, "schema version 0, this drivax reads 1; convert or generate"),
+        (
+            {"schema_version": SCHEMA_VERSION + 1},
+            f"schema version {SCHEMA_VERSION + 1}, this drivax reads {SCHEMA_VERSION}; upgrade drivax",
+        ),
+        ({"schema_version": 1}, f"schema version 1, this drivax reads {SCHEMA_VERSION}; convert or generate"),
         ({"fields": []}, "field table"),
         ({"capacity": {"agnets": 3}}, "manifest is damaged"),
         ({"scenarios": [{"scenario_id": "x"}]}, "manifest is damaged"),
@@ -386,3 +396,111 @@ def test_a_killed_writer_leaves_nothing_under_the_name(tmp_path: Path):
     )
     assert result.returncode == -9
     assert not (tmp_path / "set").exists()
+
+
+# --- Sets that can be continued.
+
+IDENTITY = {"data": "seven scenarios", "limit": 7}
+
+
+def continued(path: Path, stop: int | None = None, **options) -> list:
+    """Writes seven scenarios in shards of two, beginning where an earlier writer was; fails before ``stop``."""
+    options = {"source": {"command": "test"}, "shard_size": 2, "identity": IDENTITY, **options}
+    with ScenarioWriter(path, SMALL, **options) as writer:
+        first = writer.notes[-1] if writer.notes else 0
+        assert len(writer) == first
+        for number in range(first, 7):
+            if number == stop:
+                raise RuntimeError
+            assert writer.room == 2 - number % 2
+            writer.add(make_scenario(number), note=number + 1)
+        return writer.notes
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()
+    }
+
+
+@pytest.mark.parametrize("stops", [(3,), (2, 5), (0, 1, 6, 6)])
+def test_a_writer_continues_after_the_last_closed_shard(tmp_path: Path, stops: tuple[int, ...]):
+    continued(tmp_path / "whole")
+    for stop in stops:
+        with pytest.raises(RuntimeError):
+            continued(tmp_path / "set", stop)
+        assert not (tmp_path / "set").exists()
+    assert continued(tmp_path / "set") == [number for number in (2, 4, 6) if number <= max(stops)]
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "whole"]
+
+
+def test_nothing_is_kept_without_a_closed_shard(tmp_path: Path):
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_begun_for_something_else_is_not_continued(tmp_path: Path):
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=3)
+    with pytest.raises(UsageError, match=r"other options \(limit\); .*--overwrite"):
+        continued(tmp_path / "set", identity={**IDENTITY, "limit": 8})
+    assert begun(tmp_path / "set")
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=1, identity={**IDENTITY, "limit": 8}, overwrite=True)
+    assert not begun(tmp_path / "set")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_overwrite_continues_the_same(tmp_path: Path):
+    continued(tmp_path / "set")
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=5, overwrite=True)
+    assert len(ScenarioSet.open(tmp_path / "set")) == 7  # the old set stays until the new one is whole
+    assert continued(tmp_path / "set", overwrite=True) == [2, 4]
+
+
+def test_a_damaged_note_costs_its_shard_only(tmp_path: Path):
+    continued(tmp_path / "whole")
+    with pytest.raises(RuntimeError):
+        continued(tmp_path / "set", stop=5)
+    (tmp_path / ".set.partial" / "progress" / "00001.json").write_text('{"shard": ')
+    assert continued(tmp_path / "set") == [2]
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+def test_two_writers_at_once_are_refused(tmp_path: Path):
+    with ScenarioWriter(tmp_path / "set", SMALL, identity=IDENTITY) as writer:
+        writer.add(make_scenario(0))
+        with (
+            pytest.raises(UsageError, match="another process is writing it; wait"),
+            ScenarioWriter(tmp_path / "set", SMALL, identity=IDENTITY),
+        ):
+            pass
+    assert len(ScenarioSet.open(tmp_path / "set")) == 1
+
+
+@pytest.mark.parametrize("adds", [1, 3, 6, 7])
+def test_a_killed_writer_is_continued_to_the_same_bytes(tmp_path: Path, adds: int):
+    continued(tmp_path / "whole")
+    program = (
+        "import os, sys; sys.path.insert(0, sys.argv[2]); import test_store as t\n"
+        "from pathlib import Path\n"
+        "make, count = t.make_scenario, 0\n"
+        "def counted(number):\n"
+        "    global count\n"
+        f"    if count == {adds}: os.kill(os.getpid(), 9)\n"
+        "    count += 1\n"
+        "    return make(number)\n"
+        "t.make_scenario = counted\n"
+        "publish = t.ScenarioWriter._finish\n"
+        f"t.ScenarioWriter._finish = lambda w: os.kill(os.getpid(), 9) if {adds} == 7 else publish(w)\n"
+        "t.continued(Path(sys.argv[1]))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "set"), str(Path(__file__).parent)]
+    assert subprocess.run(command, check=False).returncode == -9
+    assert not (tmp_path / "set").exists()
+    assert continued(tmp_path / "set") == [number for number in (2, 4, 6) if number <= adds]
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "whole"]

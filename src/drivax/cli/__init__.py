@@ -36,8 +36,12 @@ COMMANDS = {
     "demo": Command(
         "drivax.cli.demo", "Demo", "the whole job on the built-in world: make, train, judge, report"
     ),
+    "doctor": Command(
+        "drivax.cli.doctor", "Doctor", "what is installed, or what a file or folder of data is"
+    ),
     "generate": Command("drivax.cli.generate", "Generate", "scenarios of the built-in world -> scenario set"),
     "convert": Command("drivax.cli.convert", "Convert", "public data set -> scenario set"),
+    "export": Command("drivax.cli.export", "Export", "part of a scenario set, or another format, from a set"),
     "inspect": Command("drivax.cli.inspect", "Inspect", "what a scenario set holds, and whether it is sound"),
     "view": Command("drivax.cli.view", "View", "one HTML page in which a scenario set can be browsed"),
     "curate": Command("drivax.cli.curate", "Curate", "how critical each scenario is: scores for a set"),

@@ -10,8 +10,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from drivax.datasets.convert import Conversion, Converted, convert
+from drivax.datasets.convert import Conversion, Converted, Plan, convert
+from drivax.datasets.estimate import counted
+from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
+from drivax.scenario.partial import begun
 from drivax.tracking.progress import Progress
 
 _SHOWN = 20
@@ -21,13 +24,13 @@ _SHOWN = 20
 class Convert:
     """Convert recordings of a public data set to a scenario set.
 
-    Reads one file, or all files of known formats in a folder.
+    Reads one file, or all files of known formats in a folder, and says which records had to be skipped, and why.
+    A conversion that was killed is continued by the same command.
 
-    Says which records had to be skipped, and why.
+    Formats: womd-scenario, womd-example, scenariomax, scenarionet, av2-motion, av2-sensor, nuplan, nuscenes, gpudrive
+    (docs/data/index.md says how to get them). drivax doctor SRC tells what SRC is.
 
-    Formats: womd-scenario, womd-example (docs/data/womd.md says how to get them).
-
-    Example: drivax convert womd/training sets/womd --workers 8
+    Example: drivax convert womd/training sets/womd --workers 8 --split 80/10/10
     """
 
     src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
@@ -39,13 +42,21 @@ class Convert:
     capacity: Literal["default", "large"] = "default"
     """Padded sizes; large for scenes with more than 80 moving agents or very dense maps."""
     limit: int | None = None
-    """Stop after so many scenarios."""
+    """Stop when the set holds so many scenarios."""
+    filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Keep only scenarios for which this holds (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
+    routes: Literal["graph", "published"] = "graph"
+    """How routes are found: our generator, or the published breadth-first one."""
+    stride: int = 40
+    """Steps between the starts of two windows of a recording that is longer than 91 steps."""
+    split: str | None = None
+    """Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10."""
     workers: int | None = None
     """Processes that read; as many as there are CPU cores by default."""
     strict: bool = False
     """Stop at the first record that cannot be read instead of skipping it."""
     overwrite: bool = False
-    """Replace OUT if it is a scenario set."""
+    """Replace OUT if it is a scenario set; start anew if another conversion to OUT was begun."""
 
 
 def run(args: Convert) -> int:
@@ -54,6 +65,10 @@ def run(args: Convert) -> int:
         format=args.format,
         capacity=args.capacity,
         limit=args.limit,
+        filters=args.filter,
+        routes=args.routes,
+        stride=args.stride,
+        split=args.split,
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
         strict=args.strict,
         overwrite=args.overwrite,
@@ -63,28 +78,41 @@ def run(args: Convert) -> int:
         def report(done: int, files: int, scenarios: int) -> None:
             bar.update(done, f"{scenarios:,} scenarios", files)
 
-        result = convert(args.src, args.out, options, report, audit)
+        try:
+            result = convert(args.src, args.out, options, report, audit, _announce)
+        except BaseException as error:
+            if not isinstance(error, UsageError) and begun(args.out):
+                print("drivax: what is finished is kept, the same command continues", file=sys.stderr)
+            raise
     print(summary(result))
     for bad in result.skipped[:_SHOWN]:
         print(f"skipped {bad.error()}", file=sys.stderr)
     if len(result.skipped) > _SHOWN:
-        print(f"skipped {len(result.skipped) - _SHOWN} more", file=sys.stderr)
+        print(f"skipped {len(result.skipped) - _SHOWN} more; manifest.json lists all", file=sys.stderr)
     return 0
+
+
+def _announce(plan: Plan) -> None:
+    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.found.formats.items())]
+    unknown = len(plan.found.inputs) - plan.found.formats.total()
+    parts += [f"{counted(unknown, 'file')} of no known format"] if unknown else []
+    print(f"found {', '.join(parts)}: {plan.estimate}", flush=True)
+    if plan.written:
+        print(f"continuing after {counted(plan.written, 'scenario')}", flush=True)
 
 
 def summary(result: Converted) -> str:
     """One line about a conversion."""
-    rate = result.scenarios / max(result.seconds, 1e-9)
+    rate = (result.scenarios - result.written) / max(result.seconds, 1e-9)
     parts = [
         f"{counted(result.scenarios, 'scenario')} from {counted(result.files, 'file')}"
         f" in {result.seconds:.1f} s ({rate:.1f}/s)",
         f"{counted(len(result.skipped), 'record')} skipped",
     ]
+    if result.written:
+        parts.insert(1, f"{result.written:,} of them written before")
+    if result.filtered:
+        parts.append(f"{counted(result.filtered, 'scenario')} left out by filters")
     if result.ignored:
         parts.append(f"{counted(result.ignored, 'file')} of other formats ignored")
     return f"{result.path}: " + ", ".join(parts)
-
-
-def counted(number: int, noun: str) -> str:
-    """A number with its noun, in the plural where it must be."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

@@ -10,6 +10,8 @@ from typing import Literal
 import tyro
 
 from drivax.evaluation.audit import audit
+from drivax.scenario.splits import parse_shares, write_splits
+from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import GeneratedSet, Generation, generate
 from drivax.tracking.progress import Progress
 
@@ -34,12 +36,15 @@ class Generate:
     """Processes; as many as there are CPU cores by default."""
     capacity: Literal["default", "large"] = "default"
     """Padded sizes; sets that are used together need the same."""
+    split: str | None = None
+    """Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10."""
     overwrite: bool = False
     """Replace OUT if it is a scenario set."""
 
 
 def run(args: Generate) -> int:
     """Generate, then print the rate and what was rejected per family."""
+    shares = None if args.split is None else parse_shares(args.split)
     options = Generation(
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
         capacity=args.capacity,
@@ -54,6 +59,8 @@ def run(args: Generate) -> int:
             lambda done, total: bar.update(done, total=total),
             audit,
         )
+    if shares is not None:
+        write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
     print(summary(result))
     return 0
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.manifest import sync_folder
+from drivax.scenario.partial import sync_folder
 from drivax.scenario.store import ScenarioSet
 
 SCORES_VERSION = 1

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
-import os
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -133,20 +134,79 @@ def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[
     return shape, dtype
 
 
-def sync_and_close(file: IO[bytes]) -> None:
-    """Bring a file to the disk and close it."""
-    file.flush()
-    os.fsync(file.fileno())
-    file.close()
+class Shard:
+    """One shard file: its expected layout, its memory map, and which records were found intact."""
 
+    def __init__(self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any]) -> None:
+        self.path = folder / entry["file"]
+        self.crc_path = folder / crc_name(entry["file"])
+        self.count = int(entry["count"])
+        self._sha256 = entry["sha256"]
+        self._dtype = dtype
+        self._data: np.ndarray[Any, Any] | None = None
+        self._crcs = np.zeros(0, np.uint32)
+        self._intact = np.zeros(self.count, bool)
 
-def sync_folder(folder: Path) -> None:
-    """Bring a folder's names to the disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    def check_files(self) -> int:
+        """Test presence, layout and size; returns the offset of the first record."""
+        for path in (self.path, self.crc_path):
+            if not path.is_file():
+                raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
+        with self.path.open("rb") as file:
+            shape, dtype = read_header(file, self.path)
+            offset = file.tell()
+        if shape != (self.count,) or dtype != self._dtype:
+            raise DataError("shard does not have the layout its manifest names", file=self.path, cure=AGAIN)
+        size = self.path.stat().st_size
+        if size != offset + self.count * self._dtype.itemsize:
+            whole = max(0, size - offset) // self._dtype.itemsize
+            raise DataError(
+                f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}",
+                file=self.path,
+                record=min(whole, self.count),
+                cure=f"copy the file again or {AGAIN}",
+            )
+        return offset
+
+    def record(self, row: int, verify: bool) -> np.ndarray[Any, Any]:
+        """The bytes of a record ``[itemsize]``, a view of the file; tested at its first use, if asked for.
+
+        Raises:
+            DataError: It is damaged.
+        """
+        data = self._map() if self._data is None else self._data
+        if verify and not self._intact[row]:
+            self._test(data, row)
+        return data[row]
+
+    def check_digest(self) -> None:
+        """Compare the file's SHA-256 with the manifest's."""
+        with self.path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != self._sha256:
+                raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
+
+    def _map(self) -> np.ndarray[Any, Any]:
+        offset = self.check_files()
+        shape = (self.count, self._dtype.itemsize)
+        # A plain view of the map: memmap's own indexing costs Python time per access.
+        self._data = np.asarray(np.memmap(self.path, np.uint8, "r", offset, shape))
+        with self.crc_path.open("rb") as file:
+            shape, dtype = read_header(file, self.crc_path)
+            crcs = file.read()
+        if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
+            raise DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
+        self._crcs = np.frombuffer(crcs, np.uint32)
+        return self._data
+
+    def _test(self, data: np.ndarray[Any, Any], row: int) -> None:
+        if zlib.crc32(data[row].data) != int(self._crcs[row]):
+            raise DataError(
+                "checksum mismatch, the record is damaged",
+                file=self.path,
+                record=row,
+                cure=f"copy the file again or {AGAIN}",
+            )
+        self._intact[row] = True
 
 
 def _text(value: Any) -> str:

@@ -5,6 +5,7 @@ A set is a folder::
     manifest.json        schema version, capacity, field table, shards, one entry per scenario
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
+    splits/              lists for training, validation and test, if asked for (``scenario.splits``)
 
 Any tool reads a shard with ``numpy.load(path, mmap_mode="r")``; record ``i`` lies at a fixed offset, so one
 scenario is one range read. Sets appear under their name only when they are complete. Numpy only, so that
@@ -15,8 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
-import os
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,18 +30,18 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.manifest import (
     AGAIN,
     MANIFEST,
+    Shard,
     crc_name,
     field_table,
     manifest_entry,
     plain,
-    read_header,
     read_manifest,
     shard_name,
-    sync_and_close,
-    sync_folder,
     write_header,
 )
+from drivax.scenario.partial import PartialFolder, sync_and_close, write_json
 from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
+from drivax.scenario.splits import Shares, write_splits
 
 
 class ScenarioWriter:
@@ -51,12 +50,15 @@ class ScenarioWriter:
     Args:
         path: Folder to create.
         capacity: Padded sizes that all scenarios of the set share.
-        source: Where the scenarios come from, as plain JSON values.
+        source: Where the scenarios come from, as plain JSON values; may be completed until the block ends.
         shard_size: Records per shard.
         overwrite: Replace an existing scenario set; other folders are never replaced.
+        shares: Percentages of train, validation and test for the files of ``splits/``; None: no such files.
+        identity: What is written, for a set that can be continued: closed shards outlive an exception or a kill, and
+            the next writer with the same identity begins after them (:attr:`notes`).
 
     Raises:
-        UsageError: ``path`` exists, or a scenario has another capacity.
+        UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
         DataError: A scenario's id is in the set already, or no scenario was added.
     """
 
@@ -67,6 +69,8 @@ class ScenarioWriter:
         source: Mapping[str, Any] | None = None,
         shard_size: int = 512,
         overwrite: bool = False,
+        shares: Shares | None = None,
+        identity: Mapping[str, Any] | None = None,
     ) -> None:
         if shard_size < 1:
             raise UsageError(f"shard_size is {shard_size}", cure="use 1 or more")
@@ -74,24 +78,59 @@ class ScenarioWriter:
         self.capacity = capacity
         self.overwrite = overwrite
         self._refuse_existing()
-        self._source = plain(dict(source or {}))
+        self.source: dict[str, Any] = plain(dict(source or {}))
+        #: What :meth:`add` was told with the last scenario of every shard that an earlier writer closed.
+        self.notes: list[Any] = []
         self._shard_size = shard_size
+        self._shares = shares
         self._buffer = np.zeros(1, record_dtype(capacity))
         self._entries: list[dict[str, Any]] = []
         self._known: set[tuple[str, str]] = set()
         self._shards: list[dict[str, Any]] = []
         self._crcs: list[int] = []
         self._file: IO[bytes] | None = None
-        self._folder = self.path.parent / f".{self.path.name}.partial-{os.getpid()}"
+        self._partial = PartialFolder(self.path, identity)
 
     def __enter__(self) -> Self:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(self._folder, ignore_errors=True)
-        self._folder.mkdir()
+        for part in self._partial.open(anew=self.overwrite):
+            if (
+                part["shard"]["count"] < self._shard_size
+            ):  # closed by the end of the data: that end comes again
+                break
+            self._shards.append(part["shard"])
+            self._entries += part["scenarios"]
+            self.notes.append(part["note"])
+        self._known = {_key(entry) for entry in self._entries}
+        names = {name for shard in self._shards for name in (shard["file"], crc_name(shard["file"]))}
+        for left in self._partial.content.iterdir():  # of a shard that was never closed
+            if left.name not in names:
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
         return self
 
-    def add(self, scenario: Scenario) -> None:
-        """Append one scenario."""
+    @property
+    def folder(self) -> Path:
+        """Where the set is being made; for files that are needed until it is complete."""
+        return self._partial.root
+
+    @property
+    def room(self) -> int:
+        """How many more scenarios the current shard holds."""
+        return self._shard_size - len(self._crcs)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __contains__(self, key: object) -> bool:
+        """Whether a scenario is in the set, by its (dataset, scenario id)."""
+        return key in self._known
+
+    def add(self, scenario: Scenario, note: Any = None) -> None:
+        """Append one scenario.
+
+        Args:
+            scenario: What to append.
+            note: What :attr:`notes` shall tell a later writer if this scenario fills its shard, as JSON values.
+        """
         if scenario.capacity != self.capacity:
             raise UsageError(
                 f"capacity is {scenario.capacity.name!r}, the set's is {self.capacity.name!r}",
@@ -100,7 +139,7 @@ class ScenarioWriter:
                 cure="assemble it with the capacity of the set",
             )
         entry = manifest_entry(scenario)
-        key = (entry["dataset"], entry["scenario_id"])
+        key = _key(entry)
         if key in self._known:
             raise DataError(
                 f"a scenario {key[1]!r} of {key[0]!r} is in the set already",
@@ -111,6 +150,8 @@ class ScenarioWriter:
         self._write_record(scenario)
         self._known.add(key)
         self._entries.append(entry)
+        if self.room == 0:
+            self._close_shard(note)
 
     def _write_record(self, scenario: Scenario) -> None:
         # Field by field into a zeroed buffer: the bytes between fields stay zero, so sets are reproducible.
@@ -118,27 +159,29 @@ class ScenarioWriter:
             self._buffer[name][0] = scenario.record[name]
         data = self._buffer.tobytes()
         if self._file is None:
-            self._file = (self._folder / shard_name(len(self._shards))).open("wb")
+            self._file = (self._partial.content / shard_name(len(self._shards))).open("wb")
             write_header(self._file, self._buffer.dtype, 0)
         self._file.write(data)
         self._crcs.append(zlib.crc32(data))
-        if len(self._crcs) == self._shard_size:
-            self._close_shard()
 
-    def _close_shard(self) -> None:
+    def _close_shard(self, note: Any) -> None:
         if self._file is None:
             return
-        name = shard_name(len(self._shards))
+        folder, name, count = self._partial.content, shard_name(len(self._shards)), len(self._crcs)
         self._file.seek(0)
-        write_header(self._file, self._buffer.dtype, len(self._crcs))
+        write_header(self._file, self._buffer.dtype, count)
         sync_and_close(self._file)
         self._file = None
-        with (self._folder / crc_name(name)).open("wb") as file:
+        with (folder / crc_name(name)).open("wb") as file:
             np.save(file, np.array(self._crcs, np.uint32))
             sync_and_close(file)
-        with (self._folder / name).open("rb") as file:
+        with (folder / name).open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        self._shards.append({"file": name, "count": len(self._crcs), "sha256": digest})
+        shard = {"file": name, "count": count, "sha256": digest}
+        self._partial.note(
+            len(self._shards), {"shard": shard, "note": note, "scenarios": self._entries[-count:]}
+        )
+        self._shards.append(shard)
         self._crcs = []
 
     def __exit__(
@@ -150,36 +193,27 @@ class ScenarioWriter:
         finally:
             if self._file is not None:
                 self._file.close()
-            shutil.rmtree(self._folder, ignore_errors=True)
+            self._partial.close()
 
     def _finish(self) -> None:
-        self._close_shard()
         if not self._entries:
             raise DataError("no scenario to write", file=self.path, cure="check what was skipped and why")
+        self._close_shard(None)
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "drivax_version": metadata.version("drivax"),
             "capacity": dataclasses.asdict(self.capacity),
             "fields": field_table(self.capacity),
             "record_bytes": self._buffer.dtype.itemsize,
-            "source": self._source,
+            "source": plain(self.source),
             "shards": self._shards,
             "scenarios": self._entries,
         }
-        with (self._folder / MANIFEST).open("wb") as file:
-            file.write(json.dumps(manifest, indent=1, allow_nan=False).encode())
-            sync_and_close(file)
-        self._publish()
-
-    def _publish(self) -> None:
-        sync_folder(self._folder)
+        if self._shares is not None:
+            write_splits(self._partial.content, self._entries, self._shares)
+        write_json(self._partial.content / MANIFEST, manifest)
         self._refuse_existing()  # someone may have written it in the meantime
-        old = self.path.parent / f".{self.path.name}.old-{os.getpid()}"
-        if self.path.exists():
-            self.path.rename(old)
-        self._folder.rename(self.path)
-        sync_folder(self.path.parent)
-        shutil.rmtree(old, ignore_errors=True)
+        self._partial.publish()
 
     def _refuse_existing(self) -> None:
         path = self.path
@@ -211,7 +245,7 @@ class ScenarioSet(Sequence[Scenario]):
         self.capacity = Capacity(**manifest["capacity"])
         self.entries: list[dict[str, Any]] = manifest["scenarios"]
         self._dtype = record_dtype(self.capacity)
-        self._shards = [_Shard(self.path, shard, self._dtype) for shard in manifest["shards"]]
+        self._shards = [Shard(self.path, shard, self._dtype) for shard in manifest["shards"]]
         self._starts = np.cumsum([0, *(shard.count for shard in self._shards)])
 
     @classmethod
@@ -242,7 +276,7 @@ class ScenarioSet(Sequence[Scenario]):
             return [self[i] for i in range(*index.indices(len(self)))]
         shard, row = self._locate(int(index))
         entry = self.entries[self._starts[shard] + row]
-        record = self._shards[shard].rows([row], self.verify)[row]
+        record = self._shards[shard].record(row, self.verify)
         return Scenario(
             record=record.view(self._dtype).reshape(()),
             capacity=self.capacity,
@@ -265,22 +299,35 @@ class ScenarioSet(Sequence[Scenario]):
             "".join(shard["sha256"] for shard in self.manifest["shards"]).encode()
         ).hexdigest()
 
-    def records(self, indices: Any) -> np.ndarray[Any, Any]:
-        """Copies of many records at once: structured array ``[n]``, in the order of ``indices``."""
+    def records(self, indices: Any, out: np.ndarray[Any, Any] | None = None) -> np.ndarray[Any, Any]:
+        """Copies of many records at once: structured array ``[n]``, in the order of ``indices``.
+
+        Args:
+            indices: Which; negative ones count from the end.
+            out: Where to put them: what an earlier call of as many returned. A loader that reads batch after batch
+                reads twice as fast into the same memory.
+
+        Raises:
+            IndexError: There is no such scenario.
+            DataError: A record is damaged.
+        """
         wanted = np.asarray(indices, np.int64).reshape(-1)
         total = len(self)
         if wanted.size and (wanted.min() < -total or wanted.max() >= total):
             raise IndexError(f"scenario indices must be in [-{total}, {total})")
         wanted = np.where(wanted < 0, wanted + total, wanted)
-        out = np.empty((wanted.size, self._dtype.itemsize), np.uint8)
+        if out is None:
+            out = np.empty(wanted.size, self._dtype)
+        if out.shape != wanted.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
+            raise UsageError(
+                "out has not the size and type of the records", file=self.path, cure="leave it out"
+            )
+        data = out.view(np.uint8).reshape(wanted.size, self._dtype.itemsize)
         owner = np.searchsorted(self._starts, wanted, side="right") - 1
-        for number in np.unique(owner):
-            places = np.flatnonzero(owner == number)
-            rows = wanted[places] - self._starts[number]
-            data = self._shards[number].rows(rows, self.verify)
-            for place, row in zip(places, rows, strict=True):  # one contiguous copy each; take() is slower
-                out[place] = data[row]
-        return out.view(self._dtype).reshape(-1)
+        # One contiguous copy each, right after the test that brought it into the cache; take() is slower.
+        for place, (shard, index) in enumerate(zip(owner.tolist(), wanted.tolist(), strict=True)):
+            data[place] = self._shards[shard].record(index - int(self._starts[shard]), self.verify)
+        return out
 
     def check(self) -> None:
         """Read everything: every record's CRC and every shard's SHA-256.
@@ -289,7 +336,8 @@ class ScenarioSet(Sequence[Scenario]):
             DataError: The first damaged record or shard.
         """
         for shard in self._shards:
-            shard.rows(range(shard.count), verify=True)
+            for row in range(shard.count):
+                shard.record(row, verify=True)
             shard.check_digest()
 
     def _locate(self, index: int) -> tuple[int, int]:
@@ -300,74 +348,5 @@ class ScenarioSet(Sequence[Scenario]):
         return shard, index - int(self._starts[shard])
 
 
-class _Shard:
-    """One shard file: its expected layout, its memory map, and which records were found intact."""
-
-    def __init__(self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any]) -> None:
-        self.path = folder / entry["file"]
-        self.crc_path = folder / crc_name(entry["file"])
-        self.count = int(entry["count"])
-        self._sha256 = entry["sha256"]
-        self._dtype = dtype
-        self._data: np.ndarray[Any, Any] | None = None
-        self._crcs = np.zeros(0, np.uint32)
-        self._intact = np.zeros(self.count, bool)
-
-    def check_files(self) -> int:
-        """Test presence, layout and size; returns the offset of the first record."""
-        for path in (self.path, self.crc_path):
-            if not path.is_file():
-                raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
-        with self.path.open("rb") as file:
-            shape, dtype = read_header(file, self.path)
-            offset = file.tell()
-        if shape != (self.count,) or dtype != self._dtype:
-            raise DataError("shard does not have the layout its manifest names", file=self.path, cure=AGAIN)
-        size = self.path.stat().st_size
-        if size != offset + self.count * self._dtype.itemsize:
-            whole = max(0, size - offset) // self._dtype.itemsize
-            raise DataError(
-                f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}",
-                file=self.path,
-                record=min(whole, self.count),
-                cure=f"copy the file again or {AGAIN}",
-            )
-        return offset
-
-    def rows(self, rows: Any, verify: bool) -> np.ndarray[Any, Any]:
-        """The shard's records as bytes ``[count, itemsize]``, those in ``rows`` tested before."""
-        data = self._map() if self._data is None else self._data
-        if verify:
-            for row in rows:
-                if not self._intact[row]:
-                    self._test(data, int(row))
-        return data
-
-    def check_digest(self) -> None:
-        """Compare the file's SHA-256 with the manifest's."""
-        with self.path.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != self._sha256:
-                raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
-
-    def _map(self) -> np.ndarray[Any, Any]:
-        offset = self.check_files()
-        shape = (self.count, self._dtype.itemsize)
-        # A plain view of the map: memmap's own indexing costs Python time per access.
-        self._data = np.asarray(np.memmap(self.path, np.uint8, "r", offset, shape))
-        with self.crc_path.open("rb") as file:
-            shape, dtype = read_header(file, self.crc_path)
-            crcs = file.read()
-        if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
-            raise DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
-        self._crcs = np.frombuffer(crcs, np.uint32)
-        return self._data
-
-    def _test(self, data: np.ndarray[Any, Any], row: int) -> None:
-        if zlib.crc32(data[row].data) != int(self._crcs[row]):
-            raise DataError(
-                "checksum mismatch, the record is damaged",
-                file=self.path,
-                record=row,
-                cure=f"copy the file again or {AGAIN}",
-            )
-        self._intact[row] = True
+def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
+    return entry["dataset"], entry["scenario_id"]

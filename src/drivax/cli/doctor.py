@@ -1,0 +1,155 @@
+"""``drivax doctor``: what is installed on this machine, or what a path holds and what is wrong with it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from drivax.datasets.diagnosis import Diagnosis, Part, diagnose
+from drivax.datasets.estimate import counted, free_bytes, gigabytes
+
+_COLUMNS = 100
+#: Modules of every extra, and what it is for.
+_EXTRAS = {
+    "womd": (("google.protobuf", "google_crc32c"), "Waymo, ScenarioMax"),
+    "av2": (("pyarrow",), "Argoverse 2"),
+    "maps": (("shapely", "pyproj"), "nuPlan, Argoverse 2, nuScenes"),
+    "show": (("matplotlib", "av"), "pictures and videos"),
+    "track": (("tensorboardX",), "TensorBoard"),
+    "gym": (("gymnasium",), "Gymnasium"),
+}
+#: JAX is asked in a process of its own: a broken accelerator may hang or end it.
+_ASK_JAX = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Tell what is installed here, or what a file or folder is and what is wrong with it.
+
+    With PATH: the data set, its flavour and version, how many recordings and scenarios, what is missing, and what to
+    use instead of what drivax does not read. Exit status 1 where nothing of it can be converted.
+
+    Example: drivax doctor womd/training
+    """
+
+    path: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]")] = None
+    """File or folder to look at; without it, this machine and what is installed."""
+
+
+def run(args: Doctor) -> int:
+    """Print the findings."""
+    console = Console(
+        width=min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS, highlight=False
+    )
+    if args.path is None:
+        console.print(_table(machine()))
+        return 0
+    found = diagnose(args.path)
+    console.print(_table(findings(found)))
+    return 0 if found.convertible else 1
+
+
+def machine() -> Iterator[tuple[str, str]]:
+    """What is installed and what the machine has, as (name, value)."""
+    yield "drivax", metadata.version("drivax")
+    yield "python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    yield "jax", metadata.version("jax")
+    yield "devices", devices()
+    for extra, (modules, purpose) in _EXTRAS.items():
+        absent = [module for module in modules if not _installed(module)]
+        state = "installed" if not absent else f"{', '.join(absent)} missing: pip install 'drivax[{extra}]'"
+        yield f"{extra} ({purpose})", state
+    yield "cores", str(os.cpu_count())
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    yield "memory", gigabytes(memory)
+    yield "disk", f"{gigabytes(free_bytes(Path.cwd()))} free here"
+
+
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the package around it is missing
+        return False
+
+
+def devices(timeout_s: float = 60.0) -> str:
+    """What JAX computes on, or why it cannot say."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _ASK_JAX], capture_output=True, text=True, timeout=timeout_s, check=False
+        )
+        if done.returncode == 0:
+            found = json.loads(done.stdout.splitlines()[-1])
+            return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in found)
+    except (subprocess.TimeoutExpired, ValueError, IndexError):
+        return f"JAX does not answer (within {timeout_s:.0f} s); check the driver, or set JAX_PLATFORMS=cpu"
+    last = (done.stderr.strip() or "no message").splitlines()[-1]
+    return f"JAX does not start: {last}"
+
+
+def findings(found: Diagnosis) -> Iterator[tuple[str, str]]:
+    """A diagnosis as (name, value)."""
+    yield "path", str(found.path)
+    for part in found.parts:
+        yield from _described(part, found.files[part.format])
+    yield from (("shards", sentence) for sentence in found.shards)
+    if found.parts:
+        others = []
+        if found.companions:
+            others.append(f"{found.companions:,} read along (maps, poses, tables)")
+        if found.ignored:
+            others.append(f"{found.ignored:,} of no known format, ignored")
+        if others:
+            yield "other files", ", ".join(others)
+        yield "input", gigabytes(found.input_bytes)
+    for problem in found.problems:
+        # The path stands above; a file inside it is named.
+        file = None if problem.file == found.path else problem.file
+        place = f"{file}: " if file is not None else ""
+        yield "problem", f"{place}{problem.problem}"
+        if problem.cure:
+            yield "instead", problem.cure
+    if found.convertible:
+        yield (
+            "after convert",
+            f"about {counted(found.scenarios, 'scenario')}, {gigabytes(found.set_bytes)}"
+            f" ({gigabytes(found.free_bytes)} free)",
+        )
+        yield "next", f"drivax convert {found.path} OUT"
+    else:
+        yield "verdict", "cannot be converted"
+
+
+def _described(part: Part, files: int) -> Iterator[tuple[str, str]]:
+    what = part.description
+    version = "" if what.version is None else f", version {what.version}"
+    yield "data set", f"{what.dataset}: {what.flavour}{version}"
+    number = counted(part.looked if part.whole else files, "file")
+    looked = "" if part.whole else f" ({part.looked:,} of them looked into)"
+    recordings = "" if what.recordings is None else f", {counted(what.recordings, 'recording')}"
+    yield "format", f"{part.format}: {number}{looked}{recordings}{'' if part.whole else ' in those'}"
+    yield from (("note", note) for note in what.notes)
+    yield from (("missing", name) for name in what.missing)
+
+
+def _table(rows: Iterator[tuple[str, str]]) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows:
+        table.add_row(name, Text(value))
+    return table

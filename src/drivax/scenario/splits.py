@@ -1,0 +1,72 @@
+"""Which recordings are for training, for validation and for the test: decided by recording, not by scenario.
+
+Windows of one recording overlap and look alike, so all scenarios of a segment belong to the same split. Where a
+segment belongs depends on its name alone: it stays there when data are added, and whatever else a set holds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from drivax.errors import UsageError
+
+NAMES = ("train", "validation", "test")
+#: Percentages of recordings for each of :data:`NAMES`.
+Shares = tuple[float, float, float]
+FOLDER = "splits"
+
+
+def parse_shares(text: str) -> Shares:
+    """The shares that ``80/10/10`` names.
+
+    Raises:
+        UsageError: They are not three percentages that add up to 100.
+    """
+    try:
+        train, validation, test = (float(part) for part in text.split("/"))
+    except ValueError:
+        train = validation = test = math.nan
+    shares = train, validation, test
+    if not all(share >= 0 for share in shares) or abs(sum(shares) - 100.0) > 1e-6:
+        raise UsageError(
+            f"{text!r} is no split",
+            cure="give percentages of train/validation/test that add up to 100: 80/10/10",
+        )
+    return shares
+
+
+def split_of(dataset: str, segment: str, shares: Shares) -> str:
+    """The split of a recording: its SHA-256, read as a number in [0, 1), falls into one of the shares."""
+    digest = hashlib.sha256(f"{dataset}\0{segment}".encode()).digest()
+    place = int.from_bytes(digest[:8], "big") / 2**64
+    train, validation, test = shares
+    if place * 100.0 < train or validation == test == 0:
+        return NAMES[0]
+    return NAMES[1] if place * 100.0 < train + validation or test == 0 else NAMES[2]
+
+
+def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Shares) -> dict[str, int]:
+    """Write ``splits/{train,validation,test}.txt``: one line ``dataset<TAB>scenario_id`` per scenario, in order.
+
+    Args:
+        folder: The scenario set.
+        entries: Its scenarios, as in the manifest.
+        shares: Percentages of the recordings.
+
+    Returns:
+        Number of scenarios per split.
+    """
+    lines: dict[str, list[str]] = {name: [] for name in NAMES}
+    for entry in entries:
+        split = split_of(entry["dataset"], entry["segment"], shares)
+        lines[split].append(f"{entry['dataset']}\t{entry['scenario_id']}\n")
+    (folder / FOLDER).mkdir(exist_ok=True)
+    for name, members in lines.items():
+        draft = folder / FOLDER / f".{name}.txt"
+        draft.write_text("".join(members))
+        draft.rename(folder / FOLDER / f"{name}.txt")
+    return {name: len(members) for name, members in lines.items()}

@@ -1,0 +1,99 @@
+"""Split files: by recording, stable, and near the shares that were asked for."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivax.errors import UsageError
+from drivax.scenario.splits import NAMES, parse_shares, split_of, write_splits
+
+
+def entries(recordings: int, windows: int = 3) -> list[dict[str, str]]:
+    return [
+        {"dataset": "womd", "segment": f"log{log}", "scenario_id": f"log{log}@{40 * window}"}
+        for window in range(windows)
+        for log in range(recordings)
+    ]
+
+
+def read(folder: Path) -> dict[str, list[tuple[str, str]]]:
+    return {
+        name: [
+            tuple(line.split("\t")) for line in (folder / "splits" / f"{name}.txt").read_text().splitlines()
+        ]
+        for name in NAMES
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "shares"), [("80/10/10", (80, 10, 10)), ("100/0/0", (100, 0, 0)), ("99.5/0.5/0", (99.5, 0.5, 0))]
+)
+def test_shares(text, shares):
+    assert parse_shares(text) == shares
+
+
+@pytest.mark.parametrize(
+    "text", ["", "80", "80/20", "80/10/20", "90/-10/20", "a/b/c", "nan/50/50", "1/1/1/97"]
+)
+def test_shares_that_cannot_be_meant(text):
+    with pytest.raises(UsageError, match="is no split; give percentages"):
+        parse_shares(text)
+
+
+def test_place_is_the_sha_256_of_data_set_and_segment():
+    """Computed here from the definition: the first 64 bits of the digest as a fraction of one."""
+    for segment in map(str, range(50)):
+        place = int(hashlib.sha256(b"nuplan\0" + segment.encode()).hexdigest()[:16], 16) / 16**16
+        expected = "train" if place < 0.5 else "validation" if place < 0.7 else "test"
+        assert split_of("nuplan", segment, (50, 20, 30)) == expected
+
+
+def test_windows_of_a_recording_never_straddle(tmp_path):
+    counts = write_splits(tmp_path, entries(400), (60, 20, 20))
+    found = read(tmp_path)
+    logs = {name: {scenario.split("@")[0] for _, scenario in rows} for name, rows in found.items()}
+    assert not (
+        logs["train"] & logs["validation"]
+        or logs["train"] & logs["test"]
+        or logs["test"] & logs["validation"]
+    )
+    assert {name: len(rows) for name, rows in found.items()} == counts
+    assert sum(counts.values()) == 1200
+    assert {dataset for rows in found.values() for dataset, _ in rows} == {"womd"}
+    # 400 recordings: three standard deviations of a binomial share are 0.073 and 0.06.
+    assert abs(len(logs["train"]) / 400 - 0.6) < 0.08 and abs(len(logs["test"]) / 400 - 0.2) < 0.07
+
+
+def test_more_data_moves_nobody(tmp_path):
+    (tmp_path / "few").mkdir()
+    (tmp_path / "many").mkdir()
+    write_splits(tmp_path / "few", entries(50), (80, 10, 10))
+    write_splits(tmp_path / "many", entries(300)[::-1], (80, 10, 10))
+    few, many = read(tmp_path / "few"), read(tmp_path / "many")
+    assert all(set(few[name]) <= set(many[name]) for name in NAMES)
+
+
+def test_same_name_in_another_data_set_is_another_recording():
+    segments = [str(number) for number in range(200)]
+    places = [[split_of(name, segment, (50, 0, 50)) for segment in segments] for name in ("womd", "av2")]
+    assert places[0] != places[1]
+
+
+@given(st.text(min_size=1), st.sampled_from([(100, 0, 0), (0, 100, 0), (0, 0, 100)]))
+def test_a_share_of_everything_takes_everything(segment, shares):
+    assert split_of("any", segment, shares) == NAMES[shares.index(100)]
+
+
+def test_empty_splits_are_empty_files(tmp_path):
+    assert write_splits(tmp_path, entries(20), (100, 0, 0)) == {"train": 60, "validation": 0, "test": 0}
+    assert (tmp_path / "splits" / "test.txt").read_text() == ""
+    assert sorted(path.name for path in (tmp_path / "splits").iterdir()) == [
+        "test.txt",
+        "train.txt",
+        "validation.txt",
+    ]
