@@ -77,6 +77,7 @@ def test_all_within_eight_metres_is_in_the_nine_cells(scenario, block):
 
 
 def test_the_ego_is_on_the_drivable_side_of_the_nearest_edge(scenario):
+    """Check-list 7: edges are oriented, drivable side on the left."""
     a, b = ends(scenario, 0)
     good = []
     for xy in scenario.agent_xy[scenario.agent_valid[:, 0], 0].astype(np.float64):

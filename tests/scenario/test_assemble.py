@@ -31,7 +31,7 @@ CROSSWALK = MapFeature(40, RoadKind.CROSSWALK, np.array([[50.0, -2, 0], [53, -2,
 SIGN = MapFeature(41, RoadKind.STOP_SIGN, np.array([[48.0, -2.0, 0.0]]), lanes=(1,))
 
 
-def busy_recording(**changes):
+def busy_recording(features=None, **changes):
     """Ego, a car ahead, a parked car, a pedestrian that appears late; a light, a crosswalk, a stop sign, an event."""
     valid = np.ones((4, 91), dtype=bool)
     valid[3, :50] = False
@@ -44,7 +44,7 @@ def busy_recording(**changes):
     )
     states = [LightState.GO] * 40 + [LightState.STOP] * 51
     return make_recording(
-        (*straight_road(), CROSSWALK, SIGN),
+        (*(straight_road() if features is None else features), CROSSWALK, SIGN),
         tracks,
         lights=(light(1, 45.0, 0.0, states),),
         to_predict=(1,),
@@ -66,7 +66,7 @@ def same(one, other, skip=(), **tolerance) -> bool:
 
 def test_a_recording_by_hand():
     scenario = assemble(busy_recording())
-    assert (scenario.id, scenario.tags, scenario.overflow) == ("hand-made", {"dataset": "test"}, {})
+    assert (scenario.id, scenario.tags["dataset"], scenario.overflow) == ("hand-made", "test", {})
     expected = Flag.LIGHTS | Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.CLOSED_EDGES | Flag.ROUTE
     assert scenario.has == expected & ~Flag.LANE_GRAPH  # two lanes without successors are no graph
     assert scenario.agent_id[:4].tolist() == [100, 101, 103, -1]
@@ -116,6 +116,7 @@ def test_segments_point_at_their_lane_and_feature():
 
 
 def test_the_map_is_cropped_but_lanes_of_routes_stay_whole():
+    """Check-list 9: crop to the box of the log and 100 m, keep the lanes that routes need."""
     scenario = assemble(busy_recording())
     edges = slice(0, scenario.segment_blocks[1])
     assert scenario.segment_a[edges, 0].min() > -10 - 100 - 4
@@ -216,6 +217,38 @@ def test_what_does_not_fit_is_counted_and_flagged():
     assert scenario.route_points[0] == 100
 
 
+def test_what_the_source_names_but_does_not_hold_is_counted():
+    """Check-list 11: dense lane indices, dangling links and unknown lanes of the route counted, not followed."""
+    road = straight_road()
+    linked = (replace(road[0], successors=(7, 8), predecessors=(2, 9), right_neighbours=(5,)), *road[1:])
+    recording = replace(
+        busy_recording(features=linked),
+        route_lanes=(1, 77),
+        route_corridor=(1, 2, 88, 89),
+        lost={"without_type": 2, "dangling_links": 1},
+    )
+    assert assemble(recording).source.lost == {
+        "without_type": 2, "dangling_links": 4, "dangling_neighbours": 1, "route_lanes_missing": 1,
+        "route_corridor_missing": 2,
+    }  # fmt: skip
+    assert assemble(busy_recording()).source.lost == {}
+
+
+def test_numbers_that_cannot_be_metres_become_no_numbers():
+    """Sizes, widths and limits beyond all reason are unknown; they would not fit into float32."""
+    road = tuple(
+        replace(f, limit_mps=1e300, width_m=1e300) if f.kind == RoadKind.LANE_SURFACE else f
+        for f in straight_road()
+    )
+    tracks = make_tracks([driving()], size=(1e300, 2.0, 1.5))
+    scenario = assemble(make_recording(road, tracks))
+    assert scenario.lane_limit[:2].tolist() == [-1.0, -1.0]
+    assert scenario.lane_width[:2].tolist() == [3.5, 3.5]  # measured instead
+    assert (scenario.road_limit[: scenario.road_rows] == -1.0).all()
+    assert scenario.agent_size[0] == pytest.approx([4.9, 2.0, 1.5])
+    assert Flag.DEFAULT_SIZES in scenario.has
+
+
 def broken(**changes):
     return replace(busy_recording(), **changes)
 
@@ -258,6 +291,12 @@ REFUSED = [
     (broken(features=(lane(8, np.full((3, 3), np.nan)),)), "feature 8 has a point that is not finite"),
     (broken(features=(edge(8, np.zeros((0, 3))),)), "points of feature 8 have shape"),
     (broken(features=straight_road() + straight_road()), "two lanes have the id 1"),
+    (broken(features=(lane(8, line((0, 0), (2e5, 0), step=5e4)),)), "feature 8 has a point more than 100 km away"),
+    (broken(features=(lane(2**63, line((0, 0), (9, 0))),)), "the feature id 9223372036854775808 does not fit"),
+    (broken(features=tuple(lane(i, line((0, i), (9e4, i), step=1e4)) for i in range(6))), "are 540 km long"),
+    (with_tracks(xy=at(TRACKS.xy, (1, 7, 0), 1e30)), "a track is more than 100 km away from the ego"),
+    (with_tracks(velocity=at(TRACKS.velocity, (1, 7, 0), -1e30)), "a track is faster than 500 m/s"),
+    (broken(lights=(light(1, 1e9, 0, [4] * 91),)), "a light is more than 100 km away from the ego"),
     (broken(lights=(light(1, 0, 0, [4]),)), "the light of lane 1 has no state from -1 to 8 per step"),
     (broken(lights=(light(1, np.nan, 0, [4] * 91),)), "the light of lane 1 has no finite stop point"),
 ]  # fmt: skip
@@ -300,16 +339,35 @@ def test_long_recordings_must_be_cut_and_windows_do_it():
     assert [(e.kind, e.start, e.end) for e in cut[1].events] == [(2, 60, 80)]
     assert [(e.kind, e.start, e.end) for e in cut[2].events] == [(2, 20, 40)]
     assert assemble(cut[2]).agent_xy[90, 0] == pytest.approx([80, 0], abs=1e-4)
+    assert [len(list(windows(long, stride=stride))) for stride in (1, 91, 109, 110)] == [110, 2, 2, 1]
     short = make_recording()
     assert [w is short for w in windows(short)] == [True]
+    eleven_seconds = make_recording(tracks=make_tracks([driving(steps=110)]))  # as in Argoverse 2
+    assert [w.scenario_id for w in windows(eleven_seconds)] == ["hand-made@0"]
     with pytest.raises(UsageError, match="a stride of 0 steps"):
         list(windows(long, stride=0))
 
 
+def test_windows_without_the_ego_are_left_out_and_counted():
+    valid = np.ones((1, 200), dtype=bool)
+    valid[0, 40:60] = False  # the second of three windows has its current step at 50
+    long = make_recording(
+        tracks=make_tracks([driving(steps=200)], valid=valid), current_step=0, lost={"boxes": 3}
+    )
+    cut = list(windows(long))
+    assert [w.scenario_id for w in cut] == ["hand-made@0", "hand-made@80"]
+    assert [w.lost for w in cut] == [{"boxes": 3, "windows_without_ego": 1}] * 2
+    assert assemble(cut[1]).source.lost == {"boxes": 3, "windows_without_ego": 1}
+    gone = replace(long, tracks=replace(long.tracks, valid=np.zeros((1, 200), dtype=bool)))
+    with pytest.raises(DataError, match="not valid at the current step of any of 3 windows; skip"):
+        list(windows(gone))
+
+
 def test_another_vehicle_can_be_the_ego():
-    recording = replace(busy_recording(), route_lanes=(1,))
+    recording = replace(busy_recording(), route_lanes=(1,), route_corridor=(1, 2))
     other = with_ego(recording, 1)
     assert (other.scenario_id, other.segment, other.route_lanes) == ("hand-made#101", "hand-made", ())
+    assert other.route_corridor == ()
     scenario = assemble(other)
     assert scenario.agent_id[0] == 101
     assert scenario.agent_flags[0] == 1 | 2 | 4

@@ -33,6 +33,7 @@ def test_links_named_by_either_side_are_kept_and_dangling_ones_dropped():
     assert graph.successor[0].tolist() == [1, 2, -1, -1]  # the straightest first
     assert graph.predecessor[:, 0].tolist() == [-1, 0, 0]
     assert graph.flags == Flag.LANE_GRAPH
+    assert graph.lost == {"dangling_links": 3, "dangling_neighbours": 0}  # 99, 98, and 5, which is an edge
     assert graph.feature.tolist() == [0, 2, 3]
     assert lane_of_feature(graph, np.array([3, 1, 0])).tolist() == [2, -1, 0]
 
@@ -45,6 +46,7 @@ def test_links_beyond_four_are_counted():
 
 
 def test_oncoming_neighbours_are_no_neighbours_and_spacing_gives_the_width():
+    """Check-list 13: neighbours are tested for direction."""
     graph = graph_of(
         lane(1, line((0, 0), (100, 0)), left_neighbours=(2, 3), right_neighbours=(4,)),
         lane(2, line((100, 3.2), (0, 3.2)), left_neighbours=(1,)),
@@ -82,6 +84,21 @@ def test_lanes_without_any_links_are_chained_by_geometry():
     linked = graph_of(lane(1, line((0, 0), (20, 0)), successors=(77,)), lane(2, line((20, 0), (40, 0))))
     assert not linked.linked  # a source with links is taken at its word
     assert linked.flags == Flag.NONE
+
+
+def test_chaining_is_the_same_whatever_the_number_of_lanes():
+    """Check-list 24: lanes of a source without a graph, more of them than are looked at at once."""
+    rows = 30
+    features = [
+        lane(100 * row + i, line((20.0 * i, 9.0 * row), (20.0 * i + 20, 9.0 * row), step=20.0))
+        for row in range(rows)
+        for i in range(20)
+    ]
+    graph = graph_of(*features)
+    expected = [lane_id + 1 if lane_id % 100 < 19 else -1 for lane_id in graph.lane_id.tolist()]
+    found = [int(graph.lane_id[i]) if i >= 0 else -1 for i in graph.successor[:, 0]]
+    assert found == expected
+    assert graph.flags == Flag.LANE_GRAPH | Flag.CHAINED_GRAPH
 
 
 def test_limits_and_widths_that_say_nothing_are_unknown():

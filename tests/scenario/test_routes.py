@@ -2,14 +2,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import project
 from drivax.scenario.agents import local_tracks
 from drivax.scenario.assemble import ego_log
 from drivax.scenario.lane_paths import trace
+from drivax.scenario.lane_search import LaneSearch
 from drivax.scenario.lanes import LaneSegments, lane_graph
-from drivax.scenario.routes import Route, find_routes, log_progress
+from drivax.scenario.route_published import LEAST_M, published_ways, score
+from drivax.scenario.route_start import join
+from drivax.scenario.routes import Intent, Route, RouteStyle, find_routes, log_progress
 from drivax.scenario.schema import RoadKind
 from drivax.scenario.segments import cut, road_lines
 
@@ -18,13 +23,16 @@ from .recordings import arc, driving, lane, line, make_tracks
 ZERO = np.zeros(3)
 
 
-def routes_of(features, path, given=(), valid=None, heading=None, most_routes=12):
+def routes_of(features, path, most_routes=12, style: RouteStyle = "graph", **more):
+    """Routes of one log; ``given`` and ``corridor`` name lanes by id, ``valid`` and ``heading`` are the track's."""
+    given, corridor = more.pop("given", ()), more.pop("corridor", ())
     graph = lane_graph(features, ZERO)
     on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
-    tracks = local_tracks(make_tracks([path], valid=valid, heading=heading), 0, ZERO)
+    tracks = local_tracks(make_tracks([path], **more), 0, ZERO)
     ego = ego_log(tracks, 10)
     index = graph.index()
-    return find_routes(graph, on, ego, [index[i] for i in given], most_routes, 400), ego, graph
+    intent = Intent(tuple(index[i] for i in given), tuple(index[i] for i in corridor))
+    return find_routes(graph, on, ego, intent, style, most_routes, 400), ego, graph
 
 
 def check_smooth(route: Route, kink=0.2):
@@ -232,3 +240,234 @@ def test_progress_does_not_jump_to_another_branch_of_the_route():
     tracks = local_tracks(make_tracks([path]), 0, ZERO)
     progress = log_progress(route, ego_log(tracks, 10))
     assert progress == pytest.approx(path[:, 0], abs=0.05)
+
+
+def changing(at_step: int, speed: float = 12.0) -> np.ndarray:
+    """A change from y = 0 to y = 3.5 that is half done at this step."""
+    path = driving(speed=speed)
+    path[:, 1] = 3.5 / (1 + np.exp(-(path[:, 0] - (at_step - 10) * 0.1 * speed) / 5))
+    return path
+
+
+@pytest.mark.parametrize("at_step", [5, 8, 10, 12, 16])
+def test_a_lane_change_under_way_at_the_current_step_is_gone_on_with(at_step):
+    path = changing(at_step)
+    found, ego, _ = routes_of(two_lanes(), path)
+    _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
+    assert (apart <= 1.5).mean() >= 0.95
+    assert apart[: ego.current + 1].max() <= 1.0 + 0.05  # never more than a metre beside where ego drove
+    assert apart[-1] < 0.05  # on its lane in the end
+    for route in found.routes:
+        check_smooth(route, kink=0.12)
+
+
+def test_the_line_is_bent_by_what_its_distance_exceeds_a_metre():
+    straight = line((0, 0), (200, 0))
+    driven = np.stack((np.linspace(40, 60, 21), np.full(21, 3.0)), axis=-1)
+    bent = join(straight, driven, 30.0)
+    assert bent[40:61, 1] == pytest.approx(np.full(21, 2.0))
+    assert bent[75, 1] == pytest.approx(1.0)  # half of the way back: the cubic is symmetric without a slope
+    assert not bent[90:, 1].any()
+    assert not bent[:21, 1].any()
+    near = join(straight, driven - [0.0, 2.1], 30.0)
+    assert near is straight
+    slanted = driven.copy()
+    slanted[:, 1] = 1.0 + 0.1 * (slanted[:, 0] - 40)  # reaches y = 3, drifting 0.1 m per metre
+    on = join(straight, slanted, 30.0)[:, 1]
+    assert on[60] == pytest.approx(2.0)
+    assert on[61] - on[60] == pytest.approx(0.1, abs=0.02)  # it goes on as ego moves
+    one_pose = join(straight, np.array([[30.0, -2.5]]), 20.0)
+    assert one_pose[30, 1] == pytest.approx(-1.5)
+
+
+def crossing_streets():
+    """Two lanes over each other at the ego; it comes from the south-west and goes on along the second."""
+    return (
+        lane(1, line((-60, 0), (60, 0)), successors=(3,)),
+        lane(2, arc((60, 150), 150.0, -np.pi / 2 - 0.8, -np.pi / 2), successors=(3,)),
+        lane(3, line((60, 0), (400, 0))),
+    )
+
+
+def test_the_lane_that_fits_the_heading_comes_first():
+    curved = arc((60, 150), 150.0, -np.pi / 2 - 0.8, -np.pi / 2, step=0.02)
+    total = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(curved[:, :2], axis=0).T))))
+    path = np.stack([np.interp(60 + np.arange(91) * 0.5, total, curved[:, i]) for i in (0, 1)], axis=-1)
+    found, ego, graph = routes_of(crossing_streets(), path)
+    assert graph.lane_id[found.routes[0].lane[20]] == 2
+    _, apart = project(found.routes[0].xyz, ego.seen[:, :2])
+    assert apart.max() < 0.1
+
+
+def test_routes_prefer_the_corridor_of_the_intended_route():
+    """Two ways around a block of the same length: the corridor decides."""
+    features = (
+        lane(1, line((-60, 0), (20, 0)), successors=(2, 3)),
+        lane(2, line((20, 0), (50, 12), (80, 0)), successors=(4,)),
+        lane(3, line((20, 0), (50, -12), (80, 0)), successors=(4,)),
+        lane(4, line((80, 0), (400, 0))),
+    )
+    for corridor in ((1, 2, 4), (1, 3, 4)):
+        search = search_of(features, need=250.0, corridor=corridor)
+        goal = search.to_goal(np.array([100.0, 0.0, 0.0]), 0.0)[0]
+        assert [int(search.graph.lane_id[i]) for i in goal.lanes] == list(corridor)
+        first = search.alternatives(2)[0]
+        assert [int(search.graph.lane_id[i]) for i in first.lanes] == list(corridor)
+
+
+def search_of(features, need=200.0, corridor=(), xy=(0.0, 0.0), heading=0.0):
+    graph = lane_graph(features, ZERO)
+    on = LaneSegments.of(cut(road_lines(features, ZERO, None)), graph)
+    index = graph.index()
+    return LaneSearch.start(graph, on, np.array([*xy, 0.0]), heading, need, [index[i] for i in corridor])
+
+
+def test_candidates_are_as_long_as_speed_and_map_ask_and_at_most_ten():
+    """At least max(200 m, v x 12 s) ahead and 50 m past the goal, 400 points at 1 m."""
+    fast, ego, _ = routes_of(two_lanes(end=900.0), driving(speed=25.0))
+    for route in fast.routes[2:]:
+        s, _ = project(route.xyz, ego.xyz[10:11, :2])
+        assert len(route.xyz) - 1 - s[0] >= 300.0 - 1.0
+    comb = [lane(0, line((-100, 0), (10, 0)), successors=tuple(range(1, 5)))]
+    for i in range(1, 5):
+        y = 8.0 * i
+        comb.append(lane(i, line((10, 0), (60, y)), successors=tuple(range(10 * i, 10 * i + 4))))
+        comb += [lane(10 * i + j, line((60, y), (400, y + 20 * j - 30))) for j in range(4)]
+    found, _, _ = routes_of(comb, driving())
+    assert len(found.routes) == 12
+    ends = {tuple(np.round(route.xyz[-1, :2])) for route in (found.routes[0], *found.routes[2:])}
+    assert len(ends) >= 10
+
+
+# Published routes -----------------------------------------------------------------------------------------------
+
+
+def brute_force(search: LaneSearch) -> dict[tuple[int, ...], float]:
+    """The first ten of all ways without a lane twice, up to the first lane that ends 250 m ahead, and their scores.
+
+    First in the order of breadth-first search: fewer lanes, then the earlier branch.
+    """
+    complete, ended = [], []
+
+    def grow(way, number):
+        if search.reach(way) >= LEAST_M:
+            complete.append((len(number), number, way))
+            return
+        children = search.following(way)
+        if not any(child.changes == way.changes for child in children):
+            ended.append((len(number), number, way))
+        for i, child in enumerate(children):
+            grow(child, (*number, i))
+
+    for i, way in enumerate(way for way in search.ways if way.lateral <= 2.5):
+        grow(way, (i,))
+    pool = [*sorted(complete, key=lambda item: item[:2]), *sorted(ended, key=lambda item: item[:2])][:10]
+    return {way.lanes: hand_score(search, way) for _, _, way in pool}
+
+
+def hand_score(search: LaneSearch, way) -> float:
+    graph = search.graph
+    turns = length = total = 0.0
+    changes = 0
+    for a, b in zip(way.lanes, (*way.lanes[1:], None), strict=True):
+        part = slice(graph.lines.start[a], graph.lines.start[a + 1])
+        points = graph.lines.points[part, :2]
+        steps = np.diff(points, axis=0)
+        turn = abs(wrap(np.arctan2(*steps[-1][::-1]) - np.arctan2(*steps[0][::-1])))
+        turns += turn > np.deg2rad(30)
+        total += turn
+        if b is None or b in graph.successor[a]:
+            length += np.hypot(*steps.T).sum()
+        else:
+            changes += 1
+    length -= way.s
+    return -0.3 * changes - 0.2 * turns + 0.1 * length - 0.1 * total / length
+
+
+def network(seed: int, layers: int, width: int):
+    """Layers of lanes, linked at random; some turn; straight neighbours run beside each other."""
+    rng = np.random.default_rng(seed)
+    features, x = [], -30.0
+    for layer in range(layers):
+        length = float(rng.integers(60, 130))
+        turns = rng.random(width + 2) < 0.3
+        beside = (rng.random(width + 1) < 0.5) & ~turns[:-1] & ~turns[1:]
+        for row in range(width):
+            number, y = 10 * layer + row, 3.5 * row
+            tip = (x + length, y + (length * rng.uniform(-0.4, 0.9) if turns[row + 1] else 0.0))
+            features.append(
+                lane(
+                    number,
+                    line((x, y), (x + length / 2, y), tip, step=5.0),
+                    successors=tuple(10 * (layer + 1) + r for r in range(width) if rng.random() < 0.6),
+                    left_neighbours=(number + 1,) if row + 1 < width and beside[row + 1] else (),
+                    right_neighbours=(number - 1,) if row > 0 and beside[row] else (),
+                )
+            )
+        x += length
+    return tuple(features)
+
+
+@given(st.integers(0, 10**6), st.integers(2, 4), st.integers(1, 3))
+@settings(max_examples=40)
+def test_published_ways_are_those_of_brute_force_enumeration(seed, layers, width):
+    search = search_of(network(seed, layers, width), need=LEAST_M)
+    ways = published_ways(search)
+    expected = brute_force(search)
+    assert {way.lanes for way in ways} == set(expected)
+    assert len(ways) == len(expected)
+    scores = [score(search, way) for way in ways]
+    assert scores == pytest.approx([expected[way.lanes] for way in ways])
+    assert scores == sorted(scores, reverse=True)  # best first
+
+
+def two_pairs():
+    """Two lanes side by side up to x = 100, and two that follow them up to x = 400."""
+    return (
+        lane(1, line((-100, 0), (100, 0)), left_neighbours=(2,), successors=(3,)),
+        lane(2, line((-100, 3.5), (100, 3.5)), right_neighbours=(1,), successors=(4,)),
+        lane(3, line((100, 0), (400, 0))),
+        lane(4, line((100, 3.5), (400, 3.5))),
+    )
+
+
+def test_the_published_score_by_hand_best_first():
+    """-0.3 lane changes - 0.2 turns + 0.1 length - 0.1 curvature; the published sort keeps the worst."""
+    features = (
+        lane(1, line((-50, 0), (100, 0)), successors=(2, 3)),
+        lane(2, line((100, 0), (300, 0))),
+        lane(3, line((100, 0), (110, 0), (110, 10)), successors=(4,)),
+        lane(4, line((110, 10), (110, 400))),
+    )
+    search = search_of(features, need=LEAST_M)
+    straight, turning = sorted(published_ways(search), key=lambda way: len(way.lanes))
+    assert score(search, straight) == pytest.approx(0.1 * 300)
+    length = 100 + 20 + 390
+    assert score(search, turning) == pytest.approx(-0.2 + 0.1 * length - 0.1 * (np.pi / 2) / length)
+    assert published_ways(search)[0] == turning
+    changed = search_of(two_pairs(), need=LEAST_M)
+    assert [round(score(changed, way), 6) for way in published_ways(changed)] == [40.0, 39.7]
+
+
+def test_published_routes_begin_beside_the_first_pose_and_lead_to_the_goal():
+    found, _, _ = routes_of(two_pairs(), driving(speed=10.0, y=0.4), style="published")
+    assert found.on_lanes
+    assert found.routes[0].xyz[0] == pytest.approx([-10.0, 0.0, 0.0])
+    assert found.progress == pytest.approx(np.arange(91.0), abs=1e-6)
+    assert found.goal == pytest.approx([80.0, 0.0])
+    assert len(found.routes) == 3  # to the goal, the log, and one with a lane change
+    assert all(len(route.xyz) >= 250 for route in (found.routes[0], *found.routes[2:]))
+    far, _, _ = routes_of(two_lanes(), driving(speed=10.0, y=-2.6), style="published")
+    assert not far.on_lanes  # further than 2.5 m from any lane
+    assert len(routes_of(two_lanes(end=100.0), driving(), style="published")[0].routes) >= 2  # a short map
+
+
+def test_the_published_search_ends_on_dense_graphs():
+    """Breadth-first search over a grid of lanes is cut off rather than exponential."""
+    rows = 8
+    features = []
+    for column, row in np.ndindex(12, rows):
+        points = line((5.0 * column - 2, 1.0 * row), (5.0 * column + 3, 1.0 * row))
+        onward = tuple(100 * (column + 1) + other for other in range(rows))
+        features.append(lane(100 * column + row, points, successors=onward))
+    assert published_ways(search_of(tuple(features), need=LEAST_M)) == []

@@ -30,6 +30,7 @@ def test_a_straight_road_is_cut_into_equal_pieces_of_at_most_four_metres():
 
 @given(st.integers(0, 10_000))
 def test_segments_stay_within_five_centimetres_of_the_source(seed):
+    """Check-list 8: simplified to 5 cm, at most 4 m long."""
     rng = np.random.default_rng(seed)
     course = np.cumsum(rng.normal(0.0, 0.1, 150))
     xy = np.cumsum(0.5 * np.stack((np.cos(course), np.sin(course)), axis=-1), axis=0)
@@ -45,6 +46,7 @@ def test_segments_stay_within_five_centimetres_of_the_source(seed):
 
 
 def test_clipping_jumps_split_lines_but_not_polygons():
+    """Check-list 5: edges are split at gaps of more than 1 m in WOMD."""
     jump = np.concatenate((line((0, 0), (5, 0), step=0.5), line((30, 0), (35, 0), step=0.5)))
     crossing = MapFeature(9, RoadKind.CROSSWALK, np.array([[0.0, 0, 0], [20, 0, 0], [20, 4, 0], [0, 4, 0]]))
     roads, segments = pieces_of(edge(4, jump), crossing, gap=1.0)
@@ -58,6 +60,7 @@ def test_clipping_jumps_split_lines_but_not_polygons():
 
 
 def test_polygons_are_closed_and_features_without_length_are_left_out():
+    """Check-list 6: lines of fewer than two points are dropped."""
     square = np.array([[0.0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0]])
     roads, segments = pieces_of(
         MapFeature(1, RoadKind.SPEED_BUMP, square),
@@ -72,6 +75,7 @@ def test_polygons_are_closed_and_features_without_length_are_left_out():
 
 
 def test_a_ring_is_closed_exactly():
+    """Check-list 7: the closed-ring flag."""
     ring = np.concatenate((line((0, 0), (9, 0), (9, 9), (0, 9)), [[0.02, 0.01, 0.0]]))
     roads, segments = pieces_of(edge(1, ring))
     assert roads.closed.tolist() == [True]

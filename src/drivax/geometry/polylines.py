@@ -198,7 +198,8 @@ def resample(
         The samples, and for each the index of the point at or before it.
     """
     arc = arc_lengths(points)
-    s = np.arange(int(np.floor(arc[-1] / spacing_m + 1e-6)) + 1)[:most] * spacing_m
+    count = int(np.floor(arc[-1] / spacing_m + 1e-6)) + 1
+    s = np.arange(count if most is None else min(count, most)) * spacing_m
     index = np.clip(np.searchsorted(arc, s + 1e-9, side="right") - 1, 0, len(points) - 2)
     span = arc[index + 1] - arc[index]
     fraction = np.clip((s - arc[index]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)

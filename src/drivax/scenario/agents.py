@@ -37,6 +37,8 @@ DEFAULT_SIZES = {
     AgentKind.STATIC: (0.5, 0.5, 1.0),
 }
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
+#: No road user is longer; larger measurements are not believed.
+MOST_SIZE_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,8 @@ class LocalTracks:
 def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
     """Moves tracks into the local frame and gives every track one box size.
 
-    Sizes vary by metres between steps of one object in public data; the median over valid, positive
-    measurements is used, and class defaults where there is none.
+    Sizes vary by metres between steps of one object in public data; the median over valid measurements between 0
+    and 100 m is used, and class defaults where there is none.
     """
     valid = tracks.valid.astype(bool)
     mask = valid[..., None]
@@ -91,7 +93,8 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
 
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], int]:
     """Median box size of every track, and how many tracks needed a default."""
-    measured = tracks.valid[..., None] & (np.nan_to_num(tracks.size) > 0.0)
+    plain = np.nan_to_num(tracks.size)
+    measured = tracks.valid[..., None] & (plain > 0.0) & (plain <= MOST_SIZE_M)
     size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(measured, 1, 2))
     default = np.array([DEFAULT_SIZES[AgentKind(kind)] for kind in tracks.kind]).reshape(-1, 3)
     default[ego] = DEFAULT_EGO_SIZE

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from drivax.scenario.lanes import LaneGraph, LaneSegments, lane_graph, select
 from drivax.scenario.lights import place_lights, place_stops
 from drivax.scenario.recording import Recording
 from drivax.scenario.roads import road_rows
-from drivax.scenario.routes import EgoLog, RouteSet, find_routes
+from drivax.scenario.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
@@ -39,11 +39,14 @@ from drivax.scenario.schema import (
 )
 from drivax.scenario.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
 from drivax.scenario.sides import cell_sides
+from drivax.scenario.tags import scenario_tags
 
 Array = np.ndarray[Any, Any]
 
 #: The map is cropped to the box of the ego's log, widened by this much.
 MARGIN_M = 100.0
+#: All lines of a map together are shorter than this; a whole city is cropped by its reader.
+MAP_M = 500_000.0
 #: Steps may differ from the median step by this much before a recording counts as jittered.
 JITTER_S = 0.002
 STRIDE = 40
@@ -91,7 +94,10 @@ def count_source(recording: Recording) -> SourceCounts:
 def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     """Cuts a long recording into windows of 91 steps that share its segment.
 
-    A recording of at most 91 steps is its own window. Steps at the end that fill no window are left out.
+    A recording of at most 91 steps is its own window. Of a longer one, window ``k`` holds the steps from ``k * stride``
+    on, so with the default stride 51 of 91 steps are in the next window too; steps at the end that fill no window are
+    left out (110 steps are one window, 199 are three). Windows in which the ego is not there at the current step are
+    left out and counted in the others' ``lost`` as ``windows_without_ego``.
 
     Args:
         recording: Any recording.
@@ -99,6 +105,7 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
 
     Raises:
         UsageError: The stride is not positive.
+        DataError: The ego is not there at the current step of any window.
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
@@ -106,8 +113,19 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
     if steps <= STEPS:
         yield recording
         return
-    for start in range(0, steps - STEPS + 1, stride):
-        yield _window(recording, start)
+    starts = range(0, steps - STEPS + 1, stride)
+    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
+    if not usable:
+        raise DataError(
+            f"the ego is not valid at the current step of any of {len(starts)} windows",
+            record=recording.scenario_id,
+            cure="skip the recording",
+        )
+    lost = dict(recording.lost)
+    if len(usable) < len(starts):
+        lost["windows_without_ego"] = len(starts) - len(usable)
+    for start in usable:
+        yield replace(_window(recording, start), lost=lost)
 
 
 def _window(recording: Recording, start: int) -> Recording:
@@ -152,27 +170,31 @@ def with_ego(recording: Recording, row: int) -> Recording:
         scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
         ego=row,
         route_lanes=(),
+        route_corridor=(),
     )
 
 
-def assemble(recording: Recording, capacity: Capacity = CAPACITIES["default"]) -> Scenario:
+def assemble(
+    recording: Recording, capacity: Capacity = CAPACITIES["default"], routes: RouteStyle = "graph"
+) -> Scenario:
     """Turns a recording into a scenario.
 
     Args:
         recording: At most ``capacity.steps`` steps; cut longer ones with :func:`windows`.
         capacity: Padded sizes; what does not fit is counted in ``overflow``, the farthest from the ego's log first.
+        routes: How candidate routes are made (``scenario.routes``).
 
     Raises:
         DataError: The recording makes no sense; the message names what and its record.
     """
     check(recording, capacity)
     try:
-        return _assemble(recording, capacity)
+        return _assemble(recording, capacity, routes)
     except DataError as error:
         raise DataError(error.problem, record=recording.scenario_id, cure=error.cure) from error
 
 
-def _assemble(recording: Recording, capacity: Capacity) -> Scenario:
+def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Scenario:
     """``assemble`` of a checked recording."""
     now, ego = recording.current_step, recording.ego
     origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
@@ -180,12 +202,12 @@ def _assemble(recording: Recording, capacity: Capacity) -> Scenario:
     log = ego_log(tracks, now)
     path = thin_path(log.seen[:, :2])
     roads = road_lines(recording.features, origin, recording.split_gap_m)
+    _refuse_endless(roads)
     segments = cut(roads)
     whole = lane_graph(recording.features, origin)
     on = LaneSegments.of(segments, whole)
-    index = whole.index()
-    given = [index[lane] for lane in recording.route_lanes if lane in index]
-    routes = find_routes(whole, on, log, given, capacity.routes, capacity.route_points)
+    intent, unknown = _intent(recording, whole)
+    routes = find_routes(whole, on, log, intent, style, capacity.routes, capacity.route_points)
     marked = (*recording.to_predict, *recording.of_interest)
     placement = place(tracks, marked, capacity.agents, capacity.parked)
     on_route = _lanes_of(routes)
@@ -219,10 +241,34 @@ def _assemble(recording: Recording, capacity: Capacity) -> Scenario:
     return Scenario(
         record=fill(parts, recording, capacity, origin, flags),
         capacity=capacity,
-        source=count_source(recording),
+        source=replace(count_source(recording), lost=_lost(recording, {**whole.lost, **unknown})),
         overflow=overflow,
-        tags={"dataset": recording.dataset},
+        tags=scenario_tags(recording, parts, flags, style),
     )
+
+
+def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
+    """What the source says about the intended route in dense indices, and how many of its lanes are missing."""
+    index = graph.index()
+    named = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
+    found = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in named.items()}
+    missing = {f"{name}_missing": len(named[name]) - len(found[name]) for name in named}
+    return Intent(found["route_lanes"], found["route_corridor"]), missing
+
+
+def _lost(recording: Recording, found: Mapping[str, int]) -> dict[str, int]:
+    """What the reader and the assembly left out, by name; only what is not zero."""
+    names = dict.fromkeys((*recording.lost, *found))
+    counts = {name: int(recording.lost.get(name, 0)) + found.get(name, 0) for name in names}
+    return {name: count for name, count in counts.items() if count}
+
+
+def _refuse_endless(roads: RoadLines) -> None:
+    """Raises where the map's lines are so long that they cannot be those of one place."""
+    length = float(roads.lines.length.sum())
+    if length > MAP_M:
+        problem = f"the map's lines are {length / 1000:.0f} km long together, more than {MAP_M / 1000:.0f} km"
+        raise DataError(problem, cure="crop the map in the reader, or repair the points that jump")
 
 
 def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:

@@ -16,6 +16,9 @@ Array = np.ndarray[Any, Any]
 #: The median step may differ from 0.1 s by this much.
 STEP_TOLERANCE_S = 0.005
 TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
+#: Nothing lies further from the ego, and nobody drives faster: the file is damaged, or its unit is not the metre.
+EXTENT_M, SPEED_MPS = 100_000.0, 500.0
+_UNITS = "repair it, or convert it to metres in the reader"
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
@@ -30,6 +33,7 @@ def check(recording: Recording, capacity: Capacity) -> None:
         _check_shapes,
         _check_tracks,
         _check_ego,
+        _check_extent,
         _check_map,
         _check_lights,
     ):
@@ -119,16 +123,47 @@ def _check_ego(recording: Recording, capacity: Capacity) -> Finding:
     return None
 
 
+def _here(recording: Recording) -> Float[Array, "3"]:
+    """Where the ego is at the current step."""
+    now = recording.ego, recording.current_step
+    return np.append(recording.tracks.xy[now], recording.tracks.z[now])
+
+
+def _check_extent(recording: Recording, capacity: Capacity) -> Finding:
+    """Valid numbers of any size would need memory of any size, and would not fit into float32."""
+    tracks, here = recording.tracks, _here(recording)
+    places = np.concatenate((tracks.xy[tracks.valid], tracks.z[tracks.valid][:, None]), axis=1)
+    if np.abs(places - here).max() > EXTENT_M:
+        return f"a track is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+    if np.abs(tracks.velocity[tracks.valid]).max() > SPEED_MPS:
+        return f"a track is faster than {SPEED_MPS:.0f} m/s", _UNITS
+    stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
+    if stops and np.nanmax(np.abs(np.array(stops) - here), initial=0.0) > EXTENT_M:
+        return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+    return None
+
+
 def _check_map(recording: Recording, capacity: Capacity) -> Finding:
     for feature in recording.features:
-        points = np.asarray(feature.points)
-        if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-            return f"points of feature {feature.feature_id} have shape {points.shape}", "give (point, 3)"
-        if not np.isfinite(points).all():
-            return f"feature {feature.feature_id} has a point that is not finite", "repair it or drop it"
+        shape = np.shape(feature.points)
+        if len(shape) != 2 or shape[1] != 3 or not shape[0]:
+            return f"points of feature {feature.feature_id} have shape {shape}", "give (point, 3)"
+        if not -(2**63) <= feature.feature_id < 2**63:
+            return f"the feature id {feature.feature_id} does not fit into 64 bits", "number the features"
         if feature.kind not in RoadKind:
             return f"feature {feature.feature_id} is of unknown kind {feature.kind}", "use a RoadKind"
-    return None
+    if not recording.features:
+        return None
+    counts = [len(feature.points) for feature in recording.features]
+    points = np.concatenate([feature.points for feature in recording.features])
+    far = ~(np.abs(points - _here(recording)).max(axis=1) <= EXTENT_M)
+    if not far.any():
+        return None
+    row = int(np.searchsorted(np.cumsum(counts), np.argmax(far), side="right"))
+    place = f"feature {recording.features[row].feature_id} has a point"
+    if not np.isfinite(points[np.argmax(far)]).all():
+        return f"{place} that is not finite", "repair it or drop it"
+    return f"{place} more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
 
 
 def _check_lights(recording: Recording, capacity: Capacity) -> Finding:

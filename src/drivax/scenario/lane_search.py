@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -24,6 +24,8 @@ TURN_RAD = np.deg2rad(60.0)
 SAME_TURN_RAD = np.deg2rad(45.0)
 #: Costs in metres: of a lane change, of a metre between ego and its first lane, of a radian of turning.
 CHANGE_COST_M, LATERAL_COST, TURN_COST_M = 60.0, 30.0, 10.0
+#: Of a radian between the headings of ego and of its first lane, and of a lane outside the intended corridor.
+ASKEW_COST_M, OUTSIDE_COST_M = 30.0, 200.0
 MOST_CHANGES = 2
 MOST_EXPANSIONS = 400
 MOST_GOAL_LANES = 3
@@ -43,6 +45,7 @@ class Way:
         penalty: Cost of lane changes, turns and lateral distance, metres.
         changes: Number of lane changes.
         until: Where the goal lies, metres ahead of the ego; infinite where the way has none.
+        lateral: Distance of the ego from the first lane, metres.
     """
 
     lanes: tuple[int, ...]
@@ -52,6 +55,7 @@ class Way:
     penalty: float
     changes: int
     until: float = np.inf
+    lateral: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -61,10 +65,11 @@ class LaneSearch:
     Attributes:
         graph: The lane graph.
         on: Lane segments of the same graph.
-        ways: One-lane ways to start from, the nearest first.
+        ways: One-lane ways to start from, the best fitting first.
         need_m: Length of a complete way ahead of the ego.
         bend: Heading change along every lane, radians.
         drivable: Whether cars use the lane.
+        outside: Cost of entering each lane because it lies outside the intended corridor, metres.
     """
 
     graph: LaneGraph
@@ -73,19 +78,54 @@ class LaneSearch:
     need_m: float
     bend: Float[Array, " lane"]
     drivable: tuple[bool, ...]
+    outside: tuple[float, ...]
 
     @classmethod
     def start(
-        cls, graph: LaneGraph, on: LaneSegments, xyz: Float[Array, "3"], heading: float, need_m: float
+        cls,
+        graph: LaneGraph,
+        on: LaneSegments,
+        xyz: Float[Array, "3"],
+        heading: float,
+        need_m: float,
+        corridor: Collection[int] = (),
     ) -> LaneSearch:
-        """A search from a pose: from lanes within 4 m and 60 degrees of it."""
+        """A search from a pose: from lanes within 4 m and 60 degrees of it.
+
+        Args:
+            graph: The lane graph.
+            on: Lane segments of the same graph.
+            xyz: Position of the ego.
+            heading: Heading of the ego, radians.
+            need_m: Length of a complete way ahead of the ego.
+            corridor: Dense indices of the lanes that the intended route may use; empty: any.
+        """
         row = np.arange(graph.count)
         lines = graph.lines
         begin, end = lines.heading(row, 0.0 * row, END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
         near = on.around(xyz, heading, REACH_M, TURN_RAD)
-        ways = tuple(Way((lane,), s, -s, s, LATERAL_COST * far, 0) for lane, s, far in near)
+        outside = np.zeros(graph.count)
+        if corridor:
+            outside[~np.isin(row, list(corridor))] = OUTSIDE_COST_M
+        lane, arc = (np.array(values) for values in ([x[0] for x in near], [x[1] for x in near]))
+        askew = np.abs(wrap(lines.heading(lane, arc) - heading)) if near else np.zeros(0)
+        ways = [
+            Way(
+                lanes=(lane,),
+                s=s,
+                ahead=-s,
+                entry=s,
+                penalty=LATERAL_COST * far + ASKEW_COST_M * float(turn) + float(outside[lane]),
+                changes=0,
+                lateral=far,
+            )
+            for (lane, s, far), turn in zip(near, askew, strict=True)
+        ]
         drivable = tuple(bool(kind) for kind in np.isin(graph.kind, CAR_LANE_KINDS))
-        return cls(graph, on, ways, need_m, np.abs(wrap(end - begin)), drivable)
+        ways.sort(key=lambda way: way.penalty)
+        return cls(
+            graph, on, tuple(ways), need_m, np.abs(wrap(end - begin)), drivable, tuple(outside.tolist())
+        )
 
     def alternatives(self, most: int) -> list[Way]:
         """Complete ways that differ in the lane a third, two thirds and the whole way ahead; the cheapest first."""
@@ -97,7 +137,7 @@ class LaneSearch:
             if not heap or len(found) >= most:
                 break
             way = heapq.heappop(heap)[2]
-            following = [] if self._reach(way) >= self.need_m else self._following(way)
+            following = [] if self.reach(way) >= self.need_m else self.following(way)
             if not any(not is_change(self.graph, way.lanes[-1], child.lanes[-1]) for child in following):
                 found.setdefault(self._signature(way), way)
             for child in following:
@@ -105,7 +145,7 @@ class LaneSearch:
         return list(found.values())
 
     def to_goal(self, xyz: Float[Array, "3"], heading: float) -> list[Way]:
-        """The cheapest ways to the lanes under the goal."""
+        """The cheapest ways to the lanes under the goal (Dijkstra's search)."""
         goals = self._goals(xyz, heading)
         found: list[Way] = []
         done: set[int] = set()
@@ -120,7 +160,7 @@ class LaneSearch:
             done.add(lane)
             if lane in goals:
                 found.append(replace(way, until=way.ahead + goals[lane]))
-            for child in self._following(way):
+            for child in self.following(way):
                 if child.lanes[-1] not in done:
                     heapq.heappush(heap, (child.penalty + child.ahead + child.entry, next(serial), child))
         return found
@@ -147,37 +187,36 @@ class LaneSearch:
         near = self.on.around(xyz, heading, REACH_M, TURN_RAD)[:MOST_GOAL_LANES]
         return {lane: s for lane, s, _ in near}
 
-    def _reach(self, way: Way) -> float:
+    def reach(self, way: Way) -> float:
         """How far ahead of the ego a way ends."""
         return way.ahead + float(self.graph.lines.length[way.lanes[-1]])
 
     def _urgency(self, way: Way) -> float:
-        return way.penalty + EAGERNESS * max(self.need_m - self._reach(way), 0.0)
+        return way.penalty + EAGERNESS * max(self.need_m - self.reach(way), 0.0)
 
-    def _following(self, way: Way) -> list[Way]:
+    def following(self, way: Way) -> list[Way]:
         """Ways with one more lane: successors, and neighbours where there is room for a change."""
         graph, lane = self.graph, way.lanes[-1]
         result = []
         for other in (int(x) for x in graph.successor[lane] if x >= 0):
             if self.drivable[other] and other not in way.lanes:
-                penalty = way.penalty + TURN_COST_M * float(self.bend[other])
+                penalty = way.penalty + TURN_COST_M * float(self.bend[other]) + self.outside[other]
                 lanes = (*way.lanes, other)
-                result.append(Way(lanes, way.s, self._reach(way), 0.0, penalty, way.changes))
+                result.append(replace(way, lanes=lanes, ahead=self.reach(way), entry=0.0, penalty=penalty))
         if way.changes >= MOST_CHANGES:
             return result
         for other, shift in graph.neighbours(lane):
             low, high, _ = change_room(graph, lane, other, way.entry)
             if self.drivable[other] and other not in way.lanes and high - low >= CHANGE_M:
-                result.append(
-                    Way(
-                        (*way.lanes, other),
-                        way.s,
-                        way.ahead - shift,
-                        low + shift + CHANGE_M,
-                        way.penalty + CHANGE_COST_M,
-                        way.changes + 1,
-                    )
+                changed = replace(
+                    way,
+                    lanes=(*way.lanes, other),
+                    ahead=way.ahead - shift,
+                    entry=low + shift + CHANGE_M,
+                    penalty=way.penalty + CHANGE_COST_M + self.outside[other],
+                    changes=way.changes + 1,
                 )
+                result.append(changed)
         return result
 
     def _signature(self, way: Way) -> tuple[int, ...]:

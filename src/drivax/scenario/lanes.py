@@ -27,11 +27,14 @@ CHAIN_HEADING_RAD = np.deg2rad(20.0)
 SAME_WAY_RAD = np.deg2rad(45.0)
 #: Lane widths believed when measured from the spacing of neighbours, metres.
 WIDTHS_M = (2.2, 5.5)
+#: Widths and limits that a source gives are believed up to here.
+MOST_WIDTH_M, MOST_LIMIT_MPS = 50.0, 100.0
 LEVEL_M = 3.0
 #: Headings at lane ends are measured over this chord: the last source points lie close together.
 END_SPAN_M = 2.0
 _SAMPLES = 33
 _PROBES = (0.1, 0.3, 0.5, 0.7, 0.9)
+_CHUNK = 512
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class LaneGraph:
         chained: Whether the links were made from geometry.
         linked: Whether there is any successor.
         dropped_links: Links beyond the four that are stored.
+        lost: What the source names and does not hold: ``dangling_links`` (successors and predecessors) and
+            ``dangling_neighbours``.
     """
 
     lines: Polylines
@@ -72,6 +77,7 @@ class LaneGraph:
     right_shift: Float[Array, " lane"]
     chained: bool
     dropped_links: int
+    lost: Mapping[str, int]
 
     @property
     def count(self) -> int:
@@ -105,7 +111,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     """Builds the lane graph of all lanes that have a direction (two or more points, some length).
 
     Args:
-        features: The source's map features. Links to features that are missing or no lanes are dropped.
+        features: The source's map features. Links to features that are missing or no lanes are dropped and counted.
         origin: Origin of the local frame in the source's frame.
 
     Raises:
@@ -133,16 +139,16 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     gap = np.fmin(left_gap, right_gap)
     measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
     given = np.array(
-        [lane.width_m if _positive(lane.width_m) else np.nan for lane in lanes], dtype=np.float64
+        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes],
+        dtype=np.float64,
     )
-    limit = [lane.limit_mps if _positive(lane.limit_mps) else -1.0 for lane in lanes]
     return LaneGraph(
         lines=lines,
         feature=np.array(rows, dtype=np.int64),
         lane_id=np.array(ids, dtype=np.int64),
         kind=kind,
         width=np.where(np.isnan(given), measured, given),
-        limit=np.array(limit, dtype=np.float64),
+        limit=np.array([known_limit(lane) for lane in lanes], dtype=np.float64),
         interpolating=np.array([lane.interpolating for lane in lanes], dtype=bool),
         successor=successor,
         predecessor=predecessor,
@@ -152,11 +158,26 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
         right_shift=right_shift,
         chained=not has_links,
         dropped_links=lost + lost_back,
+        lost={
+            "dangling_links": _dangling(lanes, index, ("successors", "predecessors")),
+            "dangling_neighbours": _dangling(lanes, index, ("left_neighbours", "right_neighbours")),
+        },
     )
 
 
-def _positive(value: float | None) -> bool:
-    return value is not None and 0.0 < value < float("inf")
+def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], names: Sequence[str]) -> int:
+    """How many links of these kinds name a lane that is not there."""
+    return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
+
+
+def known_limit(feature: MapFeature) -> float:
+    """Speed limit of a lane in m/s; -1 where there is none that can be believed, and for what is no lane."""
+    limit = feature.limit_mps if feature.kind in LANE_KINDS else None
+    return limit if limit is not None and _within(limit, MOST_LIMIT_MPS) else -1.0
+
+
+def _within(value: float | None, most: float) -> bool:
+    return value is not None and 0.0 < value <= most
 
 
 def _has_length(points: Array) -> bool:
@@ -187,13 +208,16 @@ def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> l
     if lines.count == 0:
         return []
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
-    apart = np.linalg.norm((last[:, None] - first[None])[..., :2], axis=-1)
-    level = np.abs(last[:, None, 2] - first[None, :, 2]) < LEVEL_M
-    bend = np.abs(wrap(end[:, None] - begin[None]))
     bike = kind == RoadKind.LANE_BIKE
-    fits = (apart <= CHAIN_GAP_M) & level & (bend <= CHAIN_HEADING_RAD) & (bike[:, None] == bike[None])
-    np.fill_diagonal(fits, False)
-    return [(int(i), int(j)) for i, j in np.argwhere(fits)]
+    pairs: list[tuple[int, int]] = []
+    for row in range(0, lines.count, _CHUNK):  # maps of thousands of lanes would need gigabytes at once
+        part = slice(row, row + _CHUNK)
+        apart = np.hypot(*np.moveaxis((last[part, None] - first[None])[..., :2], -1, 0))
+        level = np.abs(last[part, None, 2] - first[None, :, 2]) < LEVEL_M
+        bend = np.abs(wrap(end[part, None] - begin[None]))
+        fits = (apart <= CHAIN_GAP_M) & level & (bend <= CHAIN_HEADING_RAD) & (bike[part, None] == bike[None])
+        pairs += [(int(i) + row, int(j)) for i, j in np.argwhere(fits) if i + row != j]
+    return pairs
 
 
 def _link_table(
@@ -230,9 +254,11 @@ def _beside(
     (oncoming lanes in Argoverse 2) are no neighbours here.
     """
     best, shift, gap = np.full(len(lanes), -1), np.zeros(len(lanes)), np.full(len(lanes), np.nan)
-    pairs = [
-        (i, index[j]) for i, lane in enumerate(lanes) for j in getattr(lane, side) if index.get(j, i) != i
-    ]
+    pairs = list(
+        dict.fromkeys(
+            (i, index[j]) for i, lane in enumerate(lanes) for j in getattr(lane, side) if index.get(j, i) != i
+        )
+    )
     if not pairs:
         return best, shift, gap
     a, b = np.array(pairs).T

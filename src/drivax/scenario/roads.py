@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import cut_counts
+from drivax.scenario.lanes import known_limit
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, RoadKind
 from drivax.scenario.segments import RoadLines, inside_box, path_distance
@@ -82,7 +83,7 @@ def road_rows(
         _angle(roads, owner, begin + span * 2 / 3, begin + span)
         - _angle(roads, owner, begin, begin + span / 3)
     )
-    limits = [f.limit_mps if f.kind in LANE_KINDS and f.limit_mps else -1.0 for f in features]
+    limits = [known_limit(feature) for feature in features]
     return RoadRows(
         xy=middle,
         direction=direction,

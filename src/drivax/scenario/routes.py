@@ -2,14 +2,15 @@
 
 Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the log's route
 see the ego's poses up to the current step and the goal region only; among routes that reach the goal equally well
-the one nearest to the log is taken.
+the one nearest to the log is taken. Routes come from this project's search of the lane graph (``graph``), or from
+the published one (``published``, :mod:`drivax.scenario.route_published`); both are drawn by the same code.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,9 +19,14 @@ from drivax.geometry.polylines import arc_lengths, headings, project, project_mo
 from drivax.scenario.lane_paths import CHANGE_M, continue_straight, follow, is_change, precede, trace, walk
 from drivax.scenario.lane_search import REACH_M, SAME_TURN_RAD, LaneSearch, Way
 from drivax.scenario.lanes import LaneGraph, LaneSegments
+from drivax.scenario.route_published import LEAST_M, published_ways
+from drivax.scenario.route_start import join
 from drivax.scenario.segments import thin_path
 
 Array = np.ndarray[Any, Any]
+
+#: How candidates are made: by the search of this project, or as published.
+RouteStyle = Literal["graph", "published"]
 
 SPACING_M = 1.0
 #: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
@@ -36,8 +42,8 @@ CHANGE_S = 3.0
 GOAL_M = 10.0
 #: Where along the stretch of two parallel lanes a route may change from one to the other.
 CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Steps of the log shorter than this are jitter of a standing car.
-STEP_M = 0.5
+#: Steps of the log shorter than this are jitter of a standing car; a log that gets no further than that has no way.
+STEP_M, STANDS_M = 0.5, 2.0
 #: The log's route goes on this far beyond the log.
 LOG_AHEAD_M = 100.0
 #: Its lanes are looked up at every so manyth of its points (0.5 to 3 m apart).
@@ -116,11 +122,25 @@ class RouteSet:
     progress: Float[Array, " time"]
 
 
+@dataclass(frozen=True)
+class Intent:
+    """What the source knows about where the ego wants to go; dense lane indices, empty where it does not.
+
+    Attributes:
+        lanes: The lanes of the intended route in order.
+        corridor: All lanes that the intended route may use.
+    """
+
+    lanes: tuple[int, ...] = ()
+    corridor: tuple[int, ...] = ()
+
+
 def find_routes(
     graph: LaneGraph,
     on: LaneSegments,
     ego: EgoLog,
-    given: Sequence[int],
+    intent: Intent,
+    style: RouteStyle,
     most_routes: int,
     most_points: int,
 ) -> RouteSet:
@@ -130,24 +150,46 @@ def find_routes(
         graph: The lane graph.
         on: Lane segments of the same graph.
         ego: The logged ego.
-        given: Dense indices of the lanes of the intended route, where the source knows it.
+        intent: What the source says about the intended route; ``published`` routes do not look at it.
+        style: How candidates are made.
         most_routes: Number of rows.
         most_points: Points per route.
     """
     log = log_route(graph, on, ego, most_points)
-    need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
-    search = LaneSearch.start(graph, on, ego.xyz[ego.current], float(ego.heading[ego.current]), need)
-    drawer = _Drawer(graph, ego, most_points)
-    others = [drawer.draw(way, 0.0) for way in search.alternatives(most_routes)]
-    end = ego.xyz[ego.last], float(ego.heading[ego.last])
-    ways, spare = ([search.along(given, *end)], []) if given else (search.to_goal(*end), others)
-    best = _best(ego, [*drawer.variants(ways), *spare], np.inf if given else GOAL_M)
+    draft = _published if style == "published" else _searched
+    best, others = draft(graph, on, ego, intent, (most_routes, most_points))
     first = log if best is None else best
     rest = [route for route in others if not _same(route, first)]
     progress = log_progress(first, ego)
     index = np.arange(len(first.xyz))
     goal = np.array([np.interp(progress[ego.last], index, first.xyz[:, axis]) for axis in (0, 1)])
     return RouteSet((first, log, *rest)[:most_routes], best is not None, goal, progress)
+
+
+def _searched(
+    graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
+) -> tuple[Route | None, list[Route]]:
+    """The route to the goal, if any, and the alternatives of the best-first search from the current step."""
+    pose = ego.xyz[ego.current], float(ego.heading[ego.current])
+    need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
+    search = LaneSearch.start(graph, on, *pose, need, intent.corridor)
+    drawer = _Drawer(graph, ego, most[1])
+    others = [drawer.draw(way, 0.0) for way in search.alternatives(most[0] - 1)]
+    end = ego.xyz[ego.last], float(ego.heading[ego.last])
+    if intent.lanes:
+        return _best(ego, drawer.variants([search.along(intent.lanes, *end)]), np.inf), others
+    return _best(ego, [*drawer.variants(search.to_goal(*end)), *others], GOAL_M), others
+
+
+def _published(
+    graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
+) -> tuple[Route | None, list[Route]]:
+    """The published candidates, the best score first, and the one of them that leads to the goal, if any."""
+    ego = replace(ego, current=int(np.argmax(ego.valid)))
+    search = LaneSearch.start(graph, on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
+    drawer = _Drawer(graph, ego, most[1], plain=True)
+    others = [drawer.draw(way, 0.0) for way in published_ways(search)]
+    return _best(ego, others, GOAL_M), others
 
 
 def _same(one: Route, other: Route) -> bool:
@@ -169,11 +211,16 @@ def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
 
 @dataclass(frozen=True)
 class _Drawer:
-    """Turns ways (lane sequences) into routes for one ego."""
+    """Turns ways (lane sequences) into routes of at most ``most`` points for one ego.
+
+    A plain route begins beside the ego and keeps to the lanes; others begin 20 m behind the ego's first logged
+    position and bend to where the ego drove.
+    """
 
     graph: LaneGraph
     ego: EgoLog
     most: int
+    plain: bool = False
 
     def variants(self, ways: Sequence[Way]) -> list[Route]:
         """Routes along the ways; a way with lane changes is drawn with early to late changes."""
@@ -185,15 +232,16 @@ class _Drawer:
         return routes
 
     def draw(self, way: Way, place: float) -> Route:
-        """The route along a way: from 20 m behind the ego's first logged position to the end of the lanes."""
+        """The route along a way to the end of its lanes and of those that follow them straight on."""
         graph, ego = self.graph, self.ego
         driven = ego.driven[:, :2]
-        behind = BEHIND_M + float(arc_lengths(driven)[-1])
+        behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(driven)[-1])
         prefix, length = precede(graph, way.lanes[0], behind - way.s, driven)
         begin = way.s + length - behind
         ends = float(graph.lines.length[list(way.lanes)].sum()) - way.s
         lanes = (*prefix, *follow(graph, way.lanes, ends, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
+        change_m = max(CHANGE_M, CHANGE_S * speed)
         line = trace(
             graph,
             lanes,
@@ -201,24 +249,29 @@ class _Drawer:
             -way.s - length,
             (REACTION_S * speed, way.until),
             place,
-            max(CHANGE_M, CHANGE_S * speed),
+            change_m,
         )
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
         arc, _ = project(line[0], ego.seen[-1:, :2])
         missing = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
-        return Route.along(*continue_straight(line, 0.0, missing), self.most)
+        xyz, label = continue_straight(line, 0.0, missing)
+        points, index = resample(xyz, SPACING_M, self.most)
+        return Route.along(points if self.plain else join(points, driven, change_m), label[index], self.most)
 
 
 def log_route(graph: LaneGraph, on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
     """The logged ego's own way (privileged), continued along its last lane, else straight on.
 
-    Positions within half a metre of the one before are skipped: the jitter of a standing car is no way.
+    Positions within half a metre of the one before are skipped: the jitter of a standing car is no way. Of a log that
+    stays within 2 m only the last pose is used.
     """
     seen, heading = ego.seen, ego.heading[ego.valid]
     keep = [0]
     for i in range(1, len(seen)):
         if np.hypot(*(seen[i] - seen[keep[-1]])[:2]) >= STEP_M:
             keep.append(i)
+    if np.hypot(*(seen - seen[0])[:, :2].T).max() < STANDS_M:
+        keep = keep[-1:]
     pose, course = seen[keep[-1]], float(heading[keep[-1]])
     line = np.concatenate((seen[keep], _ahead(graph, on, pose, course)))
     probe = np.arange(0, len(line), LABEL_EVERY)
