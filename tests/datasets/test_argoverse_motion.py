@@ -59,7 +59,9 @@ def test_identity_and_time(recording):
     assert (
         recording.segment == "7bef7e1f-0000-4ba5-b39e-00000000aa5b"
     )  # the slice that scenarios are cut from
-    assert dict(recording.tags) == {"source_format": "av2-motion", "place": "austin"}
+    assert dict(recording.tags) == {
+        "source_format": "av2-motion", "place": "austin", "location": "austin"
+    }  # fmt: skip
     assert recording.current_step == 10 and recording.lost == {}
     np.testing.assert_allclose(np.diff(recording.timestamps_s), 0.1, atol=1e-6)
     assert recording.timestamps_s[0] == pytest.approx(315986559.459579)

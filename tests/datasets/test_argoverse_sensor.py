@@ -53,7 +53,9 @@ def rewritten(tmp_path):
 
 def test_identity_and_time(recording):
     assert (recording.scenario_id, recording.segment, recording.dataset) == (LOG, LOG, "av2")
-    assert dict(recording.tags) == {"source_format": "av2-sensor", "place": "pittsburgh"}
+    assert dict(recording.tags) == {
+        "source_format": "av2-sensor", "place": "pittsburgh", "location": "PIT"
+    }  # fmt: skip
     assert recording.flags == Flag.DIFFERENTIATED_VELOCITY and recording.lost == {}
     assert (recording.ego, recording.current_step) == (0, 10)
     assert recording.tracks.track_id.tolist() == [0, 1, 2, 3, 5]  # the ego's own boxes are number 4

@@ -108,6 +108,7 @@ def test_identity(recordings):
         assert (recording.dataset, recording.ego, recording.current_step) == ("nuplan", 0, 10)
         assert recording.tags["source_format"] == "nuplan"
         assert recording.tags["place"] == "las-vegas"
+        assert recording.tags["location"] == "us-nv-las-vegas-strip"
         assert recording.lost == {}
 
 

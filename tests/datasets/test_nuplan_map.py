@@ -137,6 +137,26 @@ def test_limits_are_metres_per_second_and_may_be_missing(features):
     assert features[connector_id("w", "n")].limit_mps == 6.7
 
 
+@pytest.mark.parametrize(
+    ("written_as", "mps"),
+    [
+        ("11.176", 11.176),
+        ("7", 7.0),
+        ("", None),
+        ("30 mph", None),
+        ("nan", None),
+        ("-5", None),
+        ("900", None),
+    ],
+)
+def test_limits_as_texts(tmp_path, written_as, mps):
+    layers = sample.map_layers()
+    rows = layers["lanes_polygons"].rows
+    fid = next(fid for fid, (_, values) in rows.items() if values[0] == 3)
+    rows[fid] = rows[fid][0], (*rows[fid][1][:-1], written_as)
+    assert written(tmp_path, layers).lanes[lane_id(3)].limit_mps == mps
+
+
 def test_widths_between_boundaries(features):
     for number in sample.lane_lines():
         assert features[lane_id(number)].width_m == pytest.approx(sample.WIDTH, abs=1e-3)
@@ -339,6 +359,18 @@ def test_maps_are_found_above_the_log_then_by_the_environment(tmp_path, monkeypa
     (elsewhere / sample.CITY / sample.VERSION / "map.gpkg").unlink()
     with pytest.raises(DataError, match="is missing; download the nuPlan maps"):
         find_map(log, sample.CITY)
+
+
+@pytest.mark.parametrize("folder", [".", "nuplan-maps-v1.0", "maps/nuplan-maps-v1.0"])
+def test_maps_are_found_as_the_archive_unpacks_them(tmp_path, monkeypatch, folder):
+    monkeypatch.delenv("NUPLAN_MAPS_ROOT", raising=False)
+    log = sample.write(tmp_path)
+    (tmp_path / "maps").rename(tmp_path / "unpacked")
+    (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    for path in (tmp_path / "unpacked").iterdir():
+        path.rename(tmp_path / folder / path.name)
+    found = find_map(log, sample.CITY)
+    assert found == tmp_path / folder / sample.CITY / sample.VERSION / "map.gpkg" and found.is_file()
 
 
 @pytest.mark.parametrize("version", ["../../etc", "", None, 9.15, ["9"], ".."])

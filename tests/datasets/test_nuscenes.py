@@ -55,6 +55,31 @@ def test_what_is_missing_is_told(tmp_path):
     assert "is missing" in str(bad.error())
 
 
+@pytest.mark.parametrize("folder", ["maps", "expansion"])
+def test_maps_lie_where_people_unpack_them(tmp_path, folder):
+    """The archive of the map expansion holds a folder ``expansion``; its older versions held none."""
+    path = sample.write(tmp_path)
+    file = tmp_path / "maps" / "expansion" / f"{sample.CITY}.json"
+    (tmp_path / folder).mkdir(exist_ok=True)
+    file.rename(tmp_path / folder / file.name)
+    assert NuScenes().describe(path).missing == ()
+    (found,) = NuScenes().read(path)
+    assert not isinstance(found, BadRecord) and len(found.features) > 5
+    assert (tmp_path / folder / file.name).match(f"{folder}/*.json")
+    assert f"{folder}/*.json" in NuScenes().companions
+
+
+def test_the_test_split_has_no_annotations_and_is_refused(tmp_path):
+    """Its tables are there, but empty: a scenario of the ego alone would look sound."""
+    path = sample.write(tmp_path)
+    for table in ("instance", "sample_annotation"):
+        path.with_name(f"{table}.json").write_text("[]")
+    assert any("no annotations" in note for note in NuScenes().describe(path).notes)
+    (bad,) = NuScenes().read(path)
+    assert isinstance(bad, BadRecord)
+    assert bad.file.name == "sample_annotation.json" and "the test split has none" in str(bad.error())
+
+
 def test_item_16_two_hertz_to_ten(scene):
     assert len(scene.timestamps_s) == 196
     np.testing.assert_allclose(np.diff(scene.timestamps_s), 0.1, atol=1e-9)
@@ -96,7 +121,7 @@ def test_kinds_and_names(scene):
     assert kind_of("vehicle.motorcycle") is AgentKind.CYCLIST
     assert kind_of("animal") is AgentKind.OTHER
     assert (scene.scenario_id, scene.segment, scene.dataset) == ("scene-0001", "n008-2018-08-01", "nuscenes")
-    assert scene.tags == {"source_format": "nuscenes", "place": sample.CITY}
+    assert scene.tags == {"source_format": "nuscenes", "place": "boston", "location": sample.CITY}
     assert Flag.DIFFERENTIATED_VELOCITY in scene.flags
 
 
@@ -105,6 +130,7 @@ def test_lane_graph(scene):
     right, left, on, north, turn = (lanes[i] for i in range(5))
     assert (right.successors, left.successors, turn.successors) == ((2,), (4,), (3,))
     assert turn.predecessors == (1,)
+    assert scene.lost == {"dangling_links": 1}  # "left" comes from a lane that is gone
     assert turn.interpolating
     assert not on.interpolating
     assert right.left_neighbours == (1,)

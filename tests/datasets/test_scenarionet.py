@@ -277,6 +277,7 @@ def test_place_and_current_step(tree):
     recording = decode(nuscenes(tree))
     assert recording.tags["place"] == "boston" and recording.current_step == 10
     tree["metadata"] |= {"map": "sg-one-north", "log_name": "2021.08.17.log"}
+    assert decode(tree).tags["location"] == "sg-one-north"
     assert decode(tree).tags["place"] == "singapore" and decode(tree).segment == "2021.08.17.log"
 
 

@@ -7,6 +7,7 @@ import math
 import random
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from drivax.datasets.womd_scenario import WomdScenario, decode
 from drivax.errors import DataError, UsageError
 from drivax.scenario.assemble import assemble, windows
 from drivax.scenario.recording import MapFeature, Recording
-from drivax.scenario.schema import AgentKind, Flag, RoadKind
+from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, RoadKind
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +252,20 @@ def test_02_origin_is_subtracted_in_float64(wire):
 def test_03_sizes_are_medians(recording):
     """Check-list 3: ego's length is 5.00, 5.01, 5.02, 5.00, ...: 31, 30 and 30 times."""
     assert assemble(recording).agent_size[0].tolist() == pytest.approx([5.01, 2.0, 1.7])
+
+
+def test_21_what_does_not_fit_is_counted(recording):
+    """Check-list 21: overflow counters and the flag; the ego keeps its place and the source counts stay."""
+    whole, small = assemble(recording), replace(CAPACITIES["default"], agents=1, parked=0, lanes=1)
+    cut = assemble(recording, small)
+    assert whole.overflow == {} and Flag.OVERFLOW not in whole.has
+    assert cut.overflow == {
+        "agents": int(whole.agent_valid.any(axis=0).sum()) - 1,
+        "parked": int(whole.parked_valid.any(axis=0).sum()),
+        "lanes": len(whole.lane_id[whole.lane_id >= 0]) - 1,
+    } | {name: count for name, count in cut.overflow.items() if name not in ("agents", "parked", "lanes")}
+    assert Flag.OVERFLOW in cut.has and cut.agent_id[0] == whole.agent_id[0]
+    assert cut.source.tracks == whole.source.tracks == len(recording.tracks.kind)
 
 
 def test_23_jitter_is_flagged(wire):

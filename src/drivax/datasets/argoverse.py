@@ -1,13 +1,6 @@
-"""What both kinds of Argoverse 2 recordings share: their car, and where they were made."""
+"""What both kinds of Argoverse 2 recordings share: their car, and what can be in a log."""
 
 from __future__ import annotations
-
-from typing import Any
-
-import numpy as np
-from jaxtyping import Float
-
-Array = np.ndarray[Any, Any]
 
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
@@ -17,21 +10,5 @@ EGO_SIZE = (4.877, 2.0, 1.473)
 #: the wheelbase of 2.85 m ahead, less 0.09 m, because the rear overhang is longer than the front one.
 CENTRE_AHEAD_M = 1.34
 AXLE_HEIGHT_M = 0.33
-#: Cities, as sensor logs abbreviate them.
-CITIES = {
-    "ATX": "austin",
-    "DTW": "dearborn",
-    "MIA": "miami",
-    "PAO": "palo-alto",
-    "PIT": "pittsburgh",
-    "WDC": "washington-dc",
-}
 #: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
 FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
-
-
-def box_centre(
-    rear_axle: Float[Array, "step 2"], heading: Float[Array, " step"], ahead_m: float = CENTRE_AHEAD_M
-) -> Float[Array, "step 2"]:
-    """Positions of the middle of the recording car, from those of its rear axle."""
-    return rear_axle + ahead_m * np.stack((np.cos(heading), np.sin(heading)), axis=-1)

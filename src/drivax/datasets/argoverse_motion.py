@@ -12,16 +12,17 @@ from jaxtyping import Float64, Int
 
 from drivax.datasets import readings
 from drivax.datasets.argoverse import (
+    CENTRE_AHEAD_M,
     DATASET,
     EGO_SIZE,
     FARTHEST_M,
     FASTEST_MPS,
     MOST_STATES,
-    box_centre,
 )
 from drivax.datasets.argoverse_map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse_tables import PARQUET_MAGIC, Kind, Table, Words, has_magic, read_table
 from drivax.datasets.ground import lift
+from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
@@ -149,7 +150,7 @@ def decode(path: Path) -> Recording:
         features=local_map.features,
         to_predict=tuple(row for row, word in enumerate(names.words) if word == focal),
         of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
-        tags={"source_format": "av2-motion", "place": table.texts["city"].text(0)},
+        tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
         lost=local_map.lost | readings.counted(repeated_rows=table.rows - int(tracks.valid.sum())),
         flags=Flag.DEFAULT_SIZES,
     )
@@ -179,7 +180,8 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     readings.check_within(FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
-    xy[ego, valid[ego]] = box_centre(xy[ego, valid[ego]], heading[ego, valid[ego]])
+    there = valid[ego]
+    xy[ego, there] = readings.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,

@@ -14,7 +14,6 @@ from drivax.datasets import readings
 from drivax.datasets.argoverse import (
     AXLE_HEIGHT_M,
     CENTRE_AHEAD_M,
-    CITIES,
     DATASET,
     EGO_SIZE,
     FARTHEST_M,
@@ -23,6 +22,7 @@ from drivax.datasets.argoverse import (
 )
 from drivax.datasets.argoverse_map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse_tables import FEATHER_MAGIC, Kind, Table, has_magic, read_table
+from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.scenario.recording import Recording, Tracks
@@ -87,7 +87,7 @@ class ArgoverseSensor:
         poses = path.with_name(POSES)
         return Description(
             dataset="Argoverse 2 Sensor",
-            flavour=f"one log of {frames} frames in {_city(map_path) or 'an unknown city'}",
+            flavour=f"one log of {frames} frames in {_places(map_path).get('place', 'an unknown city')}",
             recordings=1,
             notes=(f"{tracks} tracks", "there are no speed limits, lights or stop signs"),
             missing=(
@@ -117,10 +117,10 @@ def _map_path(path: Path) -> Path | None:
     return next(iter(sorted((path.parent / "map").glob(MAP_PATTERN))), None)
 
 
-def _city(map_path: Path | None) -> str | None:
-    """The city in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
-    parts = [] if map_path is None else map_path.stem.split("____")[-1].split("_")
-    return CITIES.get(parts[0]) if parts else None
+def _places(map_path: Path | None) -> dict[str, str]:
+    """Tags of the place in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
+    _, _, ending = ("" if map_path is None else map_path.stem).partition("____")
+    return place_tags(ending.split("_")[0])
 
 
 def decode(path: Path) -> Recording:
@@ -147,7 +147,6 @@ def decode(path: Path) -> Recording:
         tracks = _tracks(boxes, poses, clock)
     except DataError as error:
         raise DataError(error.problem, file=path, cure=error.cure or _SKIP) from error
-    city = _city(map_path)
     return Recording(
         scenario_id=log_id,
         dataset=DATASET,
@@ -157,7 +156,7 @@ def decode(path: Path) -> Recording:
         ego=0,
         tracks=tracks,
         features=local_map.features,
-        tags={"source_format": "av2-sensor"} | ({} if city is None else {"place": city}),
+        tags={"source_format": "av2-sensor"} | _places(map_path),
         lost=local_map.lost | readings.counted(frames_without_pose=lost_frames),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )

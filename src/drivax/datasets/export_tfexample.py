@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from drivax.datasets.readings import MPS_PER_MPH
 from drivax.datasets.restore import restore
 from drivax.geometry.polylines import project, resample
 from drivax.scenario.recording import MapFeature, Recording, Tracks
@@ -35,7 +36,6 @@ AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
 #: At most so many tracks to predict come before all others.
 _FIRST = 8
-_MPH_PER_MPS = 1 / 0.44704
 #: Just under 1 m, so that rounding never makes a gap of more: readers cut polylines there.
 _SPACING_M = 0.998
 #: Absolute coordinates are written up to here, where float32 is exact to half a millimetre.
@@ -233,7 +233,7 @@ def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _
         spacing *= 1.1
         lines = [_dense(feature, spacing) for feature in ordered]
     counts = [len(line) for line in lines]
-    limits = [-1.0 if f.limit_mps is None else f.limit_mps * _MPH_PER_MPS for f in ordered]
+    limits = [-1.0 if f.limit_mps is None else f.limit_mps / MPS_PER_MPH for f in ordered]
     columns = {
         "xyz": np.concatenate([*lines, np.zeros((0, 3))]) - origin,
         "dir": np.concatenate([*map(_directions, lines), np.zeros((0, 3))]),

@@ -18,7 +18,7 @@ from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import CURRENT_STEP, DT_S, POLYGON_KINDS, AgentKind, LightState, RoadKind
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, LightState, RoadKind
 
 _Array = np.ndarray[Any, Any]
 
@@ -292,12 +292,8 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
 
 def _split_gap_m(features: Sequence[MapFeature]) -> float | None:
     """Where to cut polylines; None for files whose points were thinned, where a jump looks like any other gap."""
-    gaps = [
-        np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
-        for feature in features
-        if feature.kind not in POLYGON_KINDS and len(feature.points) > 1
-    ]
-    return _SPLIT_GAP_M if gaps and float(np.median(np.concatenate(gaps))) <= _DENSE_M else None
+    spacing = readings.spacing_m(features)
+    return _SPLIT_GAP_M if spacing is not None and spacing <= _DENSE_M else None
 
 
 def _lights(states: Any, steps: int) -> tuple[Light, ...]:

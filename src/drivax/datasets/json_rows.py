@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from drivax.errors import DataError
 _CHUNK = 1 << 20
 #: No row of a table is longer; a longer one is damage.
 _LONGEST = 1 << 24
-_BETWEEN = " \t\r\n,"
+_BETWEEN = re.compile(r"[ \t\r\n,]*")
 
 
 def rows(path: Path) -> Iterator[dict[str, Any]]:
@@ -31,23 +32,25 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
             text = file.read(_CHUNK).lstrip()
             if not text.startswith("["):
                 raise DataError("is not a table (an array of objects)", file=path, cure="download it again")
-            text = text[1:]
+            place = 1
             while True:
-                text = text.lstrip(_BETWEEN)
-                if text.startswith("]"):
+                # Only places move: cutting the text after every row would copy a chunk thousands of times.
+                between = _BETWEEN.match(text, place)
+                place = place if between is None else between.end()
+                if text.startswith("]", place):
                     return
                 try:
-                    row, end = decoder.raw_decode(text)
+                    row, end = decoder.raw_decode(text, place)
                 except ValueError:
                     more = file.read(_CHUNK)
-                    if not more or len(text) > _LONGEST:
+                    if not more or len(text) - place > _LONGEST:
                         raise
-                    text += more
+                    text, place = text[place:] + more, 0
                     continue
                 if not isinstance(row, dict):
                     raise DataError("is no object", file=path, record=number, cure="download it again")
                 yield row
-                text, number = text[end:], number + 1
+                place, number = end, number + 1
     except FileNotFoundError as error:
         raise DataError("is missing", file=path, cure="unpack the metadata archive again") from error
     except (ValueError, RecursionError) as error:

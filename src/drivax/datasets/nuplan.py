@@ -12,6 +12,7 @@ from drivax.datasets.ground import flatten
 from drivax.datasets.nuplan_features import features_around
 from drivax.datasets.nuplan_log import Agents, Piece, TimeLine
 from drivax.datasets.nuplan_map import City, city_map, corridor, feature_id, find_map
+from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.scenario.assemble import STRIDE
@@ -20,13 +21,6 @@ from drivax.scenario.schema import CURRENT_STEP, STEPS
 
 FORMAT = "nuplan"
 DATASET = "nuplan"
-#: Short names of the cities, by name of the map.
-PLACES = {
-    "sg-one-north": "singapore",
-    "us-ma-boston": "boston",
-    "us-nv-las-vegas-strip": "las-vegas",
-    "us-pa-pittsburgh-hazelwood": "pittsburgh",
-}
 #: Tables that tell a nuPlan log from other SQLite files.
 _TELLING = ("lidar_pc", "lidar_box", "ego_pose", "scenario_tag")
 
@@ -61,12 +55,15 @@ class NuPlan:
             found = nuplan_log.pieces(log.line)
         times = log.line.time_us
         scenes = len({piece.scene for piece in found})
-        notes = [f"map {log.place}", f"{(times[-1] - times[0]) * 1e-6:.0f} s of driving in {scenes} scenes"]
+        notes = [
+            f"map {log.map_name}",
+            f"{(times[-1] - times[0]) * 1e-6:.0f} s of driving in {scenes} scenes",
+        ]
         missing: tuple[str, ...] = ()
         try:
-            find_map(path, log.place)
+            find_map(path, log.map_name)
         except DataError as error:
-            missing = (f"maps/{log.place}/<version>/map.gpkg",)
+            missing = (f"maps/{log.map_name}/<version>/map.gpkg",)
             notes.append(str(error))
         return Description("nuPlan", "SQLite log", None, len(found), tuple(notes), missing)
 
@@ -84,7 +81,7 @@ class NuPlan:
         try:
             with open_database(path) as database:
                 log = _open_log(database, path)
-                city = city_map(find_map(path, log.place))
+                city = city_map(find_map(path, log.map_name))
                 agents = nuplan_log.agents(database)
                 for piece in nuplan_log.pieces(log.line):
                     try:
@@ -101,15 +98,15 @@ class _Log:
 
     database: Database
     name: str
-    place: str
+    map_name: str
     line: TimeLine
 
 
 def _open_log(database: Database, path: Path) -> _Log:
     for table, columns in nuplan_log.TABLES.items():
         database.require(table, *columns)
-    name, place = nuplan_log.log_names(database, path)
-    return _Log(database, name, place, nuplan_log.time_line(database))
+    name, map_name = nuplan_log.log_names(database, path)
+    return _Log(database, name, map_name, nuplan_log.time_line(database))
 
 
 def _recording(log: _Log, piece: Piece, agents: Agents, city: City) -> Recording:
@@ -130,7 +127,7 @@ def _recording(log: _Log, piece: Piece, agents: Agents, city: City) -> Recording
     route, unknown = corridor(city, nuplan_log.roadblocks(log.database, piece))
     lost = {**lost, **lost_features, "lights": lost_lights, "roadblocks": unknown}
     types = nuplan_log.scenario_types(log.database, log.line, piece)
-    tags = {"source_format": FORMAT, "place": PLACES.get(log.place, log.place)}
+    tags = {"source_format": FORMAT} | place_tags(log.map_name)
     return Recording(
         scenario_id=piece.name,
         dataset=DATASET,

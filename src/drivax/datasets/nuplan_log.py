@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from drivax.datasets.geopackage import Database
+from drivax.datasets.readings import box_centre
 from drivax.errors import DataError
 from drivax.geometry.angles import rotate, wrap
 from drivax.scenario.recording import Tracks
@@ -118,8 +119,8 @@ def log_names(database: Database, path: Path) -> tuple[str, str]:
     rows = database.rows("SELECT logfile, map_version FROM log")
     if not rows or not isinstance(rows[0][1], str) or not rows[0][1]:
         raise DataError("its table log names no map", file=path, cure="download the file again")
-    name, place = rows[0]
-    return (name if isinstance(name, str) and name else path.stem), place.removesuffix(".gpkg")
+    name, map_name = rows[0]
+    return (name if isinstance(name, str) and name else path.stem), map_name.removesuffix(".gpkg")
 
 
 def time_line(database: Database) -> TimeLine:
@@ -290,7 +291,7 @@ def _ego(database: Database, line: TimeLine, piece: Piece) -> Float64[np.ndarray
         raise DataError("the ego jumps", cure=_CURE)
     heading = yaw_of(pose[:, 2:6])
     cos, sin = np.cos(heading), np.sin(heading)
-    centre = pose[:, 0:2] + REAR_AXLE_TO_CENTRE_M * np.stack((cos, sin), axis=-1)
+    centre = box_centre(pose[:, 0:2], heading, REAR_AXLE_TO_CENTRE_M)
     moving = np.stack((pose[:, 6], pose[:, 7] + REAR_AXLE_TO_CENTRE_M * pose[:, 8]), axis=-1)
     size = np.broadcast_to(EGO_SIZE_M, (len(pose), 3))
     return np.column_stack((centre, np.zeros(len(pose)), heading, size, rotate(moving, cos, sin)))

@@ -36,6 +36,8 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 _NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
+#: Folder in the archive of the maps, which users are told to rename to ``maps``.
+_UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
 
@@ -48,8 +50,8 @@ def feature_id(layer: str, fid: int) -> int:
 def find_map(log: Path, name: str) -> Path:
     """The GeoPackage of a named map.
 
-    Looked for in ``maps`` beside the log or beside any folder above it, then where the environment variable
-    ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
+    Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, beside the log or beside any folder
+    above it, then where the environment variable ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
 
     Raises:
         DataError: There are no maps, or not this one.
@@ -72,12 +74,13 @@ def find_map(log: Path, name: str) -> Path:
 
 def _listing(log: Path) -> Path:
     """The file that lists the maps and their versions."""
-    roots = [folder / "maps" for folder in log.resolve().parents]
+    roots = [root for folder in log.resolve().parents for root in (folder / "maps", folder)]
     if os.environ.get("NUPLAN_MAPS_ROOT"):
         roots.append(Path(os.environ["NUPLAN_MAPS_ROOT"]))
     for root in roots:
-        if found := sorted(root.glob("nuplan-maps-*.json")):
-            return found[-1]
+        for pattern in (_LISTING, f"{_UNPACKED}/{_LISTING}"):
+            if found := sorted(root.glob(pattern)):
+                return found[-1]
     raise DataError(
         "no nuPlan maps beside it (maps/nuplan-maps-v1.0.json)",
         file=log,
@@ -167,6 +170,9 @@ def whole(value: Any) -> int | None:
 
 
 def _limit(value: Any) -> float | None:
+    """A limit in m/s; files may hold it as a text, like ids. None where it is missing or no limit of a road."""
+    if isinstance(value, str) and re.fullmatch(r"\d{1,3}(\.\d{1,20})?", value):
+        value = float(value)
     good = isinstance(value, int | float) and math.isfinite(value) and 0.0 < value <= _FASTEST_MPS
     return float(value) if good else None
 

@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float64
 
 from drivax.datasets.ground import flatten
 from drivax.datasets.nuscenes_map import city
-from drivax.datasets.nuscenes_tables import Scene, Tables, scene_rows
+from drivax.datasets.nuscenes_tables import Scene, Tables, has_annotations, scene_rows
+from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
-from drivax.datasets.readings import check_finite, windows_of
+from drivax.datasets.readings import box_centre, check_finite, windows_of
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
 from drivax.scenario.recording import Recording, Tracks
@@ -46,6 +47,8 @@ class NuScenes:
     companions: tuple[str, ...] = (
         *(f"v1.0-*/{table}.json" for table in (*_TABLES[:-1], *_OTHERS)),
         "maps/*.png",
+        "maps/*.json",
+        "expansion/*.json",
         "maps/*/*.json",
         "maps/*/*.png",
     )
@@ -63,15 +66,18 @@ class NuScenes:
         expansion = sorted(path.name for path in _maps(path).glob("*.json"))
         if not expansion:
             missing.append("maps/expansion/*.json (the map expansion pack)")
+        notes = [
+            f"maps: {', '.join(expansion) or 'none'}",
+            "no lights, no speed limits; states between keyframes are interpolated",
+        ]
+        if not has_annotations(folder):
+            notes.append("no annotations (as in the test split): there is nothing to convert")
         return Description(
             dataset="nuScenes",
             flavour="tables of 2 Hz keyframes",
             version=folder.name,
             recordings=len(scene_rows(folder)),
-            notes=(
-                f"maps: {', '.join(expansion) or 'none'}",
-                "no lights, no speed limits; states between keyframes are interpolated",
-            ),
+            notes=tuple(notes),
             missing=tuple(missing),
         )
 
@@ -98,7 +104,10 @@ class NuScenes:
 
 
 def _maps(path: Path) -> Path:
-    return path.parent.parent / "maps" / "expansion"
+    """The folder of city maps: where the devkit wants it, or where people unpack the pack, which brings a folder."""
+    root = path.parent.parent
+    wanted = root / "maps" / "expansion"
+    return next((f for f in (wanted, root / "maps", root / "expansion") if any(f.glob("*.json"))), wanted)
 
 
 def recording(scene: Scene, map_file: Path, version: str) -> Recording:
@@ -126,7 +135,7 @@ def recording(scene: Scene, map_file: Path, version: str) -> Recording:
         ego=0,
         tracks=tracks,
         features=features,
-        tags={"source_format": "nuscenes", "place": scene.location},
+        tags={"source_format": "nuscenes"} | place_tags(scene.location),
         lost=whole.lost,
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
@@ -135,8 +144,7 @@ def recording(scene: Scene, map_file: Path, version: str) -> Recording:
 def _tracks(scene: Scene, times: Float64[Array, " time"]) -> Tracks:
     """The ego in row 0 and every instance, at the given times."""
     poses = scene.poses[:, 1:].copy()
-    heading = poses[:, 2]
-    poses[:, :2] += CENTRE_AHEAD_M * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+    poses[:, :2] = box_centre(poses[:, :2], poses[:, 2], CENTRE_AHEAD_M)
     check_finite(poses, *scene.observations.values())
     moved = [interpolate(scene.poses[:, 0], poses, times)]
     moved += [interpolate(table[:, 0], table[:, 1:4], times) for table in scene.observations.values()]

@@ -40,7 +40,7 @@ class City:
     Attributes:
         features: Everything, in the frame of the city (metres from its south-west corner), z = 0.
         version: Version that the file names.
-        lost: Elements that name others that do not exist, by layer.
+        lost: Elements that could not be used, or name others that do not exist, by kind; of the whole city.
     """
 
     features: tuple[MapFeature, ...]
@@ -139,14 +139,16 @@ class _Layers:
         for i, (row, name) in enumerate(drawn):
             connects, line = name == "lane_connector", lines[row["token"]]
             link = links.get(row["token"], {})
+            after, before = ([*link.get(way, ())] for way in ("outgoing", "incoming"))
+            self._count("dangling_links", sum(token not in index for token in (*after, *before)))
             lanes.append(
                 MapFeature(
                     i,
                     RoadKind.LANE_SURFACE,
                     np.column_stack((line, np.zeros(len(line)))),
                     width_m=None if connects else self._width(row, line),
-                    successors=tuple(index[token] for token in link.get("outgoing", ()) if token in index),
-                    predecessors=tuple(index[token] for token in link.get("incoming", ()) if token in index),
+                    successors=tuple(index[token] for token in after if token in index),
+                    predecessors=tuple(index[token] for token in before if token in index),
                     interpolating=connects,
                 )
             )

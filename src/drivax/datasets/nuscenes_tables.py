@@ -66,6 +66,14 @@ def scene_rows(folder: Path) -> list[dict[str, str]]:
     ]
 
 
+def has_annotations(folder: Path) -> bool:
+    """Whether a version's table of annotations has a row; the test split's is empty. True where it cannot be read."""
+    try:
+        return next(rows(folder / "sample_annotation.json"), None) is not None
+    except DataError:
+        return True
+
+
 @dataclass
 class Tables:
     """Everything that is needed of a version's tables, in arrays of numbers.
@@ -93,8 +101,14 @@ class Tables:
         """Reads the tables of one version (``v1.0-mini``, ...), the large ones row by row.
 
         Raises:
-            DataError: A table is missing or damaged, or rows name others that do not exist.
+            DataError: A table is missing or damaged, or there are no annotations, as in the test split.
         """
+        if not has_annotations(folder):
+            raise DataError(
+                "holds no annotations, so nobody but the ego would be there",
+                file=folder / "sample_annotation.json",
+                cure="convert v1.0-trainval or v1.0-mini; the test split has none",
+            )
         scenes = scene_rows(folder)
         scene_index = {row["token"]: i for i, row in enumerate(scenes)}
         logs = {

@@ -1,4 +1,4 @@
-"""What readers share: lights collected by lane, checks, time bases, velocities from positions, JSON files."""
+"""What readers share: lights by lane, checks, time bases, places and spacing of what was measured, JSON files."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from drivax.errors import DataError
 from drivax.scenario.arrays import differentiate as differentiate
 from drivax.scenario.assemble import STRIDE
 from drivax.scenario.recording import Light, MapFeature
-from drivax.scenario.schema import STEPS, LightState, RoadKind
+from drivax.scenario.schema import POLYGON_KINDS, STEPS, LightState, RoadKind
 
+#: Metres per second in a mile per hour.
+MPS_PER_MPH = 0.44704
 _UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
 _LAST_STATE = int(max(LightState))
 
@@ -79,6 +81,23 @@ def seconds(timestamps: Float64[np.ndarray, " time"]) -> Float64[np.ndarray, " t
         return steps * 0.1
     nearest = known[np.maximum(np.searchsorted(known, steps, side="right") - 1, 0)]
     return timestamps[nearest] + (steps - nearest) * 0.1
+
+
+def box_centre(
+    rear_axle: Float[np.ndarray, "step 2"], heading: Float[np.ndarray, " step"], ahead_m: float
+) -> Float[np.ndarray, "step 2"]:
+    """Positions of the middle of a car ``ahead_m`` ahead of its rear axle, where poses of recording cars are."""
+    return rear_axle + ahead_m * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+
+
+def spacing_m(features: Sequence[MapFeature]) -> float | None:
+    """Median distance of neighbouring points of lines (polygons are left out), metres; None without any."""
+    gaps = [
+        np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
+        for feature in features
+        if feature.kind not in POLYGON_KINDS and len(feature.points) > 1
+    ]
+    return float(np.median(np.concatenate(gaps))) if gaps else None
 
 
 def load_json(path: Path) -> Any:

@@ -18,6 +18,7 @@ import numpy as np
 from drivax.datasets import pickles, readings
 from drivax.datasets.ground import flatten, lift
 from drivax.datasets.nuscenes import CENTRE_AHEAD_M
+from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet_map import RoadMap, road_map
 from drivax.datasets.scenarionet_tracks import read_tracks, velocity_is_missing
@@ -38,8 +39,6 @@ _TITLES = {
     "lyft": "Lyft Level 5",
     "metadrive": "MetaDrive (generated)",
 }
-_CITIES = {"boston": "boston", "singapore": "singapore", "sg-one-north": "singapore", "las-vegas": "las-vegas",
-           "pittsburgh": "pittsburgh"}  # fmt: skip
 #: WOMD's polylines have points 0.5 m apart; twice that is a jump where the map was clipped.
 _WOMD_GAP_M = 1.0
 _STATES = {
@@ -217,9 +216,8 @@ def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int)
 def _centred(tracks: Tracks, ego: int) -> Tracks:
     """The ego at its box centre: nuScenes' poses are of the rear axle."""
     heading, valid = tracks.heading[ego], tracks.valid[ego]
-    ahead = CENTRE_AHEAD_M * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
     xy = tracks.xy.copy()
-    xy[ego] += np.where(valid[:, None], ahead, 0.0)
+    xy[ego] = np.where(valid[:, None], readings.box_centre(xy[ego], heading, CENTRE_AHEAD_M), 0.0)
     return replace(tracks, xy=xy)
 
 
@@ -263,10 +261,7 @@ def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
 
 
 def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
-    tags = {"source_format": _NAME}
-    named = (text(metadata.get("map")) or "").lower()
-    if city := next((city for part, city in _CITIES.items() if part in named), None):
-        tags["place"] = city
+    tags = {"source_format": _NAME} | place_tags(text(metadata.get("map")))
     if kind := text(metadata.get("scenario_type")):
         tags["scenario_type"] = kind[:64]
     return tags

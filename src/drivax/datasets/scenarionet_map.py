@@ -29,7 +29,7 @@ from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKi
 
 Array = np.ndarray[Any, Any]
 
-_MPS_PER_MPH, _MPS_PER_KMH = 0.44704, 1 / 3.6
+_MPS_PER_KMH = 1 / 3.6
 #: A limit above this is a placeholder (MetaDrive's is 1000 km/h).
 _FASTEST_MPS = 45.0
 #: Data sets whose converters write limits that nobody measured: 100 km/h on every connector, 85 mph everywhere.
@@ -182,7 +182,7 @@ def _lane(lane: MapFeature, body: Mapping[Any, Any], reading: _Reading) -> MapFe
 
 def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
     """The speed limit in m/s; 0 in the file means unknown."""
-    given = ((body.get("speed_limit_mph"), _MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
+    given = ((body.get("speed_limit_mph"), readings.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
     for value, unit in given:
         limit = number(value)
         if limit is not None and limit > 0:

@@ -20,8 +20,6 @@ from drivax.geometry.angles import wrap
 from drivax.scenario.recording import Light, MapFeature, Tracks
 from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, AgentKind, RoadKind
 
-#: Metres per second in a mile per hour.
-MPS_PER_MPH = 0.44704
 SKIP = "skip this record, or download the file again"
 _SPANS = ("past", "current", "future")
 #: Floats hold every whole number up to here; beyond, ids stored as floats may have been rounded.
@@ -237,7 +235,7 @@ def map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
     made = []
     for group in _groups(ids, keep):
         kind = RoadKind(int(kinds[group[0]]))
-        limit = float(limits[group].max()) * MPS_PER_MPH if kind in LANE_KINDS else 0.0
+        limit = float(limits[group].max()) * readings.MPS_PER_MPH if kind in LANE_KINDS else 0.0
         ring = _unclosed(points[group]) if kind in POLYGON_KINDS else points[group]
         made.append(MapFeature(int(ids[group[0]]), kind, ring, limit_mps=limit if limit > 0 else None))
     return tuple(made), bool(valid.all())
@@ -267,19 +265,9 @@ def _unclosed(points: Array) -> Array:
     return points[:-1] if closed else points
 
 
-def spacing_m(found: Sequence[MapFeature]) -> float | None:
-    """Median distance of neighbouring points of lines: 0.5 m up to v1.1, 1.0 m from v1.2; None without any."""
-    gaps = [
-        np.hypot(*np.diff(feature.points[:, :2], axis=0).T)
-        for feature in found
-        if feature.kind not in POLYGON_KINDS and len(feature.points) > 1
-    ]
-    return float(np.median(np.concatenate(gaps))) if gaps else None
-
-
 def is_coarse(found: Sequence[MapFeature]) -> bool:
-    """Whether the map is sampled at 1 m rather than at 0.5 m."""
-    return (spacing_m(found) or 0.5) > 0.75
+    """Whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m."""
+    return (readings.spacing_m(found) or 0.5) > 0.75
 
 
 def split_gap_m(found: Sequence[MapFeature]) -> float:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from drivax.datasets import readings, womd
 from drivax.datasets.messages import parse, scenario_class
 from drivax.datasets.reader import BadRecord, Description
-from drivax.datasets.tf_example import MPS_PER_MPH, agent_kind
+from drivax.datasets.tf_example import agent_kind
 from drivax.datasets.tfrecord import count_records
 from drivax.datasets.womd_tables import POINTS, STATES, read_table
 from drivax.errors import DataError
@@ -218,7 +218,7 @@ def _lane(feature_id: int, lane: Any, points: _Points) -> MapFeature:
         feature_id=feature_id,
         kind=RoadKind(lane.type) if 0 <= lane.type <= 3 else RoadKind.LANE_UNDEFINED,
         points=points,
-        limit_mps=lane.speed_limit_mph * MPS_PER_MPH if lane.speed_limit_mph > 0 else None,
+        limit_mps=lane.speed_limit_mph * readings.MPS_PER_MPH if lane.speed_limit_mph > 0 else None,
         successors=tuple(lane.exit_lanes),
         predecessors=tuple(lane.entry_lanes),
         left_neighbours=tuple(neighbour.feature_id for neighbour in lane.left_neighbors),
