@@ -74,6 +74,21 @@ def test_one_set_in_full(sets, inspect):
     assert cells(out, "s3").split()[:3] == ["91", "4", "4"]
 
 
+def test_what_was_skipped_and_filtered_is_told(tmp_path, inspect):
+    rows = [{"file": "a.tfrecord", "record": None, "problem": "is cut off"}]
+    rows += [{"file": "b.tfrecord", "record": k, "problem": "the ego jumps"} for k in range(4)]
+    source = {"skipped": 5, "skipped_records": rows, "filtered": 2, "filters": ["agents>1", "place=x"]}
+    with ScenarioWriter(tmp_path / "set", CAPACITIES["default"], source) as writer:
+        writer.add(assemble(straight_road([car(0, 0, 0, 8)])))
+    out = inspect(tmp_path / "set")
+    assert cells(out, "skipped") == "5 records that could not be converted"
+    assert "a.tfrecord: is cut off" in out and "b.tfrecord: record 1: the ego jumps" in out
+    assert "record 2" not in out and "2 more in manifest.json" in out
+    assert cells(out, "filtered") == "2 scenarios left out by agents>1 and place=x"
+    assert json.loads(inspect(tmp_path / "set", "--json"))["source"] == source
+    assert cells(inspect(tmp_path / "set", tmp_path / "set"), "skipped") == "5 5"
+
+
 def test_metres_are_not_summed():
     assert finding_text([1.0, 2.0, 6.0]) == "mean 3, median 2, most 6"
     assert finding_text([True, False, True, True]) == "3 of 4 (75 %)"
@@ -121,7 +136,7 @@ def test_filters(sets, inspect):
 def test_json_of_one_set_and_of_several(sets, inspect):
     one = json.loads(inspect(sets[0], "--json"))
     both = json.loads(inspect(*sets, "--json"))
-    assert list(one) == ["scenarios"] and len(one["scenarios"]) == 4
+    assert list(one) == ["source", "scenarios"] and len(one["scenarios"]) == 4
     assert [row["set"] for row in both] == [str(path) for path in sets]
     assert both[0]["scenarios"] == one["scenarios"] and len(both[1]["scenarios"]) == 2
 

@@ -25,7 +25,10 @@ ENTRY = {
     },
     "overflow": {"agents": 3},
     "audit": {"log_collides": False, "distance_m": 5.0, "velocity": "measured", "route_deviation_max_m": None},
-    "tags": {"place": "boston", "source_format": "womd-scenario", "fleet": "7", "lights": "yes", "type": "turn_left"},
+    "tags": {
+        "place": "boston", "source_format": "womd-scenario", "fleet": "7", "scenario_types": "stop|left_turn",
+        "lights": "yes", "type": "turn_left",
+    },
 }  # fmt: skip
 
 
@@ -46,6 +49,10 @@ def chosen(*filters):
         ("scenario_id=637.0", False),
         ("tag.fleet=7", True),
         ("tag.fleet!=7", False),
+        ("scenario_types=left_turn", True),
+        ("scenario_types=u_turn|stop", True),
+        ("scenario_types!=left_turn", False),
+        ("scenario_types=turn", False),
         ("agents>=50", True),
         ("agents>50", False),
         ("agents<=50", True),
@@ -171,6 +178,7 @@ def test_rows_are_those_that_the_operator_selects(counts, sign, number):
 
 def test_every_name_finds_something_in_a_stored_scenario():
     tags = {"place": "here", "source_format": "x", "domain": "x", "family": "x", "event": "x"}
+    tags |= {"location": "x", "scenario_types": "x|y"}
     recording = replace(straight_road([car(0, 0, 0, 8)], light=GREEN), tags=tags)
     scenario = assemble(recording)
     findings = {

@@ -61,7 +61,7 @@ class GpuDrive:
 
     name: str = "gpudrive"
     patterns: tuple[str, ...] = ("tfrecord-*_*.json",)
-    companions: tuple[str, ...] = ()
+    companions: tuple[str, ...] = ("export.json",)
 
     def recognise(self, path: Path) -> bool:
         """Whether the file begins like a GPUDrive scene."""

@@ -263,7 +263,7 @@ def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
 def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
     tags = {"source_format": _NAME} | place_tags(text(metadata.get("map")))
     if kind := text(metadata.get("scenario_type")):
-        tags["scenario_type"] = kind[:64]
+        tags["scenario_types"] = kind[:64]
     return tags
 
 

@@ -5,14 +5,11 @@ Workers stream assembled records to a file each; what comes back through the pro
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import shutil
-import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +20,7 @@ import numpy as np
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError
 from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
+from drivax.tracking.workers import worker_pool
 
 
 @dataclass(frozen=True)
@@ -58,9 +56,7 @@ def converted_ahead(
     """
     spool = folder / f"spool-{os.getpid()}"
     spool.mkdir()
-    pool = ProcessPoolExecutor(
-        min(workers, len(tasks)), multiprocessing.get_context("spawn"), initializer=_start_worker
-    )
+    pool = worker_pool(min(workers, len(tasks)))
     waiting: deque[tuple[Path, Future[list[_Kept | BadRecord]]]] = deque()
     todo = iter(enumerate(tasks))
     try:
@@ -119,17 +115,3 @@ def _unspool(
                 continue
             record = np.frombuffer(file.read(dtype.itemsize), dtype).reshape(())
             yield Scenario(record, capacity, item.source, item.overflow, tags=item.tags)
-
-
-def _start_worker() -> None:
-    # On Ctrl-C workers die at once and silently; the parent cleans up.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-
-
-def _die_with_parent() -> None:
-    """A parent that is killed cannot stop its workers, and they would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-    os._exit(1)

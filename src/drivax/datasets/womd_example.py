@@ -25,7 +25,7 @@ class WomdExample:
 
     name: str = womd.EXAMPLE_FORMAT
     patterns: tuple[str, ...] = womd.PATTERNS
-    companions: tuple[str, ...] = ()
+    companions: tuple[str, ...] = ("export.json",)
 
     def recognise(self, path: Path) -> bool:
         """Whether the first readable record is a tf.Example of the motion dataset."""

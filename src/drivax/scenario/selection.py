@@ -65,8 +65,8 @@ OVERFLOWS = (
     "lights_without_lane", "stops", "stop_lanes", "road_rows", "events", "event_actors",
 )  # fmt: skip
 _NAMES = ("dataset", "segment", "scenario_id")
-#: Tags whose values are the sources' own words.
-_OPEN_TAGS = ("place", "source_format", "domain", "family", "event")
+#: Tags whose values are the sources' own words; several words are joined by ``|``.
+_OPEN_TAGS = ("place", "location", "scenario_types", "source_format", "domain", "family", "event")
 _MAP_FEATURES = ("lane", "road_line", "road_edge", "crosswalk", "speed_bump", "stop_sign", "driveway")
 #: Counts of the source before capping, by their path in a manifest entry.
 _COUNTS: Mapping[str, tuple[str, ...]] = {
@@ -75,6 +75,11 @@ _COUNTS: Mapping[str, tuple[str, ...]] = {
     **{f"map_features.{name}": ("source", "map_features", name) for name in _MAP_FEATURES},
     "segments": ("segments",),
 }
+
+
+def tag_words(entry: Mapping[str, Any], name: str) -> frozenset[str]:
+    """The words of a scenario's tag: one, several where the source gives several (``scenario_types``), or none."""
+    return frozenset(entry["tags"].get(name, "").split("|")) - {""}
 
 
 def vocabulary() -> dict[str, Quantity]:
@@ -151,7 +156,7 @@ class Filter:
         return held.isdisjoint(self.values) == (self.operator == "!=")
 
     def find(self, entry: Mapping[str, Any]) -> Any:
-        """What a scenario says about it: a number, a word, a truth, its flags; None where it does not know."""
+        """What a scenario says about it: a number, a word, a truth, a set of words; None where it does not know."""
         group, _, name = self.name.partition(".")
         if group == "flag":
             return frozenset(entry["flags"])
@@ -160,7 +165,7 @@ class Filter:
         if group == "overflow":
             return entry["overflow"].get(name, 0)
         if group == "tag":
-            return entry["tags"].get(name)
+            return tag_words(entry, name) or None
         if group in _NAMES:
             return entry[group]
         if self.name in _COUNTS and not isinstance(self.values[0], str):
@@ -168,7 +173,7 @@ class Filter:
             for key in _COUNTS[self.name]:
                 found = found.get(key, 0)
             return found
-        return entry["tags"].get(self.name)
+        return tag_words(entry, self.name) or None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError
 from drivax.scenario.schema import DT_S, Scenario
-from drivax.scenario.selection import FINDINGS, Selection
+from drivax.scenario.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
 
 Array = np.ndarray[Any, Any]
@@ -86,6 +86,11 @@ class Inspection:
         """What the manifest says about the selected scenarios."""
         return [self.scenarios.entries[row] for row in self.rows]
 
+    @property
+    def source(self) -> Mapping[str, Any]:
+        """How the set was made, and what was read and is not in it; empty for sets that were written by hand."""
+        return self.scenarios.manifest["source"]
+
     def sample(self) -> Iterator[Scenario]:
         """At most ``SAMPLE`` of the selected scenarios, evenly spread."""
         places = np.unique(np.linspace(0, len(self.rows) - 1, min(SAMPLE, len(self.rows))).round())
@@ -120,7 +125,7 @@ class Inspection:
     def tags(self) -> dict[str, dict[str, int]]:
         """How many scenarios have each value of each tag; the data set is told elsewhere."""
         names = self.words(lambda entry: [name for name in entry["tags"] if name != "dataset"])
-        return {name: self.words(lambda e, name=name: _present(e["tags"].get(name))) for name in names}
+        return {name: self.words(lambda e, name=name: sorted(tag_words(e, name))) for name in names}
 
     def totals(self, read: Callable[[Entry], Mapping[str, int]]) -> dict[str, tuple[int, int]]:
         """Sum of each counter, and in how many scenarios it is not zero."""
@@ -140,10 +145,6 @@ class Inspection:
         """What the audit says under a name, of every scenario that it says it of."""
         found = (entry["audit"].get(name) for entry in self.entries)
         return [value for value in found if value is not None]
-
-
-def _present(word: str | None) -> tuple[str, ...]:
-    return () if word is None else (word,)
 
 
 def _counted(name: str) -> Callable[[Entry], Any]:

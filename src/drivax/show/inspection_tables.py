@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from drivax.show.inspection import QUANTITIES, Entry, Inspection
 
 #: Scenarios that are listed, values of a tag that are named, and sets that stand side by side.
 LISTED, NAMED, ABREAST = 30, 6, 4
+#: Records that could not be read, of which the cause is told.
+_CAUSES = 3
 
 
 def overview(inspection: Inspection) -> Table:
@@ -35,6 +37,8 @@ def overview(inspection: Inspection) -> Table:
         f"{capacity.segments:,} map segments, {capacity.lanes} lanes, {capacity.lights} lights",
     )
     table.add_row("written by", f"drivax {manifest['drivax_version']}, schema {manifest['schema_version']}")
+    for label, cell in _not_in_it(inspection.source):
+        table.add_row(label, cell)
     for name, values in inspection.tags().items():
         table.add_row(name, _counted(values, count))
     table.add_row("flags", _counted(inspection.words(lambda entry: entry["flags"]), count))
@@ -42,6 +46,23 @@ def overview(inspection: Inspection) -> Table:
     table.add_row("left out", _totals(inspection.totals(lambda entry: entry["source"].get("lost", {}))))
     table.add_row("integrity", "every checksum is right" if inspection.checked else "not tested (--no-check)")
     return table
+
+
+def _not_in_it(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What a conversion read and did not store: counts, and the first causes."""
+    bad, filtered = source.get("skipped_records", []), source.get("filtered", 0)
+    if bad:
+        yield "skipped", f"{len(bad):,} record{'s' if len(bad) > 1 else ''} that could not be converted"
+    for row in bad[:_CAUSES]:
+        record = "" if row["record"] is None else f"record {row['record']}: "
+        yield "", f"{row['file']}: {record}{row['problem']}"
+    if len(bad) > _CAUSES:
+        yield "", f"{len(bad) - _CAUSES:,} more in manifest.json"
+    if filtered:
+        yield (
+            "filtered",
+            f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {' and '.join(source['filters'])}",
+        )
 
 
 def audit_table(inspection: Inspection) -> Table | None:
@@ -143,6 +164,7 @@ def content_rows(inspections: Sequence[Inspection]) -> Rows:
         ("places", [_places(one) for one in inspections]),
         ("duration", [_hours(one) for one in inspections]),
         ("rate", [_rate(one) for one in inspections]),
+        ("skipped", [f"{one.source.get('skipped', 0):,}" for one in inspections]),
         ("MB", [f"{one.megabytes:,.1f}" for one in inspections]),
     ]
     for quantity in QUANTITIES:

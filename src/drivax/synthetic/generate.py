@@ -7,12 +7,10 @@ imports JAX, so that workers start in a fraction of a second; an audit that need
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
-import signal
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -24,6 +22,7 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
+from drivax.tracking.workers import worker_pool
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
@@ -169,8 +168,7 @@ def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, 
         for first, last in spans:
             yield from _draw(first, last, seed, options)
         return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(options.workers, len(spans)), context, initializer=_ignore_interrupts)
+    pool = worker_pool(min(options.workers, len(spans)))
     waiting: deque[Future[list[_Drawn]]] = deque()
     try:
         for first, last in spans:
@@ -184,8 +182,3 @@ def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, 
         raise DrivaxError("a worker process was killed", cure="try fewer --workers") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _ignore_interrupts() -> None:
-    """Leaves Ctrl-C to the parent, which stops the workers in order."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,53 @@
+"""Worker processes: they work, and none outlives its parent."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from drivax.tracking.workers import worker_pool
+
+PROGRAM = """
+import sys, time
+from drivax.tracking.workers import worker_pool
+
+if __name__ == "__main__":
+    pool = worker_pool(2)
+    for future in [pool.submit(time.sleep, 0.1) for _ in range(4)]:
+        future.result()
+    print("ready", flush=True)
+    {end}
+"""
+
+
+def group_is_gone(leader, seconds):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(leader, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_a_pool_works():
+    with worker_pool(1) as pool:
+        assert list(pool.map(abs, [-1, 2])) == [1, 2]
+
+
+@pytest.mark.parametrize("end", ["time.sleep(60)", "pool.submit(time.sleep, 60); time.sleep(60)"])
+def test_a_killed_parent_takes_its_workers_along(tmp_path, end):
+    (tmp_path / "program.py").write_text(PROGRAM.format(end=end))
+    command = [sys.executable, str(tmp_path / "program.py")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    assert not group_is_gone(process.pid, 0.1)
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    assert group_is_gone(process.pid, 10.0)
