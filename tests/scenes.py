@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import STEPS, AgentKind, Flag, LightState, RoadKind
+from drivax.scenario.schema import CAPACITIES, STEPS, AgentKind, Flag, LightState, RoadKind
 
 LANE_M = 3.7
 
@@ -87,14 +89,27 @@ def straight_road(cars, light=None, light_x=40.0, limit=13.4, begin=-150.0, end=
     )
 
 
+#: One small size for all hand-made scenes: banks of as many scenarios share one compiled program.
+SMALL = replace(
+    CAPACITIES["default"],
+    agents=16,
+    parked=8,
+    segments=512,
+    lights=2,
+    road_rows=512,
+    edge_run=48,
+    lane_run=48,
+)
+
+
 def bank_of(*recordings):
-    return ScenarioBank.from_scenarios([assemble(recording) for recording in recordings])
+    scenarios = [assemble(recording, SMALL) for recording in recordings]
+    assert not any(scenario.overflow for scenario in scenarios)
+    return ScenarioBank.from_scenarios(scenarios, trim=False)
 
 
 def moved(recording, angle, dx, dy):
     """The same world rotated about the origin and shifted."""
-    from dataclasses import replace
-
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.array([[cos, sin], [-sin, cos]])
 

@@ -130,7 +130,8 @@ def test_distance_to_a_segment_equals_dense_sampling(seed):
     t = np.linspace(0.0, 1.0, 20_001)
     brute = np.hypot(*(p - a - t[:, None] * (b - a)).T)
     distance, fraction = point_to_segment(p, a, b)
-    assert distance[0] == pytest.approx(brute.min(), abs=1e-6)
+    beside = np.hypot(*(b - a)[0]) / 40_000  # the nearest sample lies at most half a spacing off the foot
+    assert -1e-9 <= brute.min() - distance[0] <= np.hypot(distance[0], beside) - distance[0] + 1e-9
     assert fraction[0] == pytest.approx(t[brute.argmin()], abs=1e-3)
 
 

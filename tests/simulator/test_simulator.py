@@ -204,6 +204,7 @@ def test_vmap_is_a_loop(simulator, world):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-4), single, part)
 
 
+@pytest.mark.slow
 def test_jit_changes_nothing():
     simulator = Simulator(Task(observation=PRESETS["minimal"]))
     bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 0, 0, 8)], light=RED))
