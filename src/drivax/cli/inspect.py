@@ -52,9 +52,7 @@ def run(args: Inspect) -> int:
     selection = Selection.parse(args.filter)
     opened = [Inspection.open(path, selection, not args.no_check) for path in args.sets]
     if args.json:
-        found = [
-            {"source": one.source, "scenarios": [described(entry) for entry in one.entries]} for one in opened
-        ]
+        found = [{"scenarios": [described(entry) for entry in one.entries]} for one in opened]
         named = [{"set": str(path), **one} for path, one in zip(args.sets, found, strict=True)]
         json.dump(found[0] if len(found) == 1 else named, sys.stdout, indent=1)
         print()
