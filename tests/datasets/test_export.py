@@ -118,7 +118,7 @@ def test_tfrecord_shards(stored, tmp_path):
     assert listing(tmp_path / "turns") == [NOTE, *shards]
     assert (done.scenarios, done.files) == (5, 3) and calls == [(number, 5) for number in range(1, 6)]
     found = survey(tmp_path / "turns")
-    assert found.formats == {"womd-example": 3} and found.ignored == 1
+    assert found.formats == {"womd-example": 3} and (found.ignored, found.companions) == (0, 1)
     note = json.loads((tmp_path / "turns" / NOTE).read_text())
     assert note["format"] == "tfexample" and note["set"]["hash"] == ScenarioSet.open(stored).hash
     assert [(row["scenario_id"], row["file"]) for row in note["scenarios"]] == list(
