@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,14 @@ class Draft:
     markings: list[Line] = field(default_factory=list)
     crosswalks: list[Line] = field(default_factory=list)
 
-    def lane(self, curve: Curve, width_m: float, limit_mps: float, *, connector: bool = False) -> int:
-        """Adds a lane and returns its index."""
-        self.lanes.append(Lane(curve, width_m, limit_mps, connector=connector))
+    def lane(self, curve: Curve, width_m: float, limit_mps: float, **more: Any) -> int:
+        """Adds a lane, with further attributes of :class:`~drivax.synthetic.roads.Lane`, and returns its index."""
+        self.lanes.append(Lane(curve, width_m, limit_mps, **more))
         return len(self.lanes) - 1
+
+    def change(self, lane: int, **attributes: Any) -> None:
+        """Gives a lane other attributes, such as rules that are known once all lanes are there."""
+        self.lanes[lane] = replace(self.lanes[lane], **attributes)
 
     def link(self, before: int, after: int) -> None:
         """Traffic may go on from lane ``before`` to lane ``after``."""

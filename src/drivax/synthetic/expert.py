@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.geometry.boxes import corners, overlap
+from drivax.synthetic.drivers import Drivers
 from drivax.synthetic.paths import LaneChange, Path, Sway, lane_path, random_lanes
 from drivax.synthetic.roads import RoadNetwork
 from drivax.synthetic.signals import Colour
-from drivax.synthetic.traffic import Drivers
 
 #: Added to ego's length and width before overlap is tested, m: replay in float32 must not touch either.
 _SKIN_M = 0.2

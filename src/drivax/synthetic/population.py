@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from drivax.synthetic.drivers import Drivers
 from drivax.synthetic.roads import RoadNetwork
-from drivax.synthetic.traffic import Drivers
 
 #: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time added per m/s.
 _GAP_M, _GAP_S = 5.0, 0.9

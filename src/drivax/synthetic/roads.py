@@ -1,8 +1,9 @@
-"""What a family of roads builds: lanes with links, closed edges, markings, crosswalks, lights and starts."""
+"""What a family of roads builds: lanes with links and rules, closed edges, markings, crosswalks, lights, starts."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import enum
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float64
 
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
-from drivax.synthetic.curves import Curve
+from drivax.synthetic.curves import Curve, Pose
 from drivax.synthetic.signals import SignalPlan
 
 #: Centre lines closer than this belong to movements that cannot be driven at the same time, m.
@@ -19,13 +20,31 @@ CLEARANCE_M = 2.9
 _STRIDE = 2
 
 
+class Control(enum.IntEnum):
+    """What a driver meets where a lane begins."""
+
+    NONE = 0
+    SIGNAL = 1
+    YIELD = 2
+    STOP = 3
+    ALL_WAY_STOP = 4
+
+
 @dataclass(frozen=True)
 class Lane:
     """A lane; its index is its place in ``RoadNetwork.lanes``, links are indices, -1 is none.
 
     Attributes:
-        connector: True for a way across a junction: where lanes may cross and a light may control the entry.
+        connector: True for a way across a junction: where lanes may cross and where rules hold at the entry.
         left, right: The neighbour of the same direction whose ends lie beside this lane's ends.
+        control: The rule at the entry of a connector; the stop line is where the lane begins.
+        yields_to: Connectors whose users go first where both would meet: the priority road at a yield or stop sign,
+            the oncoming traffic of a left turn, who circulates in a roundabout. With all-way stops who stood first
+            goes first, and this is empty.
+        ends: The lane ends without a successor although the road goes on: its users must change to a neighbour
+            (lane drops, acceleration lanes).
+        exit_only: The lane leads off the road (a deceleration lane): who goes straight on does not use it.
+        kind: For cars or for bicycles only.
     """
 
     curve: Curve
@@ -36,6 +55,11 @@ class Lane:
     left: int = -1
     right: int = -1
     connector: bool = False
+    control: Control = Control.NONE
+    yields_to: tuple[int, ...] = ()
+    ends: bool = False
+    exit_only: bool = False
+    kind: RoadKind = RoadKind.LANE_SURFACE
 
     @cached_property
     def length_m(self) -> float:
@@ -61,6 +85,38 @@ class Start:
 
 
 @dataclass(frozen=True)
+class Crossing:
+    """Where people cross: the axis from kerb to kerb, and the crosswalk's width; unmarked ones are not painted.
+
+    Attributes:
+        axis: Two points, one on each kerb.
+        width_m: Width of the crosswalk.
+        lanes: The lanes that it crosses, and where on each (m along its centre) the axis does.
+        marked: Whether there is a crosswalk, so that drivers have to let people cross.
+    """
+
+    axis: Float64[np.ndarray, "2 2"]
+    width_m: float
+    lanes: tuple[tuple[int, float], ...]
+    marked: bool = True
+
+
+@dataclass(frozen=True)
+class Bay:
+    """A place to park beside the lanes, inside the road's edges: its middle, heading and length.
+
+    Attributes:
+        lane: The lane beside it; a car that stands in that lane beside the bay is double-parked.
+        along_m: Where on that lane the middle of the bay is.
+    """
+
+    pose: Pose
+    length_m: float
+    lane: int
+    along_m: float
+
+
+@dataclass(frozen=True)
 class RoadNetwork:
     """A road map in its own frame (metres).
 
@@ -68,8 +124,11 @@ class RoadNetwork:
         family: Name of the family that built it.
         lanes: All lanes.
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
-        signals: The lights of its junction, or None.
+        signals: The lights of its junctions, or None.
         starts: Where ego may begin.
+        crossings: Where people may cross.
+        walks: Sidewalks, outside the edges; people walk along them in both directions.
+        bays: Places where cars may be parked.
     """
 
     family: str
@@ -79,6 +138,9 @@ class RoadNetwork:
     crosswalks: tuple[Line, ...] = ()
     signals: SignalPlan | None = None
     starts: tuple[Start, ...] = ()
+    crossings: tuple[Crossing, ...] = ()
+    walks: tuple[Curve, ...] = ()
+    bays: tuple[Bay, ...] = ()
 
     @cached_property
     def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
@@ -126,19 +188,39 @@ def feature_id(lane: int) -> int:
 
 
 def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
-    """The network as map features: lanes first (ids 1, 2, ...), then edges, markings and crosswalks."""
+    """The network as map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
     features = [_lane_feature(index, lane) for index, lane in enumerate(network.lanes)]
     for line in network.edges:
         features.append(_line_feature(len(features) + 1, line.kind, np.concatenate([line.xy, line.xy[:1]])))
     for line in network.markings + network.crosswalks:
         features.append(_line_feature(len(features) + 1, line.kind, line.xy))
+    for stop in _stop_signs(network):
+        features.append(replace(stop, feature_id=len(features) + 1))
     return tuple(features)
+
+
+def _stop_signs(network: RoadNetwork) -> list[MapFeature]:
+    """One sign per lane from which connectors with a stop begin, at the stop line."""
+    signs: dict[int, list[int]] = {}
+    for index, lane in enumerate(network.lanes):
+        if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
+            for before in lane.predecessors:
+                signs.setdefault(before, []).append(index)
+    return [
+        MapFeature(
+            feature_id=0,
+            kind=RoadKind.STOP_SIGN,
+            points=_flat(network.lanes[before].curve.xy[-1:]),
+            lanes=tuple(map(feature_id, ways)),
+        )
+        for before, ways in signs.items()
+    ]
 
 
 def _lane_feature(index: int, lane: Lane) -> MapFeature:
     return MapFeature(
         feature_id=feature_id(index),
-        kind=RoadKind.LANE_SURFACE,
+        kind=lane.kind,
         points=_flat(_thinned(lane.curve.xy)),
         limit_mps=lane.limit_mps,
         width_m=lane.width_m,

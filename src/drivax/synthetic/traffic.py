@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
 from drivax.scenario.schema import DT_S
-from drivax.simulator.idm import IdmParameters, idm_acceleration
+from drivax.simulator.idm import idm_acceleration
+from drivax.synthetic.drivers import Drivers
 from drivax.synthetic.paths import Path
 from drivax.synthetic.roads import RoadNetwork
 from drivax.synthetic.signals import Colour
@@ -24,40 +25,6 @@ _SPEED_TIME_S = 0.6
 #: Jerk beyond a driver's own is used when braking harder than this, m/s2.
 _EMERGENCY_MPS2 = 3.6
 _EMERGENCY_JERK = 25.0
-
-
-@dataclass(frozen=True)
-class Drivers:
-    """Vehicles and who drives them, one entry per vehicle.
-
-    Attributes:
-        size_m: Length, width and height.
-        speed_factor: Wanted speed as a multiple of the limit.
-        lateral_mps2: Lateral acceleration accepted in bends.
-        slowing_mps2: Deceleration with which slower stretches are approached.
-        yellow_mps2: Deceleration that a driver accepts to stop at yellow.
-        jerk_mps3: Rate at which acceleration is changed in ordinary driving.
-        headway_s, acceleration_mps2, braking_mps2: The driver's IDM.
-    """
-
-    size_m: Float64[np.ndarray, "vehicle 3"]
-    speed_factor: Float64[np.ndarray, " vehicle"]
-    lateral_mps2: Float64[np.ndarray, " vehicle"]
-    slowing_mps2: Float64[np.ndarray, " vehicle"]
-    yellow_mps2: Float64[np.ndarray, " vehicle"]
-    jerk_mps3: Float64[np.ndarray, " vehicle"]
-    headway_s: Float64[np.ndarray, " vehicle"]
-    acceleration_mps2: Float64[np.ndarray, " vehicle"]
-    braking_mps2: Float64[np.ndarray, " vehicle"]
-
-    @property
-    def idm(self) -> IdmParameters:
-        """The drivers' parameters of the common law."""
-        return IdmParameters(
-            headway_s=self.headway_s,
-            acceleration_mps2=self.acceleration_mps2,
-            comfortable_braking_mps2=self.braking_mps2,
-        )
 
 
 @dataclass(frozen=True)

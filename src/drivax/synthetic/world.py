@@ -19,13 +19,14 @@ from drivax.geometry.angles import wrap
 from drivax.scenario.recording import Event, Light, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Flag
 from drivax.synthetic import expert
+from drivax.synthetic.drivers import Drivers
 from drivax.synthetic.events import SCRIPTS, EventKind, Staged
 from drivax.synthetic.families import FAMILIES, RoadFamily
 from drivax.synthetic.paths import Path, Sway, lane_path, random_lanes
 from drivax.synthetic.population import Density, drawn_drivers, joined_drivers, placed
 from drivax.synthetic.roads import RoadNetwork, feature_id, map_features
 from drivax.synthetic.signals import SignalPlan, light_states
-from drivax.synthetic.traffic import Drivers, Motion, Traffic, speed_profile
+from drivax.synthetic.traffic import Motion, Traffic, speed_profile
 
 #: Raised whenever the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 1

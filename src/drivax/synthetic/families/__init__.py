@@ -9,6 +9,7 @@ import numpy as np
 from drivax.synthetic.families.curved_road import CurvedRoad
 from drivax.synthetic.families.signalised_junction import SignalisedJunction
 from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.style import GRID, RoadStyle
 
 
 @runtime_checkable
@@ -20,7 +21,7 @@ class RoadFamily(Protocol):
         """Short name, part of scenario ids."""
         ...
 
-    def build(self, rng: np.random.Generator) -> RoadNetwork:
+    def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draws one example."""
         ...
 

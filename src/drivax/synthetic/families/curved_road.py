@@ -12,6 +12,7 @@ from drivax.scenario.schema import RoadKind
 from drivax.synthetic.curves import STEP_M, Curve, Pose, winding
 from drivax.synthetic.drafting import Draft, ring
 from drivax.synthetic.roads import Line, RoadNetwork, Start
+from drivax.synthetic.style import GRID, RoadStyle
 
 #: Lanes ahead and lanes the other way, with the share of each layout.
 _LAYOUTS = ((1, 1), (2, 0), (2, 1), (2, 2), (3, 0), (3, 1))
@@ -41,7 +42,7 @@ class CurvedRoad:
     shoulder_m: tuple[float, float] = (0.5, 1.5)
     name: str = "curved_road"
 
-    def build(self, rng: np.random.Generator) -> RoadNetwork:
+    def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draws a road; ego may begin in the second section of any lane ahead."""
         ahead, back = _LAYOUTS[rng.choice(len(_LAYOUTS), p=_SHARES)]
         tightest = float(rng.uniform(*self.tightest_m))

@@ -19,6 +19,7 @@ from drivax.synthetic.curves import STEP_M, Curve, Pose, connected, joined, resa
 from drivax.synthetic.drafting import Draft, ring
 from drivax.synthetic.roads import Line, RoadNetwork, Start, conflicting
 from drivax.synthetic.signals import LightGroup, SignalPlan
+from drivax.synthetic.style import GRID, RoadStyle
 
 _ARMS = 4
 #: From the junction's mouth outwards: the crosswalk, then the stop line, m.
@@ -80,7 +81,7 @@ class SignalisedJunction:
     green_s: tuple[float, float] = (7.0, 14.0)
     name: str = "signalised_junction"
 
-    def build(self, rng: np.random.Generator) -> RoadNetwork:
+    def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draws a junction; ego may begin on any approach, 12 to 85 m before its stop line."""
         arms = self._arms(rng)
         limit = float(rng.choice(self.limits_mps))

@@ -1,0 +1,42 @@
+"""How the roads of a domain look: ranges from which every family draws, so that domains differ in all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class RoadStyle:
+    """Statistics of a domain's roads. Families add their own geometry.
+
+    Attributes:
+        width_m: Width of lanes, low and high.
+        limits_mps: Speed limits of streets to choose from.
+        fast_limits_mps: Speed limits of highways and their like.
+        shoulder_m: Drivable width beyond the outer lanes, low and high.
+        curvature: Factor on the curvature of bends.
+        walk_share: Share of streets with sidewalks.
+        parking_share: Share of streets with bays, where a family has room for them.
+    """
+
+    width_m: tuple[float, float] = (3.35, 3.75)
+    limits_mps: tuple[float, ...] = (11.2, 13.4, 15.6, 17.9)
+    fast_limits_mps: tuple[float, ...] = (22.4, 24.6, 26.8, 29.1)
+    shoulder_m: tuple[float, float] = (0.5, 1.5)
+    curvature: float = 1.0
+    walk_share: float = 0.8
+    parking_share: float = 0.3
+
+
+#: Wide lanes and higher speeds.
+GRID = RoadStyle()
+#: Narrow lanes, low speeds, parked cars everywhere.
+RING = RoadStyle(
+    width_m=(2.9, 3.3),
+    limits_mps=(8.3, 8.3, 11.1, 13.9),
+    fast_limits_mps=(19.4, 22.2),
+    shoulder_m=(0.25, 0.7),
+    curvature=1.3,
+    walk_share=0.95,
+    parking_share=0.7,
+)
