@@ -12,7 +12,7 @@ from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.idm import IdmPlanner
 from drivax.planners.network import NetworkPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.simple import expert_action, logged_motion
+from drivax.planners.simple import RandomActions, expert_action, logged_motion
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import ActionSpace
@@ -98,3 +98,17 @@ def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
     seen = jax.jit(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)))(bank)
     np.testing.assert_allclose(mode, policy(seen).mode(), rtol=1e-4, atol=1e-6)
     assert np.abs(sample - mode).max() > 1e-3 and (jnp.abs(sample) < 1).all()
+
+
+def test_random_actions_fill_the_action_space_evenly_and_follow_the_key(simulator):
+    planner, bank = RandomActions(), bank_of(straight_road([car(0, 0, 0, 9)]))
+    state = simulator.reset(bank, 0, 10, 0)
+    situation = simulator.situation(bank, state)
+    keys = jax.random.split(jax.random.key(3), 4000)
+    actions = np.asarray(jax.vmap(lambda key: planner.act((), bank, state, situation, None, key)[0])(keys))
+    # Uniform over [-1, 1): mean 0, variance 1/3, axes independent.
+    assert np.abs(actions.mean(axis=0)).max() < 0.04
+    assert actions.var(axis=0) == pytest.approx(1 / 3, rel=0.06)
+    assert abs(np.corrcoef(actions.T)[0, 1]) < 0.05 and np.abs(actions).max() <= 1.0
+    again = planner.act((), bank, state, situation, None, keys[7])[0]
+    assert np.array_equal(np.asarray(again), actions[7])

@@ -19,20 +19,6 @@ def signed_area(ring):
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
 
 
-def crossings(a, b):
-    """Number of proper crossings of two open polylines, every segment with every other."""
-    p, r = a[:-1, None], np.diff(a, axis=0)[:, None]
-    q, s = b[None, :-1], np.diff(b, axis=0)[None]
-
-    def cross(u, v):
-        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-
-    q, s = np.broadcast_to(q, (len(a) - 1, len(b) - 1, 2)), np.broadcast_to(s, (len(a) - 1, len(b) - 1, 2))
-    one = cross(r, q - p) * cross(r, q + s - p) < 0
-    other = cross(s, p - q) * cross(s, p + r - q) < 0
-    return int(np.sum(one & other))
-
-
 def box_corners(xy, heading, length, width):
     """Corners, counter-clockwise."""
     c, s = math.cos(heading), math.sin(heading)

@@ -14,6 +14,7 @@ from drivax.synthetic.curves import (
     joined,
     quintic,
     resampled,
+    smooth_step,
     straight,
     turn,
     winding,
@@ -108,3 +109,35 @@ def test_winding_roads_respect_their_limits(seed):
     assert curve.arc_m[-1] == pytest.approx(400.0, abs=0.6)
     # It bends both ways somewhere in five draws, and never jumps in curvature.
     assert np.abs(np.diff(curve.heading, 2)).max() < STEP_M**2 * (2 / 35) / 35 * 1.01
+
+
+def test_a_displaced_curve_keeps_its_distance_and_its_tangent():
+    # On a circle of radius 40 m a displacement of 3 m to the left of a left turn gives a circle of 37 m.
+    angle = np.linspace(0.0, 1.5, 241)
+    circle = Curve(40.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1), angle + math.pi / 2)
+    inner = circle.displaced(np.full(len(angle), 3.0))
+    assert np.hypot(*inner.xy.T) == pytest.approx(37.0)
+    assert inner.heading == pytest.approx(circle.heading)
+    # A growing displacement turns the heading: it is the direction of the chords, and left stays left.
+    bent = circle.displaced(3.5 * smooth_step(np.linspace(0.0, 1.0, len(angle))))
+    chords = np.diff(bent.xy, axis=0)
+    middle = (bent.heading[1:] + bent.heading[:-1]) / 2
+    assert np.unwrap(np.arctan2(chords[:, 1], chords[:, 0])) == pytest.approx(middle, abs=2e-3)
+    assert np.hypot(*bent.xy[-1]) == pytest.approx(36.5)
+
+
+def test_the_smooth_step_has_no_slope_and_no_bend_at_its_ends():
+    share = np.array([-1.0, 0.0, 0.5, 1.0, 2.0])
+    assert smooth_step(share) == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
+    h = 1e-3
+    near = smooth_step(np.array([h, 2 * h, 1 - h, 1 - 2 * h]))
+    # Third order at both ends: 10 h^3.
+    assert near == pytest.approx([10 * h**3, 80 * h**3, 1 - 10 * h**3, 1 - 80 * h**3], abs=2e-10 * 8)
+
+
+def test_poses_are_moved_ahead_aside_and_turned():
+    pose = Pose(1.0, 2.0, math.pi / 2)
+    assert pose.ahead(3.0).y == pytest.approx(5.0) and pose.ahead(3.0).x == pytest.approx(1.0)
+    assert pose.aside(3.0).x == pytest.approx(-2.0) and pose.aside(3.0).y == pytest.approx(2.0)
+    back = pose.turned()
+    assert (back.x, back.y) == (1.0, 2.0) and math.cos(back.heading - pose.heading) == pytest.approx(-1.0)

@@ -1,73 +1,135 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drivax.synthetic.expert import boxes, inside, leaves_road, runs_red, touching
-from drivax.synthetic.families import CurvedRoad, SignalisedJunction
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.signals import Colour
+from drivax.synthetic import expert
+from drivax.synthetic.cast import Override, Staging
+from drivax.synthetic.expert import drawn_expert, drive, expert_lanes, expert_path
+from drivax.synthetic.families import CurvedRoad
+from drivax.synthetic.faults import touching, user_boxes
+from drivax.synthetic.roads import Control
+from drivax.synthetic.style import GRID
 
-from .oracles import box_corners, shared_area, winding_number
+from .staged_scenes import CAR, TIMES, crossed, driven, road, scene, user
+
+EVENT = Staging(overrides=(Override(0, 0, 0, 9.0),))
+BARRIER = (1.0, 20.0, 1.5)
 
 
-@pytest.mark.parametrize("family", [CurvedRoad(median_share=1.0), SignalisedJunction()])
-@pytest.mark.parametrize("seed", range(2))
-def test_inside_agrees_with_winding_numbers(family, seed):
+class Runs:
+    """Traffic in which nobody reacts; it remembers the plans."""
+
+    def __init__(self, motion, reaction=None):
+        self.motion, self.plans, self.reaction = motion, [], reaction
+
+    def __call__(self, staging, plan):
+        if plan is None:
+            return self.motion
+        self.plans.append(plan)
+        motion = driven(self.motion, plan)
+        return motion if self.reaction is None else self.reaction(motion, len(self.plans))
+
+
+def test_a_good_drive_is_not_planned():
+    cast, motion = scene(road(), 12.0)
+    runs = Runs(motion)
+    got, cause = drive(cast, TIMES, Staging(), 0, runs)
+    assert (got, cause, runs.plans) == (motion, "", [])
+
+
+def test_a_collision_is_planned_away():
+    cast, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
+    runs = Runs(motion)
+    got, cause = drive(cast, TIMES, EVENT, 10, runs)
+    assert cause == ""
+    assert [plan.first_step for plan in runs.plans] == [10]
+    assert np.array_equal(got.xy[0, :11], motion.xy[0, :11])
+    box = user_boxes(got)
+    assert (touching(box, got.valid, ~np.eye(2, dtype=bool)) == len(TIMES)).all()
+
+
+@pytest.mark.parametrize(("aware", "begins"), [(15, [15]), (32, [32, 16])])
+def test_ego_acts_late_if_that_is_early_enough(aware, begins):
+    # 12 m/s: bumpers meet during the 38th step; from 3.2 s on no braking helps.
+    cast, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
+    runs = Runs(motion)
+    assert drive(cast, TIMES, EVENT, 0, runs, aware)[1] == ""
+    assert [plan.first_step for plan in runs.plans] == begins
+
+
+def test_what_cannot_be_avoided_is_rejected_by_its_cause():
+    cast, motion = scene(road((1,)), 14.0, [user((40.0, 0.0), size=BARRIER)])
+    runs = Runs(motion)
+    _, cause = drive(cast, TIMES, EVENT, 0, runs)
+    assert cause == "ego_collides"
+    assert len(runs.plans) == 3
+
+
+def test_common_driving_must_not_brake_hard():
+    # 12^2 / (2 x 5.2) m and a metre ahead of the bumper.
+    barrier = user((30.0 + 2.3 + 13.8 + 1.5, 0.0), size=BARRIER)
+    cast, motion = scene(road((1,)), 12.0, [barrier])
+    assert drive(cast, TIMES, EVENT, 0, Runs(motion))[1] == ""
+    assert drive(cast, TIMES, Staging(), 0, Runs(motion))[1] == "ego_brakes_hard"
+
+
+def test_others_who_react_are_planned_for_again():
+    """The standing car rolls back by 8 m as soon as ego has a plan."""
+    cast, motion = scene(road((1,)), 12.0, [user((85.0, 0.0))])
+
+    def reaction(motion, run):
+        xy = motion.xy.copy()
+        xy[1, 30:, 0] = 77.0
+        return replace(motion, xy=xy)
+
+    runs = Runs(motion, reaction)
+    got, cause = drive(cast, TIMES, EVENT, 0, runs)
+    assert cause == ""
+    assert 1 <= len(runs.plans) <= 3
+    assert got.xy[0, -1, 0] < 77.0 - CAR[0]
+
+
+def test_a_rough_drive_is_smoothed_or_kept():
+    cast, motion = scene(road((1,)), 12.0)
+    speed = motion.speed.copy()
+    speed[0] = 12.0 - 0.5 * np.sin(2 * np.pi * TIMES / 0.9)
+    rough = replace(motion, speed=speed)
+    runs = Runs(rough)
+    got, cause = drive(cast, TIMES, EVENT, 0, runs)
+    assert cause == ""
+    assert np.abs(np.diff(got.speed[0])).max() < np.abs(np.diff(speed[0])).max() / 3
+
+
+def test_the_plan_begins_where_ego_stood_at_a_stop_sign():
+    cast, motion = scene(crossed(100.0, Control.STOP), 10.0, [user((140.0, 0.0))], lanes=(0, 1, 2))
+    falling = 10.0 - 0.25 * np.arange(41)
+    speed = np.concatenate([falling, np.zeros(5), 0.2 * np.arange(1, 46)])
+    at = 75.0 + np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) * 0.05)])
+    at += 100.0 - 1.0 - CAR[0] / 2 - at[40]
+    xy = motion.xy.copy()
+    xy[0, :, 0] = at
+    speeds = motion.speed.copy()
+    speeds[0] = speed
+    motion = replace(motion, xy=xy, speed=speeds, distance_m=at[None])
+    blocked = motion.xy.copy()
+    blocked[1, :, 0] = at[-1] - 1.0
+    runs = Runs(replace(motion, xy=blocked))
+    got, cause = drive(cast, TIMES, EVENT, 0, runs)
+    assert cause == ""
+    assert runs.plans[0].first_step == 47  # 0.4 m/s: still standing
+    assert got.xy[0, -1, 0] < blocked[1, 0, 0] - CAR[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drawn_experts_keep_limits(seed):
     rng = np.random.default_rng(seed)
-    network = family.build(rng)
-    rings = tuple(edge.xy for edge in network.edges)
-    around = np.concatenate([lane.curve.xy[::25] for lane in network.lanes])
-    points = around + rng.normal(0.0, 4.0, around.shape)
-    got = inside(points, rings)
-    brute = [sum(winding_number(p, ring) for ring in rings) == 1 for p in points]
-    assert got.tolist() == brute
-    assert 0.1 < np.mean(brute) < 0.98
-
-
-def test_touching_agrees_with_clipped_polygons():
-    rng = np.random.default_rng(0)
-    xy = rng.uniform(-15, 15, (12, 3, 2))
-    heading = rng.uniform(-4, 4, (12, 3))
-    size = rng.uniform(1.5, 7.0, (12, 3, 3))
-    size[:] = size[:, :1]
-    valid = rng.random((12, 3)) < 0.8
-    skinless = size.copy()
-    skinless[0] -= 0.2  # ego is tested with a skin of that much
-    got = touching(boxes(xy, heading, skinless), valid)
-    for i in range(12):
-        for j in range(i + 1, 12):
-            shared = [
-                shared_area(
-                    box_corners(xy[i, t], heading[i, t], *size[i, t, :2]),
-                    box_corners(xy[j, t], heading[j, t], *size[j, t, :2]),
-                )
-                for t in range(3)
-                if valid[i, t] and valid[j, t]
-            ]
-            assert got[i, j] == got[j, i] == (max(shared, default=0.0) > 1e-9)
-    assert 0 < got.sum() < 12 * 11
-
-
-def test_a_box_that_cuts_the_kerb_leaves_the_road():
-    network = CurvedRoad().build(np.random.default_rng(1))
-    lane = network.lanes[1]
-    xy, heading = lane.curve.xy[50:52], lane.curve.heading[50:52]
-    size = np.array([[4.8, 2.0, 1.5]] * 2)
-    assert not leaves_road(network, boxes(xy, heading, size))
-    right = np.stack([np.sin(heading), -np.cos(heading)], axis=-1)
-    assert leaves_road(network, boxes(xy + 8.0 * 3.7 * right, heading, size))
-
-
-def test_running_red_means_red_before_and_after():
-    network = SignalisedJunction().build(np.random.default_rng(0))
-    first = network.starts[0].lane
-    way = network.lanes[first].successors[0]
-    path = lane_path(network, (first, way, *network.lanes[way].successors), Sway())
-    line = path.spans[1].begin_m
-    times = np.arange(0.0, network.signals.cycle_s, 0.1)
-    colour = network.signals.colours(times, len(network.lanes))[0][:, way]
-    for step in range(1, len(times) - 1, 7):
-        front = np.where(np.arange(len(times)) <= step, line - 0.5, line + 0.5)
-        red = colour[step] == Colour.RED and colour[step + 1] == Colour.RED
-        assert runs_red(network, path, front, times) == red
+    network = CurvedRoad().build(rng, GRID)
+    driver = drawn_expert(rng)
+    assert driver.speed_factor[0] < 1.0
+    lanes, change = expert_lanes(network, network.starts[0].lane, 1.0, rng)
+    path = expert_path(network, lanes, change, rng)
+    assert path.length_m > 100.0
+    assert expert.HARDEST_MPS2 < expert.HARDEST_IN_EVENT_MPS2

@@ -3,11 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.cli.generate import Generate, run, summary
+from drivax.cli.generate import Generate, run, summary, world
 from drivax.errors import UsageError
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
-from drivax.synthetic.generate import FamilyCount, GeneratedSet, Generation, generate
+from drivax.settings import dump
+from drivax.synthetic.generate import RESERVED_SEED, FamilyCount, GeneratedSet, Generation, generate
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 
 SCENARIOS = 7
 
@@ -89,7 +91,10 @@ def test_audit_findings_are_stored(tmp_path):
 def test_what_cannot_be_meant_is_refused(tmp_path):
     for arguments, text in (
         ((0, 0), "scenarios is 0; use 1 or more"),
-        ((1, -1), "seed is -1; use 0 or more"),
+        ((1, -1), "seed is -1; use 0 to 999999999"),
+        ((1, RESERVED_SEED), "seed is 1000000000; use 0 to 999999999"),
+        ((1, 0, Generation(world=WorldConfig(rare_rate=1.5))), "rare_rate is 1.5; use a share from 0 to 1"),
+        ((1, 0, Generation(world=WorldConfig(scenarios_per_map=0))), "scenarios_per_map is 0; use 1"),
         ((1, 0, Generation(workers=0)), "workers is 0; use 1 or more"),
         ((1, 0, Generation(capacity="tiny")), "no capacity 'tiny'; use one of default, large"),
     ):
@@ -127,3 +132,53 @@ def test_the_summary_by_hand(tmp_path):
         "  curved_road      30 kept,  6.25% of draws rejected (ego_collides 2)",
         "  x                10 kept,  0.00% of draws rejected",
     ]
+
+
+def test_the_summary_tells_which_event_came_up_where(tmp_path):
+    counts = {
+        "curved_road": FamilyCount(30, {}, {"cut_in": 2, "lead_brakes": 1}),
+        "x": FamilyCount(10, {}, {"cut_in": 4}),
+    }
+    text = summary(GeneratedSet(tmp_path, 40, 4.0, counts))
+    assert text.splitlines()[3:] == [
+        "  7 scenarios with an event:",
+        "    cut_in            6 (curved_road 2, x 4)",
+        "    lead_brakes       1 (curved_road 1)",
+    ]
+
+
+def test_segments_are_maps_and_the_manifest_tells_the_world(one_worker):
+    path, result, _ = one_worker
+    scenarios = ScenarioSet.open(path)
+    segments = [entry["segment"] for entry in scenarios.entries]
+    each = WorldConfig().scenarios_per_map
+    assert [segments.index(name) // each for name in segments] == [i // each for i in range(SCENARIOS)]
+    assert len(set(segments)) == -(-SCENARIOS // each)
+    # The same lanes lie under all scenarios of a map, each in a frame of its own.
+    lanes = [
+        dict(zip(s.lane_id[s.lane_id >= 0].tolist(), s.lane_length.tolist(), strict=False))
+        for s in (scenarios[0], scenarios[1])
+    ]
+    both = lanes[0].keys() & lanes[1].keys()
+    assert both and all(abs(lanes[0][lane] - lanes[1][lane]) < 1e-3 for lane in both)
+    source = scenarios.manifest["source"]
+    assert source["world"] == WORLD_VERSION and source["seed"] == 5
+    assert source["config"]["domain"] == "grid" and source["config"]["rare_rate"] == 0.05
+    events = [entry["tags"]["event"] for entry in scenarios.entries if "event" in entry["tags"]]
+    assert sum(sum(count.events.values()) for count in result.families.values()) == len(events)
+
+
+def test_flags_override_the_configuration_file(tmp_path):
+    file = tmp_path / "world.yaml"
+    file.write_text("rare_rate: 0.25\nscenarios_per_map: 3\nnoise:\n  level: 0.5\n")
+    plain = world(Generate(tmp_path))
+    assert plain == WorldConfig()
+    loaded = world(Generate(tmp_path, config=file))
+    assert (loaded.rare_rate, loaded.scenarios_per_map, loaded.noise.level) == (0.25, 3, 0.5)
+    both = world(Generate(tmp_path, config=file, rare_rate=0.75, domain="ring"))
+    assert (both.rare_rate, both.scenarios_per_map, both.domain) == (0.75, 3, "ring")
+    file.write_text(dump(both))
+    assert world(Generate(tmp_path, config=file)) == both
+    file.write_text("rare_rat: 0.25\n")
+    with pytest.raises(UsageError, match="rare_rate"):
+        world(Generate(tmp_path, config=file))

@@ -1,13 +1,18 @@
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
 from drivax.scenario.schema import LightState
 from drivax.synthetic.families import SignalisedJunction
-from drivax.synthetic.signals import Colour, LightGroup, SignalPlan, light_states
+from drivax.synthetic.signals import (
+    Colour,
+    LightGroup,
+    SignalPlan,
+    light_states,
+    side_by_side,
+    yellow_time_s,
+)
 
 PLAN = SignalPlan(
     groups=(LightGroup((0,), True), LightGroup((1, 2), False)),
@@ -50,24 +55,33 @@ def test_the_phase_of_a_lane():
         PLAN.phase_of(3)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_conflicting_movements_never_go_together(seed):
-    """Boxes 1.9 m wide and 4.7 m long cannot touch anywhere on two ways that show green or yellow together."""
-    network = SignalisedJunction().build(np.random.default_rng(seed))
-    times = np.arange(0.0, network.signals.cycle_s, 0.1)
-    colour, _ = network.signals.colours(times, len(network.lanes))
-    go = (colour == Colour.GREEN) | (colour == Colour.YELLOW)
-    ways = [i for i, lane in enumerate(network.lanes) if lane.connector]
-    served = colour[:, ways] == Colour.GREEN
-    assert served.any(axis=0).all()  # everybody gets green once per cycle
-    assert (colour[:, ways] == Colour.RED).any(axis=0).all()
-    for a, b in itertools.combinations(ways, 2):
-        if network.lanes[a].predecessors == network.lanes[b].predecessors or not (go[:, a] & go[:, b]).any():
-            continue
-        one, other = network.lanes[a].curve.xy, network.lanes[b].curve.xy
-        near = np.sqrt(np.min(np.sum((one[:, None] - other[None]) ** 2, axis=-1)))
-        assert near > 2.8
-        assert network.lanes[a].successors != network.lanes[b].successors
+def test_yellow_lasts_as_long_as_it_takes_to_react_and_stop():
+    # 17.9 m/s: one second, then 17.9 / (2 x 3.05) s of braking to a stop or of driving through.
+    assert yellow_time_s(17.9) == pytest.approx(3.934, abs=1e-3)
+    assert yellow_time_s(8.3) == 3.0
+
+
+def test_two_junctions_keep_their_own_cycles():
+    second = SignalPlan((LightGroup((4, 5), False), LightGroup((6,), False)), ((0,), (1,)), (4.0, 6.0))
+    both = side_by_side(PLAN, second, 1.0)
+    assert both.cycle_s == 22.0
+    assert both.starts_s == (0.0, 9.5, 1.0, 9.5)
+    assert [both.phase_of(lane) for lane in (0, 2, 5, 6)] == [0, 1, 2, 3]
+    times = np.arange(0.0, 100.0, 0.1)
+    colour, left = both.colours(times, 8)
+    alone, _ = PLAN.colours(times, 8)
+    assert np.array_equal(colour[:, :4], alone[:, :4])
+    # The second one's cycle is 4 + 6 + 2 x 4.5 = 19 s, its green begins at 2 + 1 s.
+    for k, shown in ((3.05, Colour.GREEN), (6.85, Colour.GREEN), (7.05, Colour.YELLOW), (10.05, Colour.RED)):
+        row = int(np.searchsorted(times, k))
+        assert colour[row, 4] == colour[row + 190, 4] == colour[row + 380, 5] == shown
+    assert left[72, 4] == pytest.approx(2.8, abs=1e-4)
+
+
+def test_a_longer_cycle_is_a_longer_first_green():
+    longer = PLAN.stretched(30.0)
+    assert longer.cycle_s == 30.0
+    assert longer.green_s == (13.0, 8.0)
 
 
 def test_between_phases_everybody_has_red():

@@ -1,19 +1,25 @@
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 
+from drivax.scenario.schema import AgentKind
+from drivax.synthetic.cast import Cast, EgoPlan, Override, Reroute, Scripted, Staging, Walker
 from drivax.synthetic.curves import Pose, straight
 from drivax.synthetic.drafting import Draft
-from drivax.synthetic.families import CurvedRoad
+from drivax.synthetic.families import FAMILIES, CurvedRoad
 from drivax.synthetic.paths import Sway, lane_path, random_lanes
-from drivax.synthetic.population import Density, drawn_drivers, joined_drivers, placed
-from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.population import Density, drawn_drivers, driven_path, placed
+from drivax.synthetic.roads import Crossing, RoadNetwork
 from drivax.synthetic.signals import LightGroup, SignalPlan
-from drivax.synthetic.traffic import Override, Traffic, speed_profile
+from drivax.synthetic.tables import speed_profile
+from drivax.synthetic.traffic import Traffic
+
+from . import traffic_scenes
+from .oracles import box_corners, shared_area
+from .traffic_scenes import cast, crossroads, drivers, road
 
 
 def line_with_light(signals=None):
@@ -33,15 +39,9 @@ def light(green_s, offset_s=0.0):
     return SignalPlan(groups, ((0,), (1,)), (green_s, 500.0), offset_s=offset_s)
 
 
-def drivers(count, seed=0, **values):
-    table = drawn_drivers(count, 0.0, np.random.default_rng(seed))
-    return dataclasses.replace(table, **{k: np.full(count, v) for k, v in values.items()})
-
-
 def run(network, table, at, speed, seconds, overrides=()):
-    paths = [lane_path(network, (0, 1, 2), Sway()) for _ in at]
-    times = np.arange(round(seconds * 10)) / 10
-    return Traffic(network, paths, table, np.array(at, float), np.array(speed, float), times).run(overrides)
+    ways = [(0, 1, 2)] * len(at)
+    return traffic_scenes.run(network, ways, table, at, speed, seconds, Staging(overrides=overrides))
 
 
 def test_the_speed_profile_is_the_slowest_that_is_needed():
@@ -64,7 +64,7 @@ def test_a_free_driver_reaches_and_holds_the_wanted_speed():
 @pytest.mark.parametrize("speed", [6.0, 10.0, 14.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_at_red_everybody_stops_behind_the_line(speed, seed):
-    table = drivers(3, seed)
+    table = drivers(3, seed, speed_factor=0.95)
     motion = run(line_with_light(light(1.0, -10.0)), table, [140.0, 110.0, 70.0], [speed] * 3, 30.0)
     front = motion.distance_m[0] + table.size_m[0, 0] / 2
     assert front.max() < 200.0
@@ -121,36 +121,22 @@ def test_positions_are_the_integral_of_speeds_and_stops_are_exact():
     assert np.all(v[halt + 1 : 60] == 0) and np.ptp(s[halt + 1 : 60]) == 0
 
 
-def crossroads():
-    """Two roads that cross at right angles, without lights: lanes 0-1-2 eastwards, 3-4-5 northwards."""
-    draft = Draft()
-    for x, y, heading in ((0.0, 0.0, 0.0), (110.0, -110.0, math.pi / 2)):
-        begin = Pose(x, y, heading)
-        parts = [
-            draft.lane(straight(begin.ahead(at), length), 3.5, 15.0, connector=at == 100.0)
-            for at, length in ((0.0, 100.0), (100.0, 20.0), (120.0, 200.0))
-        ]
-        draft.link(parts[0], parts[1])
-        draft.link(parts[1], parts[2])
-    return RoadNetwork("test", tuple(draft.lanes), ())
-
-
 @pytest.mark.parametrize("crossing", [True, False])
 def test_nobody_enters_while_somebody_still_crosses(crossing):
     network = crossroads()
     assert np.argwhere(network.conflicts).tolist() == [[1, 4], [4, 1]]
     table = drivers(2, speed_factor=0.9)
-    paths = [lane_path(network, lanes, Sway()) for lanes in ((0, 1, 2), (3, 4, 5))]
     # The first one creeps across the junction, or has crossed it already.
-    at = np.array([104.0 if crossing else 140.0, 50.0])
+    at = [104.0 if crossing else 140.0, 50.0]
     creep = Override(vehicle=0, first_step=0, last_step=75, acceleration_mps2=0.0)
-    motion = Traffic(network, paths, table, at, np.array([2.0, 10.0]), np.arange(150) / 10).run((creep,))
+    ways = ((0, 1, 2), (3, 4, 5))
+    motion = traffic_scenes.run(network, ways, table, at, [2.0, 10.0], 15.0, Staging(overrides=(creep,)))
     front = motion.distance_m[1] + table.size_m[1, 0] / 2
     rear = motion.distance_m[0] - table.size_m[0, 0] / 2
     entered = int(np.flatnonzero(front > 100.0)[0])
     if crossing:
-        assert rear[entered] >= 120.0 - 0.5 and entered > 70
-        assert motion.speed[1, :entered].min() < 0.6
+        assert rear[entered] >= 113.0 and entered > 50
+        assert motion.speed[1, :entered].min() < 3.0
     else:
         assert entered < 60 and motion.speed[1].min() > 5.0
 
@@ -161,23 +147,154 @@ def test_vehicles_leave_at_the_end_of_the_map():
     assert np.all(np.diff(motion.valid[0].astype(int)) <= 0)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_placed_vehicles_keep_their_distance(seed):
+def test_a_platoon_settles_at_the_gap_of_the_closed_form():
+    # In equilibrium 1 - (v / v0)^4 = ((s0 + v T) / s)^2 (Treiber, Hennecke and Helbing 2000).
+    network, _ = road(3000.0)
+    table = drivers(4, 3, speed_factor=0.9)
+    table.top_speed_mps[0] = 8.0
+    motion = traffic_scenes.run(network, [(0,)] * 4, table, [150.0, 120.0, 90.0, 60.0], [8.0] * 4, 150.0)
+    speed = motion.speed[0, -1]
+    assert speed == pytest.approx(8.0, abs=0.05)
+    for k in range(1, 4):
+        gap = (
+            motion.distance_m[k - 1, -1]
+            - motion.distance_m[k, -1]
+            - (table.size_m[k - 1, 0] + table.size_m[k, 0]) / 2
+        )
+        wanted = (2.0 + speed * table.headway_s[k]) / math.sqrt(1 - (speed / (0.9 * 15.0)) ** 4)
+        assert gap == pytest.approx(wanted, rel=0.02)
+
+
+def test_drivers_act_on_what_they_wanted_a_reaction_time_ago():
+    network, _ = road(1000.0)
+    stop = Staging(overrides=(Override(0, 30, 100, -3.0),))
+    begins = []
+    for reaction in (0.0, 0.5):
+        table = drivers(2, 1, speed_factor=0.8, reaction_s=reaction, headway_s=1.5)
+        motion, calm = (
+            traffic_scenes.run(network, [(0,)] * 2, table, [130.0, 100.0], [11.0] * 2, 8.0, staging)
+            for staging in (stop, Staging())
+        )
+        gap = motion.distance_m[0] - motion.distance_m[1] - table.size_m[:, 0].mean()
+        assert gap.min() > 0.5
+        begins.append(int(np.flatnonzero(np.abs(motion.acceleration[1] - calm.acceleration[1]) > 1e-9)[0]))
+    # Without delay the follower sees the leader slow down one step later.
+    assert begins == [31, 36]
+
+
+def test_cyclists_are_followed_on_narrow_lanes_and_passed_on_wide_ones():
+    for width, passes in ((3.5, False), (7.0, True)):
+        network, _ = road(600.0, width_m=width)
+        table = drivers(2, speed_factor=0.8)
+        table.kind[1] = AgentKind.CYCLIST
+        table.size_m[1] = (1.8, 0.65, 1.75)
+        table.top_speed_mps[1] = 5.0
+        scene = cast(network, [(0,)] * 2, table, [60.0, 90.0], [10.0, 5.0])
+        scene.paths[1] = lane_path(network, (0,), Sway((0.55 - width / 2,), (0.0,), (math.pi / 2,)))
+        motion = Traffic(scene, np.arange(200) / 10).run()
+        assert (motion.xy[0, -1, 0] > motion.xy[1, -1, 0]) == passes
+        assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.CYCLIST]
+
+
+def test_a_planned_ego_is_where_its_plan_says_and_others_react():
+    network, _ = road(1000.0)
+    table = drivers(2, speed_factor=0.8)
+    first, steps = 20, 100
+    free = traffic_scenes.run(network, [(0,)] * 2, table, [100.0, 70.0], [11.0] * 2, steps / 10)
+    v = np.maximum(free.speed[0, first] - 3.0 * np.arange(steps - first) / 10, 0.0)
+    x = free.xy[0, first, 0] + np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) * 0.05)])
+    plan = EgoPlan(first, np.stack([x, np.full(len(x), 0.3)], axis=-1), np.full(len(x), 0.01), v)
+    motion = traffic_scenes.run(network, [(0,)] * 2, table, [100.0, 70.0], [11.0] * 2, steps / 10, ego=plan)
+    assert np.array_equal(motion.xy[:, :first], free.xy[:, :first])
+    assert np.array_equal(motion.xy[0, first:], plan.xy) and np.array_equal(
+        motion.heading[0, first:], plan.heading
+    )
+    assert np.array_equal(motion.speed[0, first:], v)
+    assert motion.distance_m[0, first:] == pytest.approx(x, abs=1e-6)
+    gap = motion.xy[0, :, 0] - motion.xy[1, :, 0] - table.size_m[:, 0].mean()
+    assert gap.min() > 0.5 and motion.speed[1, -1] < 0.5
+
+
+def test_a_told_vehicle_goes_over_to_another_path():
+    network, columns = road(600.0, lanes=2)
+    table = drivers(1, speed_factor=0.8)
+    other = lane_path(network, (columns[1][0],), Sway())
+    staging = Staging(reroutes=(Reroute(0, 10, other, 150.0),))
+    motion = traffic_scenes.run(network, [(columns[0][0],)], table, [50.0], [10.0], 3.0, staging)
+    assert motion.xy[0, 9, 1] == pytest.approx(0.0) and motion.xy[0, 10] == pytest.approx([150.0, -3.5])
+    assert motion.paths[0] is other
+
+
+def test_walkers_on_a_crossing_stop_the_cars():
+    network, _ = road(400.0)
+    axis = np.array([[200.0, -2.5], [200.0, 2.5]])
+    network = RoadNetwork("test", network.lanes, (), crossings=(Crossing(axis, 3.0, ((0, 200.0),)),))
+    way = straight(Pose(200.0, -8.0, math.pi / 2), 16.0)
+    people = (Walker(way, 0.0, 1.3, crossing=0, kerb_m=5.5, across_m=10.5),)
+    table = drivers(2, speed_factor=0.8)
+    motion = traffic_scenes.run(network, [(0,)] * 2, table, [115.0, 90.0], [11.0] * 2, 25.0, walkers=people)
+    assert motion.xy[2, -1, 1] > 2.0
+    crossing = np.abs(motion.xy[2, :, 1]) < 2.5
+    front = motion.xy[0, :, 0] + table.size_m[0, 0] / 2
+    # While somebody is on the lane, nobody is on the crosswalk, or has just passed it before.
+    rear = motion.xy[0, :, 0] - table.size_m[0, 0] / 2
+    assert np.all((front[crossing] < 198.5) | (rear[crossing] > 201.5))
+    assert motion.xy[0, -1, 0] > 230.0 and motion.acceleration.min() > -5.0
+
+
+def test_the_order_of_users_and_the_same_run_twice():
+    network, _ = road(400.0)
+    steps = 50
+    stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
+    comes = Scripted.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
+    people = (Walker(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
+    scene = cast(network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, walkers=people, parked=(stands,))
+    traffic = Traffic(scene, np.arange(steps) / 10)
+    staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(comes,))
+    first, calm, again = traffic.run(staging), traffic.run(), traffic.run(staging)
+    assert first.kind.tolist() == [1, 1, AgentKind.PEDESTRIAN, AgentKind.VEHICLE, AgentKind.CYCLIST]
+    assert first.vehicles == 2 and first.xy.shape == (5, steps, 2) and calm.xy.shape == (4, steps, 2)
+    for name in ("xy", "heading", "speed", "valid", "distance_m", "acceleration", "size_m"):
+        assert np.array_equal(getattr(first, name), getattr(again, name)), name
+    assert not np.array_equal(first.xy[0], calm.xy[0])
+    later = first.since(20)
+    assert np.array_equal(later.xy, first.xy[:, 20:]) and later.acceleration.shape == (2, steps - 20)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+@pytest.mark.parametrize("seed", range(2))
+def test_in_dense_traffic_nobody_touches_anybody(family, seed):
     rng = np.random.default_rng(seed)
-    network = CurvedRoad().build(rng)
-    where = placed(network, 0, 50.0, Density(spacing_m=(5.0, 10.0), vehicles=200), rng)
-    points = [(0, 50.0), *zip(where.lane, where.along_m, strict=True)]
-    assert len(points) > 20
-    for i, (lane, along) in enumerate(points):
-        assert 0 < along < network.lanes[lane].length_m
-        for other, there in points[i + 1 :]:
-            if other == lane:
-                assert abs(along - there) > 15.0
-            elif other in network.lanes[lane].successors:
-                assert network.lanes[lane].length_m - along + there > 15.0
-
-
-def test_tables_of_drivers_are_joined_in_order():
-    both = joined_drivers(drivers(2, 1), drivers(3, 2))
-    assert both.size_m.shape == (5, 3)
-    assert np.array_equal(both.headway_s[2:], drivers(3, 2).headway_s)
+    network = family.build(rng)
+    start = network.starts[int(rng.integers(len(network.starts)))]
+    along = float(rng.uniform(start.low_m, start.high_m))
+    where = placed(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
+    first = [start.lane, *where.lane]
+    table = drawn_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
+    paths = [
+        driven_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
+        for lane, cyclist in zip(first, table.cyclist, strict=True)
+    ]
+    at = np.array([along, *where.along_m])
+    speed = []
+    for i, path in enumerate(paths):
+        fastest = speed_profile(
+            path, table.speed_factor[i], table.lateral_mps2[i], table.slowing_mps2[i], table.top_speed_mps[i]
+        )
+        lines = [span.begin_m - at[i] - 8.0 for span in path.spans if network.lanes[span.lane].connector]
+        room = max(min((line for line in lines if line > -8.0), default=math.inf), 0.0)
+        speed.append(min(0.8 * fastest[int(at[i] / path.step_m)], math.sqrt(3.0 * room)))
+    traffic = Traffic(Cast(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
+    motion = traffic.run()
+    assert len(first) > 8
+    for t in range(0, 150, 3):
+        xy = np.where(motion.valid[:, t, None], motion.xy[:, t], np.nan)
+        near = np.hypot(*np.moveaxis(xy[:, None] - xy, -1, 0)) < 12.5
+        for a, b in np.argwhere(np.triu(near, 1)):
+            boxes = [box_corners(xy[k], motion.heading[k, t], *table.size_m[k, :2]) for k in (a, b)]
+            assert shared_area(*boxes) < 1e-6, (t, a, b)
+    # It flows, and everybody's speed is that of the places.
+    assert np.ptp(motion.distance_m, axis=1).mean() > 25.0
+    moved = np.hypot(*np.moveaxis(np.diff(motion.xy, axis=1), -1, 0))
+    there = motion.valid[:, 1:]
+    assert np.abs(moved - (motion.speed[:, 1:] + motion.speed[:, :-1]) * 0.05)[there].max() < 0.15

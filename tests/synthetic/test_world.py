@@ -12,7 +12,8 @@ import pytest
 from drivax.errors import UsageError
 from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, Flag, LightState
 from drivax.synthetic.events import EventKind
-from drivax.synthetic.world import WorldConfig, generate_one, generate_recording
+from drivax.synthetic.sensing import NoiseConfig
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one, generate_recording
 
 from .oracles import box_corners, shared_area, winding_number
 
@@ -20,8 +21,12 @@ COUNT = 20
 RED = (LightState.ARROW_STOP, LightState.STOP)
 
 
+#: The truth, without the errors of perception.
+EXACT = WorldConfig(noise=NoiseConfig(level=0.0))
+
+
 @cache
-def drawn(index, config=WorldConfig()):  # noqa: B008  (a frozen record)
+def drawn(index, config=EXACT):
     return generate_one(3, index, config)
 
 
@@ -36,9 +41,9 @@ def fields_of(recording):
 
 
 def test_a_seed_and_an_index_are_a_recording():
-    again = generate_recording(3, 1)
+    again = generate_recording(3, 1, EXACT)
     assert fields_of(again) == fields_of(drawn(1).recording)
-    assert fields_of(generate_recording(4, 1)) != fields_of(again)
+    assert fields_of(generate_recording(4, 1, EXACT)) != fields_of(again)
     assert fields_of(drawn(2).recording)[1] != fields_of(again)[1]
 
 
@@ -149,7 +154,8 @@ def test_recordings_are_complete():
         recording, tracks = one.recording, one.recording.tracks
         families.add(one.family)
         assert recording.dataset == "drivax" and recording.current_step == CURRENT_STEP
-        assert recording.scenario_id == recording.segment == f"w1-s3-{index:06d}-{one.family}"
+        assert recording.scenario_id == f"w{WORLD_VERSION}-grid-s3-{index:06d}-{one.family}"
+        assert recording.segment == f"w{WORLD_VERSION}-grid-s3-m{index // EXACT.scenarios_per_map:06d}"
         assert one.tags["family"] == one.family and one.tags["domain"] == "grid"
         assert np.allclose(np.diff(recording.timestamps_s), 0.1)
         assert tracks.xy.shape == (len(tracks.kind), STEPS, 2) and tracks.valid.any(axis=1).all()
@@ -169,7 +175,7 @@ def test_recordings_are_complete():
 
 
 def test_events_happen_as_labelled():
-    config = WorldConfig(event_rate=1.0)
+    config = dataclasses.replace(EXACT, rare_rate=1.0)
     labelled = 0
     for index in range(12):
         one = drawn(index, config)
@@ -182,7 +188,7 @@ def test_events_happen_as_labelled():
             assert CURRENT_STEP < event.start < event.end < STEPS
             assert np.diff(speed)[event.start : event.end].min() < -0.24 or speed[event.end] == 0.0
     assert labelled >= 3
-    assert not drawn(0, WorldConfig(event_rate=0.0)).recording.events
+    assert not drawn(0, WorldConfig(rare_rate=0.0)).recording.events
 
 
 def test_negative_seeds_are_refused():
@@ -197,3 +203,13 @@ def test_the_world_needs_no_jax():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
+
+
+def test_the_others_are_recorded_with_errors_and_ego_and_the_mask_are_exact():
+    """Noise moves nobody by more than decimetres and changes neither ego, nor who is there, nor what is seen."""
+    exact, noisy = drawn(1).recording, generate_recording(3, 1)
+    assert np.array_equal(exact.tracks.valid, noisy.tracks.valid) and np.array_equal(exact.seen, noisy.seen)
+    assert np.array_equal(exact.tracks.xy[0], noisy.tracks.xy[0])
+    apart = np.hypot(*np.moveaxis(exact.tracks.xy - noisy.tracks.xy, -1, 0))[1:][exact.tracks.valid[1:]]
+    assert 0.003 < apart.std() < 0.03 and apart.max() < 0.1
+    assert exact.seen is not None and exact.seen[0].all() and not exact.seen[~exact.tracks.valid].any()

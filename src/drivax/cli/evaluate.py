@@ -17,7 +17,8 @@ from drivax.scenario.store import ScenarioSet
 class Evaluate:
     """Drive a planner through every scenario of a set, to the end of each log, and measure it.
 
-    A planner is expert, expert_actions, constant_velocity, idm, or the run folder of `drivax train`.
+    A planner is expert, expert_actions, constant_velocity, random, idm, search, or the run folder of
+    `drivax train`.
 
     Writes episodes.csv, summary.json and trajectories.npz.
 

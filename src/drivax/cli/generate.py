@@ -1,72 +1,104 @@
-"""``drivax generate``: scenarios of the built-in world -> scenario set."""
+"""``drivax generate``: scenarios of the built-in world -> scenario set, or the fixed benchmark splits."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
+from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.scenario.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
-from drivax.synthetic.generate import GeneratedSet, Generation, generate
+from drivax.settings import load
+from drivax.synthetic.benchmark import BENCHMARK_VERSION, generate_benchmark
+from drivax.synthetic.generate import FamilyCount, GeneratedSet, Generation, generate
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 from drivax.tracking.progress import Progress
+
+_SCENARIOS = 256
 
 
 @dataclass(frozen=True)
 class Generate:
     """Generate scenarios of the built-in traffic world; no data set is needed.
 
-    Winding roads and junctions with lights, other vehicles that follow, yield and stop, and an expert log that
+    Roads of many kinds, other road users that follow, yield and stop, labelled rare events, and an expert log that
     neither collides nor leaves the road. The same seed gives the same set, byte for byte.
 
     Example: drivax generate sets/world --scenarios 256 --seed 0
     """
 
     out: tyro.conf.Positional[Path]
-    """Scenario set to write (a folder)."""
-    scenarios: int = 256
-    """How many scenarios."""
-    seed: int = 0
-    """Seed of the set; scenario i of a seed is the same whatever the number of scenarios."""
+    """Scenario set to write (a folder); with --benchmark the folder of the four sets."""
+    scenarios: int | None = None
+    """How many scenarios, 256 by default; with --benchmark those of train, the other splits in proportion."""
+    seed: int | None = None
+    """Seed of the set, 0 by default; scenario i of a seed is the same whatever the number of scenarios."""
+    domain: Literal["grid", "ring"] | None = None
+    """Statistics of roads and drivers: wide lanes, lights and higher speeds, or narrow, dense and roundabouts."""
+    rare_rate: float | None = None
+    """Share of scenarios with a labelled rare event."""
+    config: Path | None = None
+    """YAML file with the settings of the world; --domain and --rare-rate override it."""
+    benchmark: bool = False
+    """Write the fixed, versioned splits OUT/train, validation, test and test-rare."""
     workers: int | None = None
     """Processes; as many as there are CPU cores by default."""
     capacity: Literal["default", "large"] = "default"
     """Padded sizes; sets that are used together need the same."""
     split: str | None = None
-    """Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10."""
+    """Write lists for train/validation/test to OUT/splits, by map: percentages, as 80/10/10."""
     overwrite: bool = False
     """Replace OUT if it is a scenario set."""
 
 
 def run(args: Generate) -> int:
-    """Generate, then print the rate and what was rejected per family."""
+    """Generate, then print the rate, what was rejected per family, and how often which event came up."""
+    if args.benchmark and (args.seed is not None or args.split is not None):
+        raise UsageError("the benchmark has seeds and splits of its own", cure="leave out --seed and --split")
     shares = None if args.split is None else parse_shares(args.split)
     options = Generation(
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
         capacity=args.capacity,
         overwrite=args.overwrite,
+        world=world(args),
     )
+    scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
     with Progress("generating", "scenarios") as bar:
-        result = generate(
-            args.out,
-            args.scenarios,
-            args.seed,
-            options,
-            lambda done, total: bar.update(done, total=total),
-            audit,
-        )
+
+        def further(done: int, total: int) -> None:
+            bar.update(done, total=total)
+
+        if args.benchmark:
+            made = generate_benchmark(args.out, options, args.scenarios, further, audit)
+        else:
+            made = {"": generate(args.out, scenarios, args.seed or 0, options, further, audit)}
     if shares is not None:
         write_splits(args.out, ScenarioSet.open(args.out).entries, shares)
-    print(summary(result))
+    if args.benchmark:
+        print(f"benchmark {BENCHMARK_VERSION} of world {WORLD_VERSION}, domain {options.world.domain}")
+    print("\n".join(map(summary, made.values())))
     return 0
 
 
+def world(args: Generate) -> WorldConfig:
+    """The settings of the world that the flags and the file ask for."""
+    config = WorldConfig() if args.config is None else load(WorldConfig, args.config)
+    if args.domain is not None:
+        config = replace(config, domain=args.domain)
+    if args.rare_rate is not None:
+        config = replace(config, rare_rate=args.rare_rate)
+    return config
+
+
 def summary(result: GeneratedSet) -> str:
-    """One line about the set, and one per family of roads."""
+    """One line about the set, one per family of roads, and a table of families and events where there are any."""
     rate = result.scenarios / max(result.seconds, 1e-9)
     lines = [f"{result.path}: {result.scenarios:,} scenarios in {result.seconds:.1f} s ({rate:.1f}/s)"]
     width = max(map(len, result.families))
@@ -74,4 +106,21 @@ def summary(result: GeneratedSet) -> str:
         causes = ", ".join(f"{cause} {times}" for cause, times in sorted(count.rejected.items()))
         line = f"  {name:<{width}}  {count.kept:>6,} kept, {count.rejection_rate:6.2%} of draws rejected"
         lines.append(line + (f" ({causes})" if causes else ""))
-    return "\n".join(lines)
+    return "\n".join((*lines, *coverage(result.families)))
+
+
+def coverage(families: Mapping[str, FamilyCount]) -> list[str]:
+    """How often each event came up in each family: lines of a table, events as rows; empty without events."""
+    totals: Counter[str] = Counter()
+    for count in families.values():
+        totals.update(count.events)
+    if not totals:
+        return []
+    width = max(map(len, totals))
+    lines = [f"  {sum(totals.values()):,} scenarios with an event:"]
+    for event in sorted(totals):
+        where = ", ".join(
+            f"{name} {count.events[event]}" for name, count in families.items() if event in count.events
+        )
+        lines.append(f"    {event:<{width}}  {totals[event]:>6,} ({where})")
+    return lines

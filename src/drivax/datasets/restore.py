@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from drivax.scenario.agents import INTEREST_BIT, PREDICT_BIT
 from drivax.scenario.assemble import MEASURED
@@ -42,6 +42,7 @@ def restore(scenario: Scenario) -> Recording:
         ego=0,
         tracks=_tracks(scenario),
         features=features,
+        seen=_seen(scenario),
         lights=_lights(scenario, fresh),
         to_predict=tuple(np.flatnonzero(marks[_moving(scenario)] & PREDICT_BIT).tolist()),
         of_interest=tuple(np.flatnonzero(marks[_moving(scenario)] & INTEREST_BIT).tolist()),
@@ -99,6 +100,19 @@ def _tracks(scenario: Scenario) -> Tracks:
         kind=block(scenario.agent_kind, scenario.parked_kind).astype(np.int8),
         track_id=block(scenario.agent_id, scenario.parked_id).astype(np.int64),
     )
+
+
+def _seen(scenario: Scenario) -> Bool[_Array, "track time"] | None:
+    """What ego's sensors saw, in the order of :func:`_tracks`; None where that is everything."""
+    steps, moving = int(scenario.steps), _moving(scenario)
+    parked = np.flatnonzero(scenario.parked_valid.any(axis=0))
+
+    def both(name: str) -> Bool[_Array, "track time"]:
+        blocks = scenario.record["agent_" + name], scenario.record["parked_" + name]
+        return np.concatenate((blocks[0][:steps, moving], blocks[1][:steps, parked]), axis=1).T
+
+    seen = both("seen")
+    return None if np.array_equal(seen, both("valid")) else seen.copy()
 
 
 @dataclass(frozen=True)

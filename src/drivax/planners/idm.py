@@ -24,6 +24,8 @@ _FALLBACK_LIMIT_MPS = 13.4
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
 #: A yellow light is a red one for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
+#: Where to stand before a stop line, m.
+STOP_SHORT_M = 1.0
 
 
 @record
@@ -55,18 +57,13 @@ class IdmPlanner(Memoryless):
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
         gap, leader_speed = self._leader(bank, situation, path, there, offsets)
-        wanted = jnp.where(there[1], self._desired_speed(path, there, offsets), 0.0)
+        wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
         acceleration = idm_acceleration(speed, wanted, gap, leader_speed, self.parameters)
         ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
         left_m = bank.route_points[scene.index, 0] - 1 - scene.route_m
         ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
         target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, :2] - me[:2]
-        forward = target[0] * me[2] + target[1] * me[3]
-        left = target[1] * me[2] - target[0] * me[3]
-        curvature = jnp.where(
-            forward > 1.0, 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0), 0.0
-        )
-        return jnp.clip(self.actions.action(acceleration, curvature, me[4]), -1.0, 1.0), carry
+        return jnp.clip(self.actions.action(acceleration, pursuit(me, target), me[4]), -1.0, 1.0), carry
 
     def _leader(
         self, bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array
@@ -74,7 +71,7 @@ class IdmPlanner(Memoryless):
         """Gap to, and speed along the route of, the nearest thing in the corridor: an agent or a red light."""
         scene, frame = situation.scene, situation.surroundings.frame
         me = frame.box[scene.slot]
-        along, lateral, cos, sin = _project(path, there, offsets, frame.box[:, :2], frame.box[:, 2:4])
+        along, lateral, cos, sin = project(path, there, offsets, frame.box[:, :2], frame.box[:, 2:4])
         half_length = jnp.abs(cos) * frame.box[:, 4] / 2 + jnp.abs(sin) * frame.box[:, 5] / 2
         half_width = jnp.abs(sin) * frame.box[:, 4] / 2 + jnp.abs(cos) * frame.box[:, 5] / 2
         others = frame.valid & (jnp.arange(frame.valid.shape[0]) != scene.slot)
@@ -83,40 +80,53 @@ class IdmPlanner(Memoryless):
         gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
         speed = jnp.sqrt(jnp.sum(frame.velocity**2, axis=-1)) * cos
         nearest = jnp.argmin(gaps)
-        stop = self._stop_line(bank, situation, path, there, offsets)
+        stop = stop_line_m(bank, situation, path, there, offsets) + self.parameters.min_gap_m - STOP_SHORT_M
         gap = jnp.minimum(gaps[nearest], stop)
         gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
         return gap, jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
 
-    def _stop_line(
-        self, bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array
-    ) -> Float[Array, ""]:
-        """Distance from the front bumper to the nearest stop line of the route whose light asks to stop."""
-        scene = situation.scene
-        line = bank.light_line[scene.index]
-        state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
-        middle = (line[:, 0:2] + line[:, 2:4]) / 2
-        heading = jnp.stack([jnp.cos(line[:, 5]), jnp.sin(line[:, 5])], axis=-1)
-        along, lateral, _, _ = _project(path, there, offsets, middle, heading)
-        front = along - situation.surroundings.frame.box[scene.slot, 4] / 2
-        speed = scene.history[-1, 3]
-        can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
-        red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
-        yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
-        asks = (red | (yellow & can_stop)) & (line[:, 7] > 0) & (jnp.abs(lateral) < 2.5) & (front > 0.0)
-        return jnp.min(jnp.where(asks, front + self.parameters.min_gap_m - 1.0, jnp.inf))
 
-    def _desired_speed(self, path: Array, there: Array, offsets: Array) -> Float[Array, ""]:
-        """The limit here, and what the curves ahead allow with gentle braking."""
-        limit = jnp.where(path[0, 5] > 0, path[0, 5], _FALLBACK_LIMIT_MPS)
-        heading = jnp.arctan2(path[:, 4], path[:, 3])
-        curvature = jnp.abs(wrap(heading[1:] - heading[:-1])) / _STEP_M
-        curvature = jnp.where(there[1:], curvature, 0.0)
-        allowed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
-        return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))
+def stop_line_m(
+    bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array
+) -> Float[Array, ""]:
+    """Distance from the front bumper to the nearest stop line of the route whose light asks to stop."""
+    scene = situation.scene
+    line = bank.light_line[scene.index]
+    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
+    middle = (line[:, 0:2] + line[:, 2:4]) / 2
+    heading = jnp.stack([jnp.cos(line[:, 5]), jnp.sin(line[:, 5])], axis=-1)
+    along, lateral, _, _ = project(path, there, offsets, middle, heading)
+    front = along - situation.surroundings.frame.box[scene.slot, 4] / 2
+    speed = scene.history[-1, 3]
+    can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
+    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
+    yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
+    asks = (red | (yellow & can_stop)) & (line[:, 7] > 0) & (jnp.abs(lateral) < 2.5) & (front > 0.0)
+    return jnp.min(jnp.where(asks, front, jnp.inf))
 
 
-def _project(
+def desired_speed(path: Array, there: Array, offsets: Array) -> Float[Array, ""]:
+    """The limit here, and what the curves ahead allow with gentle braking."""
+    limit = jnp.where(path[0, 5] > 0, path[0, 5], _FALLBACK_LIMIT_MPS)
+    heading = jnp.arctan2(path[:, 4], path[:, 3])
+    curvature = jnp.abs(wrap(heading[1:] - heading[:-1])) / _STEP_M
+    curvature = jnp.where(there[1:], curvature, 0.0)
+    allowed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
+    return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))
+
+
+def pursuit(me: Float[Array, " 6"], target: Float[Array, " 2"]) -> Float[Array, ""]:
+    """Curvature of the arc from a box to a point that is given relative to its centre; 0 where that lies behind.
+
+    Pure pursuit (Coulter 1992): k = 2 y / L^2, with the point at (x, y) in the box's frame and L away.
+    """
+    forward = target[0] * me[2] + target[1] * me[3]
+    left = target[1] * me[2] - target[0] * me[3]
+    arc = 2.0 * left / jnp.maximum(forward * forward + left * left, 1.0)
+    return jnp.where(forward > 1.0, arc, 0.0)
+
+
+def project(
     path: Float[Array, "K 7"], there: Array, offsets: Float[Array, " K"], xy: Float[Array, "S 2"],
     heading: Float[Array, "S 2"],
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip

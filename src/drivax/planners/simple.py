@@ -1,9 +1,10 @@
-"""Planners that need no thought: the expert, replayed and driven, and constant velocity."""
+"""Planners that need no thought: the expert, replayed and driven, constant velocity, and random actions."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -78,3 +79,23 @@ class ConstantVelocity(Memoryless):
     ) -> tuple[Float[Array, "2"], Any]:
         """No acceleration, no curvature."""
         return jnp.zeros(2), carry
+
+
+@record
+class RandomActions(Memoryless):
+    """Draws every action anew, uniform over the action space: what no driver should be worse than."""
+
+    name: str = static(default="random")
+    replays: bool = static(default=False)
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, "2"], Any]:
+        """Two independent numbers in [-1, 1)."""
+        return jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0), carry

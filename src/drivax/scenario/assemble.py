@@ -140,6 +140,7 @@ def _window(recording: Recording, start: int) -> Recording:
         timestamps_s=recording.timestamps_s[part],
         current_step=CURRENT_STEP,
         tracks=replace(tracks, **{name: getattr(tracks, name)[:, part] for name in time_fields}),
+        seen=None if recording.seen is None else recording.seen[:, part],
         lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
         events=tuple(
             replace(e, start=max(e.start, 0), end=min(e.end, STEPS - 1))
@@ -150,7 +151,9 @@ def _window(recording: Recording, start: int) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """The same recording with another logged vehicle as the ego; the known route, if any, is not its own.
+    """The same recording with another logged vehicle as the ego.
+
+    What was known of the former ego's route, and of what its sensors saw, is dropped.
 
     Raises:
         UsageError: The row is no vehicle that is valid at the current step.
@@ -169,6 +172,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
         recording,
         scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
         ego=row,
+        seen=None,
         route_lanes=(),
         route_corridor=(),
     )

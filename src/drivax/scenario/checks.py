@@ -93,6 +93,11 @@ def _check_shapes(recording: Recording, capacity: Capacity) -> Finding:
         found = np.shape(getattr(tracks, name))
         if found != shape:
             return f"tracks.{name} has shape {found}, not {shape}", "give every track every step"
+    if recording.seen is not None and np.shape(recording.seen) != (count, steps):
+        return (
+            f"seen has shape {np.shape(recording.seen)}, not {(count, steps)}",
+            "give every track every step",
+        )
     rows = (recording.ego, *recording.to_predict, *recording.of_interest)
     if any(not 0 <= row < count for row in rows):
         return f"a track row out of {count} is named in {rows}", "name rows of the track table"

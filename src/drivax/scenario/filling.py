@@ -110,16 +110,19 @@ def _fill_head(record: Record, recording: Recording, origin: Float[Array, "3"], 
 def _fill_agents(record: Record, parts: Parts, recording: Recording) -> None:
     tracks, moving, parked = parts.tracks, parts.placement.moving, parts.placement.parked
     steps, count = tracks.valid.shape[1], len(moving)
+    seen = tracks.valid if recording.seen is None else tracks.valid & recording.seen
     timed = {
         "agent_xy": tracks.xyz[moving, :, :2],
         "agent_z": tracks.xyz[moving, :, 2],
         "agent_heading": tracks.heading[moving],
         "agent_velocity": tracks.velocity[moving],
         "agent_valid": tracks.valid[moving],
+        "agent_seen": seen[moving],
     }
     for name, value in timed.items():
         record[name][:steps, :count] = np.swapaxes(value, 0, 1)
     record["parked_valid"][:steps, : len(parked)] = tracks.valid[parked].T
+    record["parked_seen"][:steps, : len(parked)] = seen[parked].T
     flags = np.zeros(len(tracks.kind), dtype=np.uint8)
     flags[tracks.ego] |= EGO_BIT
     flags[list(recording.to_predict)] |= PREDICT_BIT

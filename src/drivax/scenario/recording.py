@@ -81,6 +81,8 @@ class Recording:
         route_lanes: Feature ids of the lanes of the intended route in order, where the source knows it.
         route_corridor: Feature ids of all lanes that the intended route may use, where the source knows only that
             (nuPlan's roadblocks).
+        seen: Which valid steps of which tracks ego's sensors would have seen, where the source holds the truth and
+            knows the difference; None: everything that was recorded was seen.
         tags: What the source says in words: ``place`` (city), ``source_format``, the world's ``family``, ...
         lost: What the reader left out, by name and number.
         flags: Facts that only the reader knows (defaulted sizes, truncated map, ...).
@@ -100,6 +102,7 @@ class Recording:
     of_interest: tuple[int, ...] = ()
     route_lanes: tuple[int, ...] = ()
     route_corridor: tuple[int, ...] = ()
+    seen: Bool[np.ndarray, "track time"] | None = None
     events: tuple[Event, ...] = ()
     tags: Mapping[str, str] = field(default_factory=dict)
     lost: Mapping[str, int] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 #: Steps of a full scenario: 10 past, the current one, 80 future (semantics, Time).
 STEPS = 91
@@ -160,6 +160,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "agent_heading": ("f4", (t, a)),
         "agent_velocity": ("f4", (t, a, 2)),
         "agent_valid": ("?", (t, a)),
+        "agent_seen": ("?", (t, a)),  # of the valid ones, those that ego's sensors would see
         "agent_size": ("f4", (a, 3)),
         "agent_kind": ("i1", (a,)),
         "agent_id": ("i4", (a,)),
@@ -173,6 +174,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
         "parked_kind": ("i1", (p,)),
         "parked_id": ("i4", (p,)),
         "parked_valid": ("?", (t, p)),
+        "parked_seen": ("?", (t, p)),
         # Lights and stop signs.
         "light_line": ("f4", (lt, 4)),  # stop line from left to right of the lane: x, y, x, y
         "light_z": ("f4", (lt,)),

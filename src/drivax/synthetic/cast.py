@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8
@@ -112,13 +112,23 @@ class Heedless:
 
 
 @dataclass(frozen=True)
+class Tailgate:
+    """A vehicle keeps only this time gap to whoever is ahead, all the time."""
+
+    vehicle: int
+    headway_s: float
+
+
+@dataclass(frozen=True)
 class Staging:
-    """What an event changes in how traffic goes."""
+    """What an event changes in how traffic goes; vehicles in the way of its making (``removed``) do not take part."""
 
     overrides: tuple[Override, ...] = ()
     reroutes: tuple[Reroute, ...] = ()
     heedless: tuple[Heedless, ...] = ()
     extras: tuple[Scripted, ...] = ()
+    tailgates: tuple[Tailgate, ...] = ()
+    removed: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -158,3 +168,8 @@ class Motion:
     def vehicles(self) -> int:
         """How many of the users are vehicles or cyclists on paths."""
         return len(self.distance_m)
+
+    def since(self, step: int) -> Motion:
+        """The same from a step on."""
+        timed = ("xy", "heading", "speed", "valid", "distance_m", "acceleration")
+        return replace(self, **{name: getattr(self, name)[:, step:] for name in timed})

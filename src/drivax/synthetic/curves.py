@@ -32,6 +32,16 @@ class Pose:
             self.x + metres * math.cos(self.heading), self.y + metres * math.sin(self.heading), self.heading
         )
 
+    def aside(self, left_m: float) -> Pose:
+        """The pose this far to the left (right where negative)."""
+        return Pose(
+            self.x - left_m * math.sin(self.heading), self.y + left_m * math.cos(self.heading), self.heading
+        )
+
+    def turned(self) -> Pose:
+        """The same place, looking back."""
+        return Pose(self.x, self.y, self.heading + math.pi)
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -49,17 +59,31 @@ class Curve:
     @property
     def start(self) -> Pose:
         """Where the curve begins."""
-        return Pose(float(self.xy[0, 0]), float(self.xy[0, 1]), float(self.heading[0]))
+        return self.pose(0)
 
     @property
     def end(self) -> Pose:
         """Where the curve ends."""
-        return Pose(float(self.xy[-1, 0]), float(self.xy[-1, 1]), float(self.heading[-1]))
+        return self.pose(-1)
+
+    def pose(self, sample: int) -> Pose:
+        """Place and direction at a sample."""
+        return Pose(float(self.xy[sample, 0]), float(self.xy[sample, 1]), float(self.heading[sample]))
 
     def shifted(self, left_m: float) -> Curve:
         """The parallel curve this far to the left (right where negative)."""
         normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=-1)
         return Curve(self.xy + left_m * normal, self.heading)
+
+    def displaced(self, left_m: Float64[np.ndarray, " point"]) -> Curve:
+        """The curve at a distance to the left that changes along the way; its heading is its own tangent.
+
+        With arc s, curvature k and displacement d the tangent turns by ``atan2(dd/ds, 1 - d k)``.
+        """
+        stretch = 1.0 - left_m * np.gradient(self.heading, self.arc_m)
+        slope = np.gradient(left_m, self.arc_m)
+        normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=-1)
+        return Curve(self.xy + left_m[:, None] * normal, self.heading + np.arctan2(slope, stretch))
 
     def reversed(self) -> Curve:
         """The same points in the other direction."""
@@ -68,6 +92,12 @@ class Curve:
     def piece(self, first: int, last: int) -> Curve:
         """The samples ``first`` to ``last``, both included."""
         return Curve(self.xy[first : last + 1], self.heading[first : last + 1])
+
+
+def smooth_step(share: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """From 0 to 1 with no slope and no bend at both ends: ``10 t^3 - 15 t^4 + 6 t^5`` of the clipped share."""
+    t = np.clip(share, 0.0, 1.0)
+    return t**3 * (10 - 15 * t + 6 * t**2)
 
 
 def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, start: Pose) -> Curve:
@@ -83,7 +113,9 @@ def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, star
 def straight(start: Pose, length_m: float) -> Curve:
     """A straight line."""
     count = max(2, math.ceil(length_m / STEP_M) + 1)
-    return from_curvature(np.zeros(count), length_m / (count - 1), start)
+    at = np.linspace(0.0, length_m, count)
+    xy = np.column_stack([start.x + at * math.cos(start.heading), start.y + at * math.sin(start.heading)])
+    return Curve(xy, np.full(count, start.heading))
 
 
 def joined(*curves: Curve) -> Curve:
@@ -141,7 +173,7 @@ def quintic(start: Pose, end: Pose) -> Curve:
     p0, p1 = np.array([start.x, start.y]), np.array([end.x, end.y])
     d0 = chord * np.array([math.cos(start.heading), math.sin(start.heading)])
     d1 = chord * np.array([math.cos(end.heading), math.sin(end.heading)])
-    step = 10 * t**3 - 15 * t**4 + 6 * t**5
+    step = smooth_step(t)
     step_rate = 30 * t**2 - 60 * t**3 + 30 * t**4
     first, first_rate = t - 6 * t**3 + 8 * t**4 - 3 * t**5, 1 - 18 * t**2 + 32 * t**3 - 15 * t**4
     last, last_rate = -4 * t**3 + 7 * t**4 - 3 * t**5, -12 * t**2 + 28 * t**3 - 15 * t**4

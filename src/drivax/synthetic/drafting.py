@@ -9,7 +9,8 @@ import numpy as np
 
 from drivax.scenario.schema import RoadKind
 from drivax.synthetic.curves import Curve
-from drivax.synthetic.roads import Lane, Line
+from drivax.synthetic.roads import Bay, Crossing, Lane, Line, RoadNetwork, Start
+from drivax.synthetic.signals import SignalPlan
 
 
 @dataclass
@@ -20,6 +21,9 @@ class Draft:
     edges: list[Line] = field(default_factory=list)
     markings: list[Line] = field(default_factory=list)
     crosswalks: list[Line] = field(default_factory=list)
+    crossings: list[Crossing] = field(default_factory=list)
+    walks: list[Curve] = field(default_factory=list)
+    bays: list[Bay] = field(default_factory=list)
 
     def lane(self, curve: Curve, width_m: float, limit_mps: float, **more: Any) -> int:
         """Adds a lane, with further attributes of :class:`~drivax.synthetic.roads.Lane`, and returns its index."""
@@ -44,6 +48,23 @@ class Draft:
     def mark(self, kind: RoadKind, curve: Curve) -> None:
         """Adds a marking of about 1 m sampling along a curve."""
         self.markings.append(Line(kind, curve.xy[::2]))
+
+    def network(
+        self, family: str, starts: tuple[Start, ...], signals: SignalPlan | None = None
+    ) -> RoadNetwork:
+        """The finished network."""
+        return RoadNetwork(
+            family=family,
+            lanes=tuple(self.lanes),
+            edges=tuple(self.edges),
+            markings=tuple(self.markings),
+            crosswalks=tuple(self.crosswalks),
+            signals=signals,
+            starts=starts,
+            crossings=tuple(self.crossings),
+            walks=tuple(self.walks),
+            bays=tuple(self.bays),
+        )
 
 
 def ring(*curves: Curve) -> np.ndarray:

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Float64
+from collections.abc import Callable
 
-from drivax.geometry.boxes import corners, overlap
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.scenario.schema import AgentKind
+from drivax.synthetic.cast import Cast, EgoPlan, Motion, Staging
+from drivax.synthetic.comfort import discomfort
 from drivax.synthetic.drivers import Drivers
+from drivax.synthetic.expert_plan import plan_ego
+from drivax.synthetic.faults import Fault, eventful, fault, last_stop
 from drivax.synthetic.paths import LaneChange, Path, Sway, lane_path, random_lanes
 from drivax.synthetic.roads import RoadNetwork
-from drivax.synthetic.signals import Colour
 
-#: Added to ego's length and width before overlap is tested, m: replay in float32 must not touch either.
-_SKIN_M = 0.2
 #: Experts that brake harder than this are not shown, m/s2: comfort (-4.05) in common driving, the end of the
 #: common law's range where an event leaves no choice.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
+#: What no plan for ego can mend.
+_HOPELESS = ("ego_leaves_map", "other_runs_red", "others_collide")
+
+#: Moves everyone: what is staged, and ego's plan.
+TrafficRun = Callable[[Staging, EgoPlan | None], Motion]
 
 
 def drawn_expert(rng: np.random.Generator) -> Drivers:
@@ -26,7 +34,9 @@ def drawn_expert(rng: np.random.Generator) -> Drivers:
 
     size = np.array([[rng.uniform(4.5, 5.0), rng.uniform(1.85, 2.05), rng.uniform(1.5, 1.8)]])
     return Drivers(
+        kind=np.full(1, AgentKind.VEHICLE, np.int8),
         size_m=size,
+        top_speed_mps=np.full(1, np.inf),
         speed_factor=one(0.85, 0.98),
         lateral_mps2=one(1.8, 2.4),
         slowing_mps2=one(1.1, 1.5),
@@ -35,6 +45,9 @@ def drawn_expert(rng: np.random.Generator) -> Drivers:
         headway_s=one(1.3, 1.8),
         acceleration_mps2=one(1.3, 1.8),
         braking_mps2=one(1.8, 2.2),
+        politeness=one(0.3, 0.5),
+        reaction_s=np.zeros(1),
+        critical_gap_s=one(4.5, 5.5),
     )
 
 
@@ -72,69 +85,66 @@ def expert_path(
     return lane_path(network, lanes, Sway.drawn(rng, 0.12), change)
 
 
-def boxes(
-    xy: Float64[np.ndarray, "*n 2"], heading: Float64[np.ndarray, "*n"], size: Float64[np.ndarray, "*n 3"]
-) -> Float64[np.ndarray, "*n 6"]:
-    """Boxes in the order of :mod:`drivax.geometry.boxes`."""
-    return np.concatenate(
-        [xy, np.cos(heading)[..., None], np.sin(heading)[..., None], size[..., :2]], axis=-1
-    )
-
-
-def touching(
-    box: Float64[np.ndarray, "vehicle time 6"], valid: Bool[np.ndarray, "vehicle time"]
-) -> Bool[np.ndarray, "vehicle vehicle"]:
-    """Which pairs of vehicles ever overlap; row 0 (ego) is tested with a skin of 10 cm around it."""
-    box = box.copy()
-    box[0, :, 4:] += _SKIN_M
-    one, other = np.triu_indices(len(box), 1)
-    reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
-    gap = np.hypot(*np.moveaxis(box[one, :, :2] - box[other, :, :2], -1, 0))
-    pair, time = np.nonzero((gap < (reach[one] + reach[other])[:, None]) & valid[one] & valid[other])
-    hit = overlap(box[one[pair], time], box[other[pair], time])
-    result = np.zeros((len(box), len(box)), bool)
-    result[one[pair[hit]], other[pair[hit]]] = True
-    return result | result.T
-
-
-def inside(
-    points: Float64[np.ndarray, "point 2"], rings: tuple[Float64[np.ndarray, "_ 2"], ...]
-) -> Bool[np.ndarray, " point"]:
-    """Whether points lie in the area that closed rings bound, islands left out (even-odd rule, exact)."""
-    crossings = np.zeros(len(points), int)
-    x, y = points[:, 0, None], points[:, 1, None]
-    for ring in rings:
-        a, b = ring, np.roll(ring, -1, axis=0)
-        near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
-        # A ray to the right meets only sides at the points' heights that do not end left of them all.
-        keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
-        (ax, ay), (bx, by) = a[keep].T, b[keep].T
-        across = (ay > y) != (by > y)
-        side = (bx - ax) * (y - ay) - (x - ax) * (by - ay)
-        crossings += np.sum(across & ((side > 0) == (by > ay)), axis=1)
-    return crossings % 2 == 1
-
-
-def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> bool:
-    """Whether a corner of the box is ever outside the edges."""
-    points = corners(box).reshape(-1, 2)
-    return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
-
-
-def runs_red(
-    network: RoadNetwork,
-    path: Path,
-    front_m: Float64[np.ndarray, " time"],
+def drive(
+    cast: Cast,
     times_s: Float64[np.ndarray, " time"],
-) -> bool:
-    """Whether the front bumper passes a stop line while its light is red before and after."""
-    if network.signals is None:
-        return False
-    colour, _ = network.signals.colours(times_s, len(network.lanes))
-    for span in path.spans:
-        if network.lanes[span.lane].connector:
-            red = colour[:, span.lane] == Colour.RED
-            passed = (front_m[:-1] <= span.begin_m) & (front_m[1:] > span.begin_m)
-            if bool(np.any(passed & red[:-1] & red[1:])):
-                return True
-    return False
+    staging: Staging,
+    first_step: int,
+    traffic_run: TrafficRun,
+    aware_step: int = 0,
+) -> tuple[Motion, str]:
+    """Lets ego drive well: as the common driver if that is good enough, else as planned with knowledge of the others.
+
+    Everybody reacts to a plan, so it is run, judged and made again where that spoils it.
+
+    Args:
+        cast: Everybody.
+        times_s: Times of all steps, on the clock of the lights.
+        staging: What is staged.
+        first_step: Where the recording begins; from here on ego may be planned.
+        traffic_run: Moves everyone: :meth:`drivax.synthetic.traffic.Traffic.run`.
+        aware_step: Ego does not act on what is staged before this step, if it can be mastered from then on.
+
+    Returns:
+        What everybody did, and why it must not be shown (empty: it is good).
+    """
+    hardest = HARDEST_IN_EVENT_MPS2 if eventful(staging) else HARDEST_MPS2
+
+    def judged(motion: Motion) -> Fault:
+        return fault(cast, motion, times_s, first_step, staging, hardest)
+
+    def pleasant(motion: Motion) -> bool:
+        return not discomfort(motion.heading[0, first_step:], motion.speed[0, first_step:])
+
+    motion = traffic_run(staging, None)
+    found = judged(motion)
+    if (not found.cause and pleasant(motion)) or found.cause in _HOPELESS:
+        return motion, found.cause
+    # What is safe but rough is kept, unless a plan does better.
+    rough = None if found.cause else motion
+    minded: frozenset[int] = frozenset()
+    for begin in _beginnings(cast, motion, found, first_step, aware_step):
+        plan = plan_ego(cast, motion, times_s, begin, minded)
+        motion = traffic_run(staging, plan)
+        found = judged(motion)
+        minded |= set(found.users)
+        if not found.cause and (rough is None or pleasant(motion)):
+            return motion, ""
+        if found.cause in ("", *_HOPELESS):
+            break
+    return (motion, found.cause) if rough is None else (rough, "")
+
+
+def _beginnings(
+    cast: Cast, motion: Motion, found: Fault, first_step: int, aware_step: int
+) -> tuple[int, int, int]:
+    """Where the first, second and last plan begin: each earlier than the one before.
+
+    Who stood at a stop sign before things go wrong has stood: only the last plan begins before that.
+    """
+    late = max(first_step, aware_step)
+    stood = last_stop(cast, motion, first_step)
+    if found.cause == "ego_collides":
+        late = late if late < found.step else first_step
+        stood = stood if stood < found.step else first_step
+    return max(late, stood), max((first_step + late) // 2, stood), first_step

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -26,6 +26,10 @@ from drivax.tracking.workers import worker_pool
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
+_EVENT = "event"
+
+#: Seeds from here on belong to the fixed splits of ``synthetic.benchmark``.
+RESERVED_SEED = 1_000_000_000
 
 #: Called with (scenarios done, scenarios).
 Progress = Callable[[int, int], None]
@@ -61,14 +65,25 @@ class Generation:
             raise UsageError(
                 f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
+        if not 0.0 <= self.world.rare_rate <= 1.0:
+            raise UsageError(f"rare_rate is {self.world.rare_rate}", cure="use a share from 0 to 1")
+        if self.world.scenarios_per_map < 1:
+            raise UsageError(f"scenarios_per_map is {self.world.scenarios_per_map}", cure="use 1 or more")
 
 
 @dataclass(frozen=True)
 class FamilyCount:
-    """How the draws of one family went: scenarios kept, and attempts thrown away by cause."""
+    """How the draws of one family went.
+
+    Attributes:
+        kept: Scenarios.
+        rejected: Attempts that were thrown away, by cause.
+        events: How many of the scenarios have which labelled event.
+    """
 
     kept: int
     rejected: dict[str, int]
+    events: dict[str, int] = field(default_factory=dict)
 
     @property
     def rejection_rate(self) -> float:
@@ -94,6 +109,28 @@ class _Drawn:
     rejected: dict[str, int]
 
 
+class _Counts:
+    """Counts draws by family."""
+
+    def __init__(self) -> None:
+        self._kept: Counter[str] = Counter()
+        self._rejected: dict[str, Counter[str]] = {}
+        self._events: dict[str, Counter[str]] = {}
+
+    def add(self, one: _Drawn) -> None:
+        self._kept[one.family] += 1
+        self._rejected.setdefault(one.family, Counter()).update(one.rejected)
+        events = self._events.setdefault(one.family, Counter())
+        events.update({one.scenario.tags[_EVENT]: 1} if _EVENT in one.scenario.tags else {})
+
+    def families(self) -> dict[str, FamilyCount]:
+        """Sorted by name."""
+        return {
+            name: FamilyCount(self._kept[name], dict(self._rejected[name]), dict(self._events[name]))
+            for name in sorted(self._kept)
+        }
+
+
 def generate(
     out: str | Path,
     scenarios: int,
@@ -107,7 +144,7 @@ def generate(
     Args:
         out: The scenario set to write; it appears when it is complete.
         scenarios: How many.
-        seed: Scenario ``i`` of a seed is the same in every set.
+        seed: Scenario ``i`` of a seed is the same in every set; sets of different seeds have no map in common.
         options: How.
         progress: Called after every scenario.
         audit: Called in this process with batches of scenarios; what it returns is stored with them.
@@ -119,29 +156,39 @@ def generate(
     options.check()
     if scenarios < 1:
         raise UsageError(f"scenarios is {scenarios}", cure="use 1 or more")
-    if seed < 0:
-        raise UsageError(f"seed is {seed}", cure="use 0 or more")
+    if not 0 <= seed < RESERVED_SEED:
+        raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1:,}".replace(",", ""))
+    return written(out, scenarios, seed, options, {}, progress, audit)
+
+
+def written(
+    out: str | Path,
+    scenarios: int,
+    seed: int,
+    options: Generation,
+    notes: Mapping[str, Any],
+    progress: Progress | None,
+    audit: Audit | None,
+) -> GeneratedSet:
+    """:func:`generate` without looking at the arguments; ``notes`` go into the manifest's source."""
     begin = time.monotonic()
-    source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios}
+    source = {"command": "generate", "world": WORLD_VERSION, "seed": seed, "scenarios": scenarios, **notes}
     source["config"] = dataclasses.asdict(options.world)
-    kept: Counter[str] = Counter()
-    rejected: dict[str, Counter[str]] = {}
+    counts = _Counts()
     batch: list[Scenario] = []
     with (
         ScenarioWriter(out, CAPACITIES[options.capacity], source, overwrite=options.overwrite) as writer,
         closing(_drawn(scenarios, seed, options)) as drawn,
     ):
         for done, one in enumerate(drawn, start=1):
-            kept[one.family] += 1
-            rejected.setdefault(one.family, Counter()).update(one.rejected)
+            counts.add(one)
             batch.append(one.scenario)
             if len(batch) == _BATCH or done == scenarios:
                 _write(writer, batch, audit)
                 batch = []
             if progress is not None:
                 progress(done, scenarios)
-    families = {name: FamilyCount(kept[name], dict(rejected[name])) for name in sorted(kept)}
-    return GeneratedSet(Path(out), scenarios, time.monotonic() - begin, families)
+    return GeneratedSet(Path(out), scenarios, time.monotonic() - begin, counts.families())
 
 
 def _write(writer: ScenarioWriter, batch: list[Scenario], audit: Audit | None) -> None:
@@ -156,7 +203,6 @@ def _draw(first: int, last: int, seed: int, options: Generation) -> list[_Drawn]
     for index in range(first, last):
         one = generate_one(seed, index, options.world)
         scenario = assemble(one.recording, capacity)
-        scenario = dataclasses.replace(scenario, tags={**scenario.tags, **one.tags})
         result.append(_Drawn(scenario, one.family, one.rejected))
     return result
 

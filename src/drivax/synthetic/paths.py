@@ -27,6 +27,7 @@ class LaneSpan:
         begin_m: Path position of the lane's start, m; below zero where the path begins inside the lane.
         scale: Path metres per lane metre.
         from_m, until_m: The range of path positions of the driver's centre in which others on this lane matter.
+        end_m: Path position of the lane's end, m.
     """
 
     lane: int
@@ -34,6 +35,7 @@ class LaneSpan:
     scale: float
     from_m: float = -math.inf
     until_m: float = math.inf
+    end_m: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -78,11 +80,21 @@ class LaneChange:
     length_m: float
 
 
+def onward(network: RoadNetwork, lanes: list[int]) -> list[int]:
+    """Where a way along lanes can go on: nobody goes round a roundabout twice, no lane comes twice on a path."""
+    seen = set(lanes)
+    return [
+        way
+        for way in network.lanes[lanes[-1]].successors
+        if way not in seen and not seen.issuperset(network.lanes[way].successors or (-1,))
+    ]
+
+
 def random_lanes(network: RoadNetwork, first: int, rng: np.random.Generator) -> tuple[int, ...]:
     """A random way from a lane to the end of the map; where lanes fork each way is as likely."""
     lanes = [first]
     while network.lanes[lanes[-1]].successors:
-        lanes.append(int(rng.choice(network.lanes[lanes[-1]].successors)))
+        lanes.append(int(rng.choice(onward(network, lanes))))
     return tuple(lanes)
 
 
@@ -111,7 +123,7 @@ def lane_path(
             ]
         else:
             length = network.lanes[lane].length_m
-            spans.append(LaneSpan(lane, at, 1.0))
+            spans.append(LaneSpan(lane, at, 1.0, end_m=at + length))
         pieces.append(curve)
         at += length
     middle = joined(*pieces) if len(pieces) > 1 else pieces[0]
@@ -119,7 +131,7 @@ def lane_path(
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
-    return LaneSpan(lane, at, length / network.lanes[lane].length_m, **when)
+    return LaneSpan(lane, at, length / network.lanes[lane].length_m, end_m=at + length, **when)
 
 
 def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
@@ -156,6 +168,7 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
             scale=span.scale * stretch,
             from_m=span.from_m * stretch,
             until_m=span.until_m * stretch,
+            end_m=span.end_m * stretch,
         )
         for span in spans
     ]
@@ -177,11 +190,15 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
             lane[chosen, used[chosen]] = name
             lane_m[chosen, used[chosen]] = along[chosen]
             used[chosen] += 1
-    window = max(1, round(_CURVATURE_WINDOW_M / step))
-    rate = np.gradient(curve.heading, step)
+    return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)
+
+
+def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " point"]:
+    """Curvature of an equally sampled curve, 1/m, averaged over 3 m."""
+    window = max(1, round(_CURVATURE_WINDOW_M / step_m))
+    rate = np.gradient(curve.heading, step_m)
     padded = np.pad(rate, (window // 2, window - 1 - window // 2), mode="edge")
-    curvature = np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
-    return Path(curve, step, curvature, limit, tuple(spans), lane, lane_m)
+    return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
 def _sharing(
@@ -189,10 +206,11 @@ def _sharing(
 ) -> list[tuple[int, np.ndarray]]:
     """The lanes that a vehicle on ``lane`` occupies too: those that leave the same lane, while still close."""
     result = [(lane, np.ones(len(along), bool))]
-    for (a, b), shared in network.shared_m.items():
-        if a == lane:
-            # Half a vehicle's length longer: its tail is in the way after its centre has left.
-            result.append((b, along < shared + 2.5))
+    for before in network.lanes[lane].predecessors:
+        for other in network.lanes[before].successors:
+            if other != lane:
+                # Half a vehicle's length longer: its tail is in the way after its centre has left.
+                result.append((other, along < network.shared_m[lane, other] + 2.5))
     return result
 
 
@@ -205,12 +223,16 @@ class Sway:
     phase: tuple[float, ...] = ()
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, largest_m: float) -> Sway:
-        """Two waves 60 to 160 m long whose amplitudes add up to at most ``largest_m``."""
+    def drawn(cls, rng: np.random.Generator, largest_m: float, aside_m: float = 0.0) -> Sway:
+        """Two waves 60 to 160 m long whose amplitudes add up to at most ``largest_m``, about a line aside."""
         share = rng.uniform(0.2, 0.5, size=2) * largest_m
         waves = 2 * math.pi / rng.uniform(60.0, 160.0, size=2)
         phases = rng.uniform(0.0, 2 * math.pi, size=2)
-        return cls(tuple(share.tolist()), tuple(waves.tolist()), tuple(phases.tolist()))
+        result = cls(tuple(share.tolist()), tuple(waves.tolist()), tuple(phases.tolist()))
+        if not aside_m:
+            return result
+        # A wave without end is a constant.
+        return cls((*result.amplitude_m, aside_m), (*result.wave_per_m, 0.0), (*result.phase, math.pi / 2))
 
     def applied(self, curve: Curve) -> Curve:
         """The curve that is really driven; its heading is its own tangent (to first order in the straying)."""

@@ -129,6 +129,7 @@ class RoadNetwork:
         crossings: Where people may cross.
         walks: Sidewalks, outside the edges; people walk along them in both directions.
         bays: Places where cars may be parked.
+        busy: Lanes on which traffic is denser than elsewhere.
     """
 
     family: str
@@ -141,6 +142,7 @@ class RoadNetwork:
     crossings: tuple[Crossing, ...] = ()
     walks: tuple[Curve, ...] = ()
     bays: tuple[Bay, ...] = ()
+    busy: tuple[int, ...] = ()
 
     @cached_property
     def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
@@ -163,9 +165,15 @@ def conflicting(lanes: tuple[Lane, ...]) -> Bool[np.ndarray, "lane lane"]:
     """See :attr:`RoadNetwork.conflicts`."""
     result = np.zeros((len(lanes), len(lanes)), bool)
     ways = [i for i, lane in enumerate(lanes) if lane.connector]
+    low = np.array([lanes[i].curve.xy.min(axis=0) for i in ways]).reshape(-1, 2)
+    high = np.array([lanes[i].curve.xy.max(axis=0) for i in ways]).reshape(-1, 2)
+    # Most pairs of a network with several junctions are far apart: their bounding boxes tell.
+    far = ((low[:, None] - high[None]).max(axis=-1) > CLEARANCE_M) | (
+        (low[None] - high[:, None]).max(axis=-1) > CLEARANCE_M
+    )
     for place, a in enumerate(ways):
-        for b in ways[place + 1 :]:
-            if set(lanes[a].predecessors) & set(lanes[b].predecessors):
+        for other, b in enumerate(ways[place + 1 :], place + 1):
+            if far[place, other] or set(lanes[a].predecessors) & set(lanes[b].predecessors):
                 continue
             near = _distance(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2]) < CLEARANCE_M
             result[a, b] = result[b, a] = near
@@ -173,7 +181,8 @@ def conflicting(lanes: tuple[Lane, ...]) -> Bool[np.ndarray, "lane lane"]:
 
 
 def _distance(a: Float64[np.ndarray, "a 2"], b: Float64[np.ndarray, "b 2"]) -> float:
-    return float(np.sqrt(np.min(np.sum((a[:, None] - b[None]) ** 2, axis=-1))))
+    dx, dy = (np.subtract.outer(a[:, k], b[:, k]) for k in (0, 1))
+    return float(np.sqrt((dx * dx + dy * dy).min()))
 
 
 def _shared_length(a: Curve, b: Curve) -> float:

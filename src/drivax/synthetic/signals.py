@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int8, Int64
@@ -30,15 +30,17 @@ class LightGroup:
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """A fixed-time plan: phases in turn, each green, then yellow, then red for everyone.
+    """Fixed-time plans of all junctions of a network: phases in turn, each green, then yellow, then red for everyone.
 
     Attributes:
         groups: The light groups.
         phases: Per phase the indices of the groups that are green.
         green_s: Duration of green of each phase, s.
         yellow_s: Yellow of every phase, s.
-        all_red_s: Red for everyone after every yellow, s.
+        all_red_s: Red for everyone at the junction after every yellow, s.
         offset_s: Time at which phase 0 turns green, s.
+        programs: Per junction its phases in turn, each program on its own cycle; empty: one junction with them all.
+        lags_s: Per program the time from ``offset_s`` until its first phase turns green, s; empty: no lags.
     """
 
     groups: tuple[LightGroup, ...]
@@ -47,17 +49,37 @@ class SignalPlan:
     yellow_s: float = 3.0
     all_red_s: float = 1.5
     offset_s: float = 0.0
+    programs: tuple[tuple[int, ...], ...] = ()
+    lags_s: tuple[float, ...] = ()
 
     @property
     def starts_s(self) -> tuple[float, ...]:
-        """When each phase turns green, s after phase 0 does."""
-        ends = np.cumsum([green + self.yellow_s + self.all_red_s for green in self.green_s])
-        return (0.0, *(float(end) for end in ends[:-1]))
+        """When each phase turns green, s after ``offset_s``."""
+        starts = [0.0] * len(self.phases)
+        programs = self._programs
+        for program, lag in zip(programs, self.lags_s or (0.0,) * len(programs), strict=True):
+            at = lag
+            for phase in program:
+                starts[phase] = at
+                at += self.green_s[phase] + self.yellow_s + self.all_red_s
+        return tuple(starts)
 
     @property
     def cycle_s(self) -> float:
-        """Duration of the whole cycle, s."""
-        return sum(self.green_s) + len(self.phases) * (self.yellow_s + self.all_red_s)
+        """Duration of the whole cycle, s; the longest one where junctions have their own."""
+        return max(map(self._duration_s, self._programs))
+
+    @property
+    def _programs(self) -> tuple[tuple[int, ...], ...]:
+        return self.programs or (tuple(range(len(self.phases))),)
+
+    def _duration_s(self, program: tuple[int, ...]) -> float:
+        return sum(self.green_s[phase] for phase in program) + len(program) * (self.yellow_s + self.all_red_s)
+
+    def stretched(self, cycle_s: float) -> SignalPlan:
+        """The plan with a longer green in its first phase, so that a cycle takes this long (one junction only)."""
+        extra = cycle_s - self.cycle_s
+        return replace(self, green_s=(self.green_s[0] + extra, *self.green_s[1:]))
 
     def phase_of(self, lane: int) -> int:
         """The phase that serves a connector lane.
@@ -87,17 +109,50 @@ class SignalPlan:
         left = np.zeros((len(times_s), lanes))
         for group in self.groups:
             colour[:, list(group.lanes)] = Colour.RED
-        for phase, begin in enumerate(self.starts_s):
-            # A hair later than the true time: a change that falls on a step shows at that step on every machine.
-            since = (times_s + 1e-6 - self.offset_s - begin) % self.cycle_s
-            green = since < self.green_s[phase]
-            to_red = self.green_s[phase] + self.yellow_s - since
-            yellow = ~green & (to_red > 0)
-            for lane in (lane for group in self.phases[phase] for lane in self.groups[group].lanes):
-                colour[green, lane] = Colour.GREEN
-                colour[yellow, lane] = Colour.YELLOW
-                left[yellow, lane] = to_red[yellow]
+        starts = self.starts_s
+        for program in self._programs:
+            cycle = self._duration_s(program)
+            for phase in program:
+                # A hair later than the true time: a change that falls on a step shows at that step on every machine.
+                since = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
+                green = since < self.green_s[phase]
+                to_red = self.green_s[phase] + self.yellow_s - since
+                yellow = ~green & (to_red > 0)
+                for lane in (lane for group in self.phases[phase] for lane in self.groups[group].lanes):
+                    colour[green, lane] = Colour.GREEN
+                    colour[yellow, lane] = Colour.YELLOW
+                    left[yellow, lane] = to_red[yellow]
         return colour, left
+
+
+def yellow_time_s(limit_mps: float) -> float:
+    """How long yellow lasts on an approach: a second to react, then a stop with 3.05 m/s2, at least 3 s.
+
+    The kinematic formula of the Institute of Transportation Engineers (Guidelines for Determining Traffic Signal
+    Change and Clearance Intervals, 2020) on level ground: ``t + v / (2 a)``.
+    """
+    return max(3.0, 1.0 + limit_mps / (2 * 3.05))
+
+
+def side_by_side(first: SignalPlan, second: SignalPlan, lag_s: float) -> SignalPlan:
+    """One plan of the lights of two junctions, each with its own cycle.
+
+    Args:
+        first: Plan of one junction, without programs; its yellow and all-red hold for both.
+        second: Plan of the other one.
+        lag_s: How long after phase 0 of ``first`` phase 0 of ``second`` turns green, s.
+    """
+    groups, phases = len(first.groups), len(first.phases)
+    return SignalPlan(
+        groups=first.groups + second.groups,
+        phases=first.phases + tuple(tuple(groups + g for g in phase) for phase in second.phases),
+        green_s=first.green_s + second.green_s,
+        yellow_s=first.yellow_s,
+        all_red_s=first.all_red_s,
+        offset_s=first.offset_s,
+        programs=(tuple(range(phases)), tuple(range(phases, phases + len(second.phases)))),
+        lags_s=(0.0, lag_s),
+    )
 
 
 _ROUND = {

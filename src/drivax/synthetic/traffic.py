@@ -1,239 +1,317 @@
-"""Traffic at 10 Hz: many vehicles on lane paths, each following its leader, the lights and the bends ahead.
+"""Traffic at 10 Hz: many vehicles on lane paths who follow, stop, give way, change lanes and go around things.
 
 The law of following is the simulator's own (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a
-few dozen array operations over vehicles, whatever their number.
+few dozen array operations over vehicles, whatever their number. Who may enter a junction is decided in
+:mod:`drivax.synthetic.right_of_way`, who changes lanes in :mod:`drivax.synthetic.lane_changes`, what is in the way in
+:mod:`drivax.synthetic.obstacles`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Bool, Float64, Int8, Int64
+from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.drivers import Drivers
-from drivax.synthetic.paths import Path
-from drivax.synthetic.roads import RoadNetwork
-from drivax.synthetic.signals import Colour
+from drivax.synthetic.cast import Cast, EgoPlan, Motion, Staging
+from drivax.synthetic.detours import Detours, swerver
+from drivax.synthetic.lane_changes import HELP_MPS2, Change, Helped, LaneChanges, Situation
+from drivax.synthetic.lateral import change_onto, followed
+from drivax.synthetic.obstacles import Boxes, Standing, in_the_way
+from drivax.synthetic.paths import Path, Sway, lane_path, onward
+from drivax.synthetic.right_of_way import Moment, RightOfWay
+from drivax.synthetic.scripted import boxes_at, everybody, standing_and_moving
+from drivax.synthetic.tables import PathTables
+from drivax.synthetic.walkers import Walkers
 
 #: Where drivers want to come to rest before a stop line, m from the front bumper.
 _STOP_SHORT_M = 1.0
+#: Before a thing that stands in the lane they keep room to pass it, m; before a lane's end, to change.
+_KEEP_M, _END_M = 5.0, 10.0
+#: What a cyclist at a lane's side needs of half its width: half a bicycle, its place, and 1.5 m to a car.
+_PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
 #: A driver follows the speed profile with this reaction, s.
 _SPEED_TIME_S = 0.6
 #: Jerk beyond a driver's own is used when braking harder than this, m/s2.
 _EMERGENCY_MPS2 = 3.6
 _EMERGENCY_JERK = 25.0
-
-
-@dataclass(frozen=True)
-class Override:
-    """A labelled event in the making: from one step to another a vehicle accelerates as told, or less."""
-
-    vehicle: int
-    first_step: int
-    last_step: int
-    acceleration_mps2: float
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What everyone did.
-
-    Attributes:
-        xy, heading, speed: Pose of the box centre and speed along the heading.
-        valid: False before a vehicle exists and after it has left the map.
-        distance_m: Position along each vehicle's path.
-        acceleration: Acceleration during the step that begins here.
-    """
-
-    xy: Float64[np.ndarray, "vehicle time 2"]
-    heading: Float64[np.ndarray, "vehicle time"]
-    speed: Float64[np.ndarray, "vehicle time"]
-    valid: Bool[np.ndarray, "vehicle time"]
-    distance_m: Float64[np.ndarray, "vehicle time"]
-    acceleration: Float64[np.ndarray, "vehicle time"]
-
-
-@dataclass(frozen=True)
-class _Plans:
-    """All paths padded to one shape, with the lookup tables of a step."""
-
-    table: Float64[np.ndarray, "vehicle point 4"]  # x, y, heading, speed profile
-    step_m: Float64[np.ndarray, " vehicle"]
-    last: Int64[np.ndarray, " vehicle"]
-    lane: Int64[np.ndarray, "vehicle point slot"]
-    lane_m: Float64[np.ndarray, "vehicle point slot"]
-    begin: Float64[np.ndarray, "vehicle lane"]  # path position where a lane begins; nan: not on the path
-    scale: Float64[np.ndarray, "vehicle lane"]
-    since: Float64[np.ndarray, "vehicle lane"]
-    until: Float64[np.ndarray, "vehicle lane"]
-    way: Int64[np.ndarray, "vehicle way"]  # connectors on the path, -1 none
-    way_begin: Float64[np.ndarray, "vehicle way"]
-    way_end: Float64[np.ndarray, "vehicle way"]
-
-
-def speed_profile(
-    path: Path, factor: float, lateral_mps2: float, slowing_mps2: float
-) -> Float64[np.ndarray, " p"]:
-    """The fastest speed at each sample that respects limits, bends and the braking towards them.
-
-    ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with ``vmax = min(factor x limit, sqrt(a_lat / |k|))``.
-    """
-    cap = np.minimum((factor * path.limit_mps) ** 2, lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-6))
-    ramp = 2 * slowing_mps2 * path.step_m * np.arange(len(cap))
-    return np.sqrt(np.minimum.accumulate((cap + ramp)[::-1])[::-1] - ramp)
-
-
-def _plans(network: RoadNetwork, paths: list[Path], drivers: Drivers) -> _Plans:
-    count, points = len(paths), max(len(path.curve.xy) for path in paths)
-    lanes, slots = len(network.lanes), paths[0].lane.shape[1]
-    ways = [[span for span in path.spans if network.lanes[span.lane].connector] for path in paths]
-    width = max(1, max(map(len, ways)))
-    table, lane = np.zeros((count, points, 4)), np.full((count, points, slots), -1)
-    lane_m = np.zeros((count, points, slots))
-    begin, scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
-    since, until = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
-    way = np.full((count, width), -1)
-    way_begin, way_end = np.full((count, width), np.inf), np.full((count, width), np.inf)
-    for i, path in enumerate(paths):
-        n = len(path.curve.xy)
-        fastest = speed_profile(
-            path, drivers.speed_factor[i], drivers.lateral_mps2[i], drivers.slowing_mps2[i]
-        )
-        table[i, :n] = np.column_stack([path.curve.xy, path.curve.heading, fastest])
-        table[i, n:] = table[i, n - 1]
-        lane[i, :n], lane_m[i, :n] = path.lane, path.lane_m
-        for span in path.spans:
-            begin[i, span.lane], scale[i, span.lane] = span.begin_m, span.scale
-            since[i, span.lane], until[i, span.lane] = span.from_m, span.until_m
-        for k, span in enumerate(ways[i]):
-            way[i, k], way_begin[i, k] = span.lane, span.begin_m
-            way_end[i, k] = span.begin_m + span.scale * network.lanes[span.lane].length_m
-    step = np.array([path.step_m for path in paths])
-    last = np.array([len(path.curve.xy) - 1 for path in paths])
-    return _Plans(table, step, last, lane, lane_m, begin, scale, since, until, way, way_begin, way_end)
+#: Lane changes and ways around things are considered every so many steps.
+_DECIDE_EVERY = 5
+#: A driver stays in its lane for this long after a change, s.
+_REST_S = 4.0
+#: Drivers stop for people where this is enough when they come, m/s2, and once they do brake up to this.
+_YIELD_MPS2, _HARDEST_MPS2 = 3.0, 8.0
+#: Braking for lines, as a multiple of what is needed.
+_FIRMLY = 1.3
+#: Longest reaction, steps.
+_SLOWEST = 6
+#: A planned ego is expected at stop lines this far ahead of time, steps.
+_FORESEEN = 25
 
 
 class Traffic:
-    """Vehicles on their paths, moved step by step.
+    """Everybody, moved step by step.
 
     Args:
-        network: The roads.
-        paths: One path per vehicle.
-        drivers: One driver per vehicle.
-        distance_m: Where on its path each vehicle's centre begins.
-        speed_mps: Speeds to begin with.
+        cast: Who there is.
         times_s: Times of all steps to come, on the clock of the signals.
     """
 
-    def __init__(
-        self,
-        network: RoadNetwork,
-        paths: list[Path],
-        drivers: Drivers,
-        distance_m: Float64[np.ndarray, " vehicle"],
-        speed_mps: Float64[np.ndarray, " vehicle"],
-        times_s: Float64[np.ndarray, " time"],
-    ) -> None:
-        self._network, self._drivers = network, drivers
-        self._plans = _plans(network, paths, drivers)
-        self._half_m = drivers.size_m[:, 0] / 2
-        self._rows = np.arange(len(paths))
-        self._colour: Int8[np.ndarray, "time lane"] = np.zeros((len(times_s), len(network.lanes)), np.int8)
-        self._to_red = np.zeros((len(times_s), len(network.lanes)))
-        if network.signals is not None:
-            self._colour, self._to_red = network.signals.colours(times_s, len(network.lanes))
-        self._steps = len(times_s)
-        self._at, self._speed = distance_m.copy(), speed_mps.copy()
-        self._last = np.zeros(len(paths))
+    def __init__(self, cast: Cast, times_s: Float64[np.ndarray, " time"]) -> None:
+        self.cast, self.times_s = cast, times_s
+        self.tables = PathTables(cast.network, cast.paths, cast.drivers)
+        self.parked = boxes_at(cast.parked, 0)
+        self.standing = Standing(self.parked, self.tables, cast.drivers.size_m[:, 1])
+        self.right_of_way = RightOfWay(cast.network, cast.drivers)
+        self.detours = Detours(cast.network)
+        shape = (len(times_s), len(cast.network.lanes))
+        self.colour, self.to_red = np.zeros(shape, np.int8), np.zeros(shape)
+        if cast.network.signals is not None:
+            self.colour, self.to_red = cast.network.signals.colours(times_s, shape[1])
 
-    def run(self, overrides: tuple[Override, ...] = ()) -> Motion:
-        """Moves everyone through all steps."""
-        shape = (len(self._rows), self._steps)
-        pose = np.zeros((*shape, 3))
-        speed, at, acceleration = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        valid = np.zeros(shape, bool)
-        for t in range(self._steps):
-            active = self._at + self._half_m < self._plans.last * self._plans.step_m
-            pose[:, t], fastest = self._look_up(self._at)
-            speed[:, t], at[:, t], valid[:, t] = self._speed, self._at, active
+    def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
+        """Moves everyone through all steps.
+
+        Args:
+            staging: What an event changes.
+            ego: How ego drives from a step on; None: like everybody.
+        """
+        return _Run(self, staging or Staging(), ego).finished()
+
+
+class _Run:
+    """One run of a traffic."""
+
+    def __init__(self, traffic: Traffic, staging: Staging, ego: EgoPlan | None) -> None:
+        self._fixed, self._staging, self._ego = traffic, staging, ego
+        cast = traffic.cast
+        self._network, self._drivers = cast.network, cast.drivers
+        for told in staging.tailgates:
+            self._drivers = self._drivers.with_headway(told.vehicle, told.headway_s)
+        self._half_m, self._width_m = cast.drivers.size_m[:, 0] / 2, cast.drivers.size_m[:, 1]
+        # Half the widest car that passes a cyclist at the side of a lane.
+        self._spare_m = np.array([lane.width_m for lane in self._network.lanes]) / 2 - _PASS_CYCLIST_M
+        count = len(cast.paths)
+        self._rows = np.arange(count)
+        self._tables = traffic.tables.copy()
+        self._fixtures, self._movers = standing_and_moving(staging.extras)
+        boxes = traffic.parked.joined(boxes_at(self._fixtures, 0))
+        self._standing = traffic.standing.copy()
+        if self._fixtures:
+            self._standing = Standing(boxes, self._tables, self._width_m)
+        self._right_of_way = traffic.right_of_way
+        self._right_of_way.reset()
+        self._changes = LaneChanges(self._network, cast.drivers, boxes)
+        self._walkers = Walkers(self._network, cast.walkers, traffic.times_s) if cast.walkers else None
+        self._claims = np.zeros(len(self._network.crossings), bool)
+        self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path: who stops for people
+        self._delay = np.rint(cast.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
+        self._at, self._speed = cast.distance_m.copy(), cast.speed_mps.copy()
+        for row in staging.removed:  # it has left before anything begins
+            self._at[row] = cast.paths[row].length_m
+        self._last = np.zeros(count)
+        self._memory = np.zeros((_SLOWEST + 1, count))
+        self._busy_m = np.full(count, -np.inf)  # until here on its path a vehicle is changing or passing
+        self._rest = np.zeros(count, int)  # from this step on it may change again
+        self._helped = Helped(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+        self._gap, self._leader = np.full(count, np.inf), np.zeros(count, int)
+        self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
+        self._pose = np.zeros((count, 3))
+        self._people = boxes_at((), 0)
+
+    def finished(self) -> Motion:
+        """Goes through all steps and collects what happened."""
+        count, steps = len(self._rows), len(self._fixed.times_s)
+        pose, walked = np.zeros((count, steps, 3)), np.zeros((len(self._fixed.cast.walkers), steps, 4))
+        speed, at, acceleration = (np.zeros((count, steps)) for _ in range(3))
+        valid = np.zeros((count, steps), bool)
+        for t in range(steps):
+            self._reroute(t)
+            planned = self._put_ego(t)
+            active = self._at + self._half_m < self._tables.last * self._tables.step_m
+            active[0] |= planned
+            row = self._tables.at(self._at, self._rows)
+            self._pose, fastest = row[:, :3], row[:, 3]
+            if planned and self._ego is not None:
+                k = t - self._ego.first_step
+                self._pose[0] = (*self._ego.xy[k], self._ego.heading[k])
+            self._walk(t, active, walked)
+            pose[:, t], speed[:, t], at[:, t], valid[:, t] = self._pose, self._speed, self._at, active
             wanted = self._wanted(t, fastest, active)
-            for override in overrides:
-                if override.first_step <= t <= override.last_step:
-                    who = override.vehicle
-                    wanted[who] = min(wanted[who], override.acceleration_mps2)
-            acceleration[:, t] = self._advance(wanted, active)
-        return Motion(pose[..., :2], pose[..., 2], speed, valid, at, acceleration)
+            if t % _DECIDE_EVERY == 0:
+                self._decide(t, wanted, fastest, active)
+            acceleration[:, t] = self._advance(self._acted(t, wanted), active)
+        if self._ego is not None:
+            k = slice(self._ego.first_step, steps - 1)
+            acceleration[0, k] = np.diff(speed[0, self._ego.first_step :]) / DT_S
+        vehicles = (pose, speed, valid, at, acceleration)
+        return everybody(self._fixed.cast, self._staging, vehicles, walked, self._tables.paths)
 
-    def _look_up(
-        self, at: Float64[np.ndarray, " v"]
-    ) -> tuple[Float64[np.ndarray, "v 3"], Float64[np.ndarray, " v"]]:
-        """Pose and fastest speed at positions on the own paths."""
-        place = at / self._plans.step_m
-        index = np.clip(place.astype(int), 0, self._plans.last - 1)
-        share = np.clip(place - index, 0.0, 1.0)[:, None]
-        low, high = self._plans.table[self._rows, index], self._plans.table[self._rows, index + 1]
-        row = low + share * (high - low)
-        return row[:, :3], row[:, 3]
+    def _reroute(self, t: int) -> None:
+        for reroute in self._staging.reroutes:
+            if reroute.step == t:
+                who = reroute.vehicle
+                self._swap(who, reroute.path, reroute.distance_m)
+                self._rest[who] = np.iinfo(int).max
+
+    def _swap(self, row: int, path: Path, at: float) -> None:
+        self._tables.replace(row, path)
+        self._standing.replace(row, path)
+        self._at[row] = at
+        self._halting[row : row + 1] = False
+        self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
+
+    def _put_ego(self, t: int) -> bool:
+        """Puts ego where its plan says; whether there is a plan for this step."""
+        if self._ego is None or t < self._ego.first_step:
+            return False
+        k = t - self._ego.first_step
+        self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
+        return True
+
+    def _walk(
+        self, t: int, active: Bool[np.ndarray, " v"], walked: Float64[np.ndarray, "walker time 4"]
+    ) -> None:
+        """Moves the walkers and gathers everybody who moves as told."""
+        boxes = []
+        if self._walkers is not None:
+            xy, heading, speed, self._claims = self._walkers.step(
+                t, self._pose[:, :2], self._pose[:, 2], self._speed, self._drivers.size_m, active, self._fixed.colour[t]
+            )  # fmt: skip
+            walked[:, t] = np.column_stack([xy, heading, speed])
+            size = np.array([walker.size_m[:2] for walker in self._fixed.cast.walkers])
+            boxes.append(Boxes(xy, heading, speed, size))
+        there = tuple(extra for extra in self._movers if extra.valid[t])
+        if there:
+            boxes.append(boxes_at(there, t))
+        self._people = boxes[0] if boxes else self._people.chosen(np.zeros(len(self._people), bool))
+        for more in boxes[1:]:
+            self._people = self._people.joined(more)
+
+    def _vehicles(self) -> Boxes:
+        return Boxes(self._pose[:, :2], self._pose[:, 2], self._speed, self._drivers.size_m[:, :2])
 
     def _wanted(
         self, t: int, fastest: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
     ) -> Float64[np.ndarray, " v"]:
-        """The acceleration that each driver would like: the least that leader, stop line and speed allow."""
+        """The acceleration that each driver would like: the least that leaders, lines, things and speed allow."""
         gap, leader_speed = self._leaders(active)
-        stop_gap = self._stop_lines(t, active)
-        # Drivers stop closer to a line than to a bumper.
-        stop_gap = stop_gap + 2.0 - _STOP_SHORT_M
-        speed = np.broadcast_to(self._speed, (2, len(self._speed)))
+        vehicles = self._vehicles()
+        other_gap, other_speed = in_the_way(self._tables, vehicles, self._at, active, self._people)
+        stop_gap = self._stops(t, active, leader_speed)
+        # Speeds below zero are those of a told ego that reverses: to the law it stands.
+        speed = np.maximum(np.broadcast_to(self._speed, (3, len(self._speed))), 0.0)
         following = idm_acceleration(
             speed,
             np.broadcast_to(fastest, speed.shape),
-            np.stack([gap, stop_gap]),
-            np.stack([leader_speed, np.zeros_like(gap)]),
+            np.stack([gap, stop_gap, other_gap]),
+            np.maximum(np.stack([leader_speed, np.zeros_like(gap), other_speed]), 0.0),
             self._drivers.idm,
-        ).min(axis=0)
-        ahead = self._look_up(self._at + self._speed * _SPEED_TIME_S)[1]
-        return np.minimum(following, (ahead - self._speed) / _SPEED_TIME_S)
+        )
+        # What stands still is not braked for harder than it takes to stop there, and a little more.
+        needed = speed[1] ** 2 / (2 * np.maximum(stop_gap - (2.0 - _STOP_SHORT_M), 0.1))
+        following[1] = np.maximum(following[1], -_FIRMLY * needed - 0.5)
+        following = following.min(axis=0)
+        ahead = self._tables.at(self._at + self._speed * _SPEED_TIME_S, self._rows)[:, 3]
+        wanted = np.minimum(following, (ahead - self._speed) / _SPEED_TIME_S)
+        return self._helping(wanted, fastest)
+
+    def _helping(
+        self, wanted: Float64[np.ndarray, " v"], fastest: Float64[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, " v"]:
+        """Makes room for those who must change lanes, and lets these fall in behind whom they will follow."""
+        h = self._helped
+        if len(h.behind):
+            gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
+            idm = self._drivers.chosen(h.behind).idm
+            speed = self._speed[h.behind]
+            helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
+            # Nobody who is past can be let in; nobody is helped by a standstill.
+            helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
+            np.minimum.at(wanted, h.behind, helpful)
+        return wanted
 
     def _leaders(
         self, active: Bool[np.ndarray, " v"]
     ) -> tuple[Float64[np.ndarray, " v"], Float64[np.ndarray, " v"]]:
-        """Gap to the nearest vehicle ahead on the own path (infinite: none) and that vehicle's speed."""
-        p = self._plans
-        index = np.clip(np.rint(self._at / p.step_m).astype(int), 0, p.last)
-        lane = p.lane[self._rows, index]
-        along = p.lane_m[self._rows, index] + (self._at - index * p.step_m)[:, None]
-        # position[i, j, slot]: where vehicle j is on the path of vehicle i.
-        position = p.begin[:, lane] + p.scale[:, lane] * along
-        own = self._at[:, None, None]
-        seen = (lane >= 0) & active[:, None] & (position > own)
-        seen &= (p.since[:, lane] <= own) & (own <= p.until[:, lane])
-        seen[self._rows, self._rows] = False
-        nearest = np.where(seen, position, np.inf).min(axis=2)
-        gap = nearest - self._at[:, None] - self._half_m[:, None] - self._half_m
-        leader = np.argmin(gap, axis=1)
-        return gap[self._rows, leader], self._speed[leader]
+        """Gap to the nearest vehicle ahead on the own lanes (infinite: none) and that vehicle's speed."""
+        p = self._tables
+        lane, along = p.on(self._at, self._rows)
+        lane = np.where(active[:, None], lane, -1)
+        # position[i, k]: where the k-th occupied (vehicle, lane) is on the path of vehicle i.
+        who, slot = np.nonzero(lane >= 0)
+        taken, along = lane[who, slot], along[who, slot]
+        position = p.begin[:, taken] + p.scale[:, taken] * along
+        own = self._at[:, None]
+        seen = (position > own) & (p.since[:, taken] <= own) & (own <= p.until[:, taken])
+        seen &= who != self._rows[:, None]
+        # Cyclists are overtaken within the lane where it is wide enough.
+        seen &= ~(self._drivers.cyclist[who] & (self._spare_m[taken] >= self._width_m[:, None] / 2))
+        gap = np.where(seen, position - self._half_m[who], np.inf) - own - self._half_m[:, None]
+        if not len(who):
+            return self._gap, np.zeros_like(self._gap)
+        nearest = np.argmin(gap, axis=1)
+        self._gap, self._leader = gap[self._rows, nearest], who[nearest]
+        return self._gap, self._speed[self._leader]
 
-    def _stop_lines(self, t: int, active: Bool[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """Distance from the front bumper to the next line at which to stop (infinite: none)."""
-        p, half = self._plans, self._half_m[:, None]
-        front, rear = self._at[:, None] + half, self._at[:, None] - half
-        inside = (front > p.way_begin) & (rear < p.way_end) & active[:, None]
-        taken = np.zeros(len(self._network.lanes), bool)
-        taken[p.way[inside]] = True
-        blocked = self._network.conflicts @ taken
-        distance = np.where((p.way >= 0) & (front <= p.way_begin), p.way_begin - front, np.inf)
-        speed = self._speed[:, None]
-        needed = speed**2 / (2 * np.maximum(distance, 0.05))
-        colour, to_red = self._colour[t, p.way], self._to_red[t, p.way]
-        late = distance > speed * to_red
-        yellow = (colour == Colour.YELLOW) & (
-            (needed <= self._drivers.yellow_mps2[:, None]) | (late & (needed <= 5.0))
+    def _stops(
+        self, t: int, active: Bool[np.ndarray, " v"], leader_speed: Float64[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, " v"]:
+        """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
+        p, front = self._tables, self._at + self._half_m
+        heedless = np.zeros(len(front), bool)
+        for told in self._staging.heedless:
+            heedless[told.vehicle] |= told.first_step <= t <= told.last_step
+        promised = np.full(len(front), -1)
+        if self._ego is not None and t >= self._ego.first_step:
+            then = min(t - self._ego.first_step + _FORESEEN, len(self._plan_at) - 1)
+            promised[0] = np.sum(p.way_begin[0] < self._plan_at[then] + self._half_m[0])
+        now = Moment(
+            step=t,
+            colour=self._fixed.colour[t],
+            to_red=self._fixed.to_red[t],
+            front_m=front,
+            rear_m=self._at - self._half_m,
+            speed=self._speed,
+            active=active,
+            room_m=self._gap,
+            leader=self._leader,
+            leader_speed=leader_speed,
+            heedless=heedless,
+            promised=promised,
         )
-        halt = yellow | (((colour == Colour.RED) | blocked[p.way]) & (needed <= 8.0))
-        return np.where(halt & np.isfinite(distance), distance, np.inf).min(axis=1)
+        # Drivers stop closer to a line than to a bumper.
+        room = self._right_of_way.lines(now, p) + 2.0 - _STOP_SHORT_M
+        if self._claims.any():
+            room = np.minimum(room, self._crossings(front, heedless) + 2.0 - _STOP_SHORT_M)
+        room = np.minimum(room, p.stop_m - front - _END_M)
+        return np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
+
+    def _crossings(
+        self, front: Float64[np.ndarray, " v"], heedless: Bool[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, " v"]:
+        """Distance to the next crossing that people claim; who cannot stop with ease when they come goes on."""
+        away = self._tables.crossing_m - front[:, None]
+        needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
+        halt = self._claims[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
+        halt &= ~heedless[:, None]
+        if self._halting.shape != halt.shape:
+            self._halting = np.zeros_like(halt)
+        self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
+        return np.where(self._halting, away, np.inf).min(axis=1)
+
+    def _acted(self, t: int, wanted: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
+        """What drivers do: what they wanted a reaction time ago, or what the event makes them do."""
+        depth = len(self._memory)
+        if t == 0:
+            self._memory[:] = wanted
+        self._memory[t % depth] = wanted
+        result = self._memory[(t - self._delay) % depth, self._rows]
+        for override in self._staging.overrides:
+            if override.first_step <= t <= override.last_step:
+                who = override.vehicle
+                result[who] = min(result[who], override.acceleration_mps2)
+        return result
 
     def _advance(
         self, wanted: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
@@ -251,3 +329,72 @@ class Traffic:
         self._last = np.where(halted, 0.0, a)
         self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
         return a
+
+    def _decide(
+        self,
+        t: int,
+        wanted: Float64[np.ndarray, " v"],
+        fastest: Float64[np.ndarray, " v"],
+        active: Bool[np.ndarray, " v"],
+    ) -> None:
+        """Lane changes and ways around things that begin now."""
+        calm = (self._at > self._busy_m) & (self._rest <= t) & active
+        calm &= ~self._staged(t)
+        free = calm.copy()
+        free[0] = False
+        now = Situation(self._at, self._speed, active, free, fastest, wanted)
+        changes, self._helped = self._changes.decide(now, self._tables)
+        for change in changes:
+            self._change(t, change)
+            calm[change.vehicle] = False
+        if self._ego is not None and t >= self._ego.first_step:
+            calm[0] = False
+        self._pass(t, calm)
+
+    def _staged(self, t: int) -> Bool[np.ndarray, " v"]:
+        """Who does not decide because an event has decided for it."""
+        result = np.zeros(len(self._rows), bool)
+        for told in (*self._staging.overrides, *self._staging.heedless):
+            result[told.vehicle] |= t >= told.first_step
+        return result
+
+    def _change(self, t: int, change: Change) -> None:
+        row, present = change.vehicle, self._tables.paths[change.vehicle]
+        lanes = [change.lane]
+        ahead = {span.lane for span in present.spans}
+        while self._network.lanes[lanes[-1]].successors:
+            after = onward(self._network, lanes)
+            beside = [k for k in after if k in ahead]
+            # The old way where it is open, else one of the ways by turns: no chance is needed here.
+            lanes.append(beside[0] if beside else after[(row + len(lanes)) % len(after)])
+        sway = Sway((0.08,), (0.07,), (float(row),))
+        path, at = change_onto(
+            lane_path(self._network, tuple(lanes), sway), present, self._at[row], change.length_m
+        )
+        self._swap(row, path, at)
+        self._busy_m[row], self._rest[row] = at + change.length_m, t + round(_REST_S / DT_S)
+
+    def _pass(self, t: int, calm: Bool[np.ndarray, " v"]) -> None:
+        """Ways around what stands in the lane, for those who are near it and cannot change lanes in time."""
+        halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
+        stuck = np.zeros(len(self._rows), bool)
+        for told in self._staging.overrides:
+            stuck[told.vehicle] |= told.first_step <= t <= told.last_step and self._speed[told.vehicle] < 0.05
+        vehicles = self._vehicles()
+        standing = self._standing.boxes.joined(vehicles.chosen(stuck))
+        gap = self._standing.gap(self._at + self._half_m)
+        if stuck.any() or len(halted):
+            near = calm & (self._speed < 3.0)
+            standing = standing.joined(halted.chosen(halted.size_m[:, 0] > 1.2))
+        else:
+            near = calm & (gap < 45.0)
+        for row in np.flatnonzero(near & (self._speed < 9.0)):
+            others = vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
+            moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
+            size = (float(2 * self._half_m[row]), float(self._width_m[row]))
+            who = swerver(self._network, self._tables, int(row), (self._at[row], self._speed[row]), size)
+            found = self._fixed.detours.find(who, standing, moving)
+            if found is not None:
+                path, end = found
+                self._swap(int(row), path, float(self._at[row]))
+                self._busy_m[row], self._rest[row] = end, t + round(_REST_S / DT_S)

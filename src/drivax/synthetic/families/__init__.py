@@ -1,4 +1,4 @@
-"""Families of roads: each is a frozen configuration with ``build(rng) -> RoadNetwork``."""
+"""Families of roads: each is a frozen configuration with ``build(rng, style) -> RoadNetwork``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,17 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.families.curved_road import CurvedRoad
+from drivax.synthetic.families.all_way_stop import AllWayStop
+from drivax.synthetic.families.corridor import Corridor
+from drivax.synthetic.families.curved_road import STRAIGHT_ROAD, CurvedRoad
+from drivax.synthetic.families.highway import Highway
+from drivax.synthetic.families.lane_drop import LaneDrop
+from drivax.synthetic.families.midblock_crosswalk import MidblockCrosswalk
+from drivax.synthetic.families.parked_street import ParkedStreet
+from drivax.synthetic.families.roundabout import Roundabout
 from drivax.synthetic.families.signalised_junction import SignalisedJunction
+from drivax.synthetic.families.t_junction import TJunction
+from drivax.synthetic.families.unprotected_left import UnprotectedLeft
 from drivax.synthetic.roads import RoadNetwork
 from drivax.synthetic.style import GRID, RoadStyle
 
@@ -27,6 +36,34 @@ class RoadFamily(Protocol):
 
 
 #: The families of the world; a new one is a file here and an entry in this tuple.
-FAMILIES: tuple[RoadFamily, ...] = (CurvedRoad(), SignalisedJunction())
+FAMILIES: tuple[RoadFamily, ...] = (
+    CurvedRoad(),
+    SignalisedJunction(),
+    TJunction(),
+    AllWayStop(),
+    UnprotectedLeft(),
+    Corridor(),
+    STRAIGHT_ROAD,
+    LaneDrop(),
+    Highway(),
+    Roundabout(),
+    MidblockCrosswalk(),
+    ParkedStreet(),
+)
 
-__all__ = ["FAMILIES", "CurvedRoad", "RoadFamily", "SignalisedJunction"]
+__all__ = [
+    "FAMILIES",
+    "STRAIGHT_ROAD",
+    "AllWayStop",
+    "Corridor",
+    "CurvedRoad",
+    "Highway",
+    "LaneDrop",
+    "MidblockCrosswalk",
+    "ParkedStreet",
+    "RoadFamily",
+    "Roundabout",
+    "SignalisedJunction",
+    "TJunction",
+    "UnprotectedLeft",
+]

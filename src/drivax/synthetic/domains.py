@@ -1,0 +1,91 @@
+"""Domains: worlds whose roads and drivers have other statistics, for studies of generalisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivax.synthetic.families import FAMILIES, RoadFamily
+from drivax.synthetic.population import Density
+from drivax.synthetic.style import GRID, RING, RoadStyle
+
+
+@dataclass(frozen=True)
+class Domain:
+    """What the roads of a part of the world are like, and who is on them.
+
+    Attributes:
+        name: A tag of every scenario.
+        style: Widths, limits and the like of its roads.
+        shares: How often each family of roads comes up, relative to the others; what is not named does not.
+        density: How full the roads are.
+        walkers: People per 100 m of sidewalk, low and high, drawn per scenario.
+        parked_share: Share of bays with a car in them, low and high, drawn per scenario.
+        double_share: Share of scenarios with bays in which somebody is double-parked.
+    """
+
+    name: str
+    style: RoadStyle
+    shares: tuple[tuple[str, float], ...]
+    density: Density = field(default_factory=Density)
+    walkers: tuple[float, float] = (0.3, 2.0)
+    parked_share: tuple[float, float] = (0.4, 0.9)
+    double_share: float = 0.1
+
+    @property
+    def families(self) -> tuple[tuple[RoadFamily, float], ...]:
+        """The families of this domain with their shares, which add up to 1."""
+        shares = dict(self.shares)
+        chosen = [(family, shares[family.name]) for family in FAMILIES if family.name in shares]
+        total = sum(share for _, share in chosen)
+        return tuple((family, share / total) for family, share in chosen)
+
+    def drawn_family(self, rng: np.random.Generator) -> RoadFamily:
+        """One family by chance."""
+        families = self.families
+        return families[rng.choice(len(families), p=[share for _, share in families])][0]
+
+
+#: Wide lanes, lights, higher speeds; roundabouts are rare.
+GRID_DOMAIN = Domain(
+    name="grid",
+    style=GRID,
+    shares=(
+        ("straight_road", 0.08),
+        ("curved_road", 0.12),
+        ("lane_drop", 0.08),
+        ("highway", 0.1),
+        ("signalised_junction", 0.16),
+        ("t_junction", 0.09),
+        ("all_way_stop", 0.07),
+        ("roundabout", 0.03),
+        ("unprotected_left", 0.09),
+        ("midblock_crosswalk", 0.06),
+        ("parked_street", 0.05),
+        ("corridor", 0.07),
+    ),
+)
+#: Narrow streets, roundabouts and signs in place of lights, dense traffic, cyclists, no highways.
+RING_DOMAIN = Domain(
+    name="ring",
+    style=RING,
+    shares=(
+        ("straight_road", 0.05),
+        ("curved_road", 0.1),
+        ("lane_drop", 0.04),
+        ("signalised_junction", 0.05),
+        ("t_junction", 0.13),
+        ("all_way_stop", 0.1),
+        ("roundabout", 0.2),
+        ("unprotected_left", 0.05),
+        ("midblock_crosswalk", 0.1),
+        ("parked_street", 0.13),
+        ("corridor", 0.05),
+    ),
+    density=Density(spacing_m=(14.0, 60.0), vehicles=40, cyclist_share=0.14),
+    walkers=(0.5, 3.0),
+    parked_share=(0.6, 1.0),
+    double_share=0.25,
+)
+DOMAINS: dict[str, Domain] = {domain.name: domain for domain in (GRID_DOMAIN, RING_DOMAIN)}

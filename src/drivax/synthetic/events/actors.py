@@ -1,0 +1,132 @@
+"""Actors that move as told: along ego's way or along lanes, and how fast."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.cast import Motion, Scripted
+from drivax.synthetic.curves import Curve
+from drivax.synthetic.events.scene import Track
+
+CAR_M = (4.6, 1.85, 1.55)
+
+
+def changed_speed(
+    first_mps: float, last_mps: float, rate_mps2: float, times_s: Float64[np.ndarray, " k"]
+) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+    """Distance and speed of somebody who goes from one speed to another from time 0 on, and keeps it.
+
+    Before time 0 the first speed holds, and distances are negative.
+    """
+    lasts = abs(last_mps - first_mps) / rate_mps2
+    rate = math.copysign(rate_mps2, last_mps - first_mps)
+    during = np.clip(times_s, 0.0, lasts)
+    distance = first_mps * np.minimum(times_s, 0.0) + first_mps * during + rate * during**2 / 2
+    distance = distance + last_mps * np.maximum(times_s - lasts, 0.0)
+    return distance, first_mps + rate * during
+
+
+def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
+    """Time for a distance from rest with this gain of speed up to a speed."""
+    ramp = speed_mps**2 / (2 * gain_mps2)
+    if distance_m <= ramp:
+        return math.sqrt(2 * max(distance_m, 0.0) / gain_mps2)
+    return speed_mps / gain_mps2 + (distance_m - ramp) / speed_mps
+
+
+def walked(
+    distance_m: float,
+    speed_mps: float,
+    rates_mps2: tuple[float, float],
+    times_s: Float64[np.ndarray, " k"],
+) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]] | None:
+    """Distance and speed of somebody who starts at time 0, goes a distance at a speed and stops; None: too short.
+
+    Args:
+        distance_m: How far it goes.
+        speed_mps: Its speed in between.
+        rates_mps2: How it gains and loses its speed.
+        times_s: Times.
+    """
+    gain, loss = rates_mps2
+    stopping = speed_mps**2 / (2 * loss)
+    if distance_m < stopping + speed_mps**2 / (2 * gain):
+        return None
+    slows = travel_s(distance_m - stopping, speed_mps, gain)
+    gone, up = changed_speed(0.0, speed_mps, gain, np.minimum(times_s, slows))
+    more, down = changed_speed(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
+    return gone + more, np.where(times_s < slows, up, down)
+
+
+def smooth_step(times_s: Float64[np.ndarray, " k"], lasts_s: float) -> Float64[np.ndarray, " k"]:
+    """From 0 to 1 within a time, by the quintic whose speed and acceleration vanish at both ends."""
+    t = np.clip(times_s / lasts_s, 0.0, 1.0)
+    return t**3 * (10 - 15 * t + 6 * t**2)
+
+
+def along_track(
+    track: Track,
+    station: Float64[np.ndarray, " time"],
+    left_m: Float64[np.ndarray, " time"],
+    kind: AgentKind,
+    size_m: tuple[float, float, float],
+    *,
+    valid: Bool[np.ndarray, " time"],
+) -> Scripted:
+    """Somebody who moves along ego's way at a distance beside it; the heading is that of the movement."""
+    valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
+    xy, heading = track.pose(station, left_m)
+    return moving(xy, heading, kind, size_m, valid)
+
+
+def moving(
+    xy: Float64[np.ndarray, "time 2"],
+    heading: Float64[np.ndarray, " time"],
+    kind: AgentKind,
+    size_m: tuple[float, float, float],
+    valid: Bool[np.ndarray, " time"],
+) -> Scripted:
+    """Somebody with these positions, headed where it goes; who stands keeps the last heading, or the given one."""
+    step = np.gradient(xy, DT_S, axis=0)
+    speed = np.hypot(step[:, 0], step[:, 1])
+    drives = speed > 0.3
+    if drives.any():
+        angle = np.arctan2(step[:, 1], step[:, 0])
+        index = np.maximum.accumulate(np.where(drives, np.arange(len(xy)), -1))
+        index = np.where(index < 0, int(np.argmax(drives)), index)
+        heading = angle[index]
+    return Scripted(kind, size_m, xy, heading, speed, valid)
+
+
+def along_curve(
+    curve: Curve,
+    distance_m: Float64[np.ndarray, " time"],
+    kind: AgentKind,
+    size_m: tuple[float, float, float],
+) -> Scripted:
+    """Somebody who drives along a curve; it exists while it is on it."""
+    arc = curve.arc_m
+    xy = np.stack([np.interp(distance_m, arc, curve.xy[:, k]) for k in (0, 1)], axis=-1)
+    speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
+    valid = (distance_m >= size_m[0] / 2) & (distance_m <= arc[-1] - size_m[0] / 2)
+    return Scripted(kind, size_m, xy, np.interp(distance_m, arc, curve.heading), speed, valid)
+
+
+def slowed(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
+    """A vehicle of the cast that brakes from a step on until it stands: it stays on the way it took."""
+    xy, heading = motion.xy[row], np.unwrap(motion.heading[row])
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    times = DT_S * (np.arange(len(xy)) - step)
+    speed = float(motion.speed[row, step])
+    gone, slower = changed_speed(speed, 0.0, braking_mps2, times)
+    at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
+    grows = np.concatenate([[True], np.diff(arc) > 1e-6])
+    moved = np.stack([np.interp(at, arc[grows], xy[grows, k]) for k in (0, 1)], axis=-1)
+    turned = np.interp(at, arc[grows], heading[grows])
+    speeds = np.where(times < 0, motion.speed[row], np.minimum(slower, motion.speed[row]))
+    size = (float(motion.size_m[row, 0]), float(motion.size_m[row, 1]), float(motion.size_m[row, 2]))
+    return Scripted(AgentKind(int(motion.kind[row])), size, moved, turned, speeds, motion.valid[row].copy())

@@ -1,0 +1,180 @@
+"""Events with somebody ahead of ego in its lane: a leader who brakes hard (tailgater or not) or breaks down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.cast import Override, Staging, Tailgate
+from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, slowed
+from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
+from drivax.synthetic.events.scene import Scene
+from drivax.synthetic.roads import RoadNetwork
+
+#: Hard braking, up to locked wheels, m/s2.
+_HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
+#: Who stopped for no reason stands so long, s, and at least until an ego that keeps its speed would be there.
+_HOLD_S = 1.5
+#: Who can be made to tailgate ego is at most this far behind it, m.
+_FOLLOWER_M = 60.0
+#: A leader who is put there appears so many steps before the recording: ego has had no time to fall far back.
+_BEFORE = 5
+
+
+def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
+    """The deceleration that a leader who brakes to a halt requires of ego from the same moment on.
+
+    Ego may roll ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). That is the whole condition where
+    ego comes to rest later than the leader, v / a >= v_l / b; else they are nearest while both move, and
+    a = b + (v - v_l)^2 / (2 g).
+    """
+    severity = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
+    if speed_mps / severity >= leader_mps / braking_mps2:
+        return severity
+    return braking_mps2 + max(speed_mps - leader_mps, 0.0) ** 2 / (2 * gap_m)
+
+
+def drawn_braking(
+    speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
+) -> tuple[float, float] | None:
+    """How hard the leader brakes and what that requires, which is uniform where hard braking can bring it about."""
+    low, high = (leader_requires(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
+    low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
+    if high <= low + 0.05:
+        return None
+    severity = float(rng.uniform(low, high))
+    room = speed_mps**2 / (2 * severity) - gap_m
+    return (leader_mps**2 / (2 * room), severity) if room > 0 else None
+
+
+@dataclass(frozen=True)
+class LeadBrakes:
+    """The vehicle ahead of ego brakes to a halt for no visible reason, and drives on after a moment.
+
+    Where nobody drives close ahead somebody is put there who does.
+
+    Attributes:
+        within_s: Who is ahead by at most this time gap is the one who brakes.
+        headway_s: Time gap of somebody who is put there, low and high.
+        tailgater: Whether somebody must be behind ego, who then follows it closely.
+        tailgating_s: The time gap that this one keeps, low and high.
+    """
+
+    within_s: float = 2.0
+    headway_s: tuple[float, float] = (0.9, 1.4)
+    tailgater: bool = False
+    tailgating_s: tuple[float, float] = (0.4, 0.7)
+
+    @property
+    def kind(self) -> EventKind:
+        """See :class:`EventScript`."""
+        return EventKind.TAILGATER if self.tailgater else EventKind.LEAD_BRAKES
+
+    def possible(self, network: RoadNetwork) -> bool:
+        """See :class:`EventScript`: anywhere."""
+        return bool(network.lanes)
+
+    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+        """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
+        step, headway = scene.drawn_step(rng), float(rng.uniform(*self.headway_s))
+        tailgating = float(rng.uniform(*self.tailgating_s))
+        if step is None:
+            return None
+        motion, own = scene.motion, float(scene.track.at[step])
+        station, on = scene.on_way(step)
+        speed = float(motion.speed[0, step])
+        followers: tuple[int, ...] = ()
+        tailgates: tuple[Tailgate, ...] = ()
+        if self.tailgater:
+            behind = np.where(on & (station < own), own - station, np.inf)
+            follower = int(np.argmin(behind))
+            if not behind[follower] < _FOLLOWER_M or motion.kind[follower] != AgentKind.VEHICLE:
+                return None
+            followers, tailgates = (follower,), (Tailgate(follower, tailgating),)
+        length = motion.size_m[: motion.vehicles, 0]
+        gap = np.where(on & (station > own), station - own - (length + length[0]) / 2, np.inf)
+        leader = int(np.argmin(gap))
+        if gap[leader] > self.within_s * speed:
+            return _put_ahead(scene, step, headway, rng, Staging(tailgates=tailgates), followers)
+        lead = float(motion.speed[leader, step])
+        drawn = drawn_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        last = scene.last_step if drawn is None else step + _stands_until(speed, drawn[1])
+        if drawn is None or last > scene.last_step:
+            return None
+        staging = Staging(overrides=(Override(leader, step, last, -drawn[0]),), tailgates=tailgates)
+        threat = slowed(motion, leader, step, drawn[0])
+        return Proposal(staging, drawn[1], threat, step, last, leader, followers)
+
+
+@dataclass(frozen=True)
+class StalledVehicle:
+    """A car that drives ahead of ego loses its power, comes to a halt and stays.
+
+    Attributes:
+        headway_s: How far it is ahead, low and high, as time.
+    """
+
+    headway_s: tuple[float, float] = (0.9, 1.4)
+    kind: EventKind = EventKind.STALLED_VEHICLE
+
+    def possible(self, network: RoadNetwork) -> bool:
+        """See :class:`EventScript`: anywhere."""
+        return bool(network.lanes)
+
+    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+        """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
+        step, headway = scene.drawn_step(rng), float(rng.uniform(*self.headway_s))
+        if step is None:
+            return None
+        return _put_ahead(scene, step, headway, rng, None, ())
+
+
+def _stands_until(speed_mps: float, severity_mps2: float) -> int:
+    """Steps until an ego that keeps its speed would be there, v / (2 a), and a moment more."""
+    return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
+
+
+def _put_ahead(
+    scene: Scene,
+    step: int,
+    headway_s: float,
+    rng: np.random.Generator,
+    drives_on: Staging | None,
+    others: tuple[int, ...],
+) -> Proposal | None:
+    """A car that drives as ego does but ahead of it, and brakes to a halt at a step; ego keeps its distance before.
+
+    None where the car would meet a junction, or cannot brake so that it requires enough of ego.
+
+    Args:
+        scene: The scene without it.
+        step: When it brakes.
+        headway_s: How far it is ahead where ego drives freely, as time.
+        rng: Source of chance.
+        drives_on: What else is staged with a car that drives on after a moment; None: it stays.
+        others: Further actors.
+    """
+    track, lead = scene.track, float(scene.motion.speed[0, step])
+    lengths = (float(scene.ego_size_m[0]) + CAR_M[0]) / 2
+    cruising = track.at + headway_s * lead + lengths
+    if scene.meets_junction(float(cruising[scene.first_step]), float(cruising[step])):
+        return None
+    appears = scene.first_step - _BEFORE
+    after = scene.behind(cruising - CAR_M[0] / 2, appears)
+    speed, gap = float(after.motion.speed[0, step]), float(cruising[step] - after.track.at[step]) - lengths
+    drawn = drawn_braking(speed, gap, lead, rng)
+    if drawn is None:
+        return None
+    times = DT_S * (np.arange(scene.steps) - step)
+    gone, _ = changed_speed(lead, 0.0, drawn[0], times)
+    last = scene.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
+    onward, _ = changed_speed(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    station = np.where(times < 0, cruising, cruising[step] + gone + onward)
+    if last > scene.last_step or scene.meets_junction(float(cruising[step]), float(station[scene.last_step])):
+        return None
+    valid, left = np.arange(scene.steps) >= appears, np.zeros(scene.steps)
+    threat = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+    staging = replace(drives_on or Staging(), extras=(threat,))
+    return Proposal(staging, drawn[1], threat, step, last, None, others, after)

@@ -1,0 +1,141 @@
+"""Events with somebody who comes into ego's lane from the lane beside it: a cut-in, and a merge at the last moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+
+from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.cast import Staging
+from drivax.synthetic.curves import STEP_M
+from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, smooth_step
+from drivax.synthetic.events.kinds import EventKind, Proposal
+from drivax.synthetic.events.scene import EARLIEST, LATEST, Scene
+from drivax.synthetic.roads import RoadNetwork
+
+#: The lane beside ego's is looked for at stations so far apart, m.
+_EVERY_M = 8.0
+
+
+def cut_in_gap(
+    ego_mps: float, actor_mps: float, last_mps: float, braking_mps2: float, severity_mps2: float
+) -> float | None:
+    """Bumper-to-bumper gap at which somebody who slows ahead requires this deceleration of ego.
+
+    In a frame that moves at the actor's last speed ego has to shed u = v - v_f within the gap and what the actor
+    still rolls: u^2 / (2 a) = g + w^2 / (2 b) with w = v_a - v_f; None where ego would be slow first.
+    """
+    u, w = ego_mps - last_mps, actor_mps - last_mps
+    if u / severity_mps2 < w / braking_mps2:
+        return None
+    return u**2 / (2 * severity_mps2) - w**2 / (2 * braking_mps2)
+
+
+@dataclass(frozen=True)
+class CutIn:
+    """Somebody in the next lane, a little slower than ego, pulls over right in front of it and brakes.
+
+    Attributes:
+        late_merge: Only where the actor's lane ends or leads off the road, and at the last moment.
+        speed_share: The actor's speed before as a share of ego's, low and high.
+        slower_share: Its speed afterwards as a share of ego's, low and high.
+        braking_mps2: How it slows, low and high.
+        lasts_s: Duration of the lane change, low and high.
+        before_end_m: A late merge ends at most this far before the lane does.
+    """
+
+    late_merge: bool = False
+    speed_share: tuple[float, float] = (0.8, 1.0)
+    slower_share: tuple[float, float] = (0.15, 0.65)
+    braking_mps2: tuple[float, float] = (2.5, 6.0)
+    lasts_s: tuple[float, float] = (2.0, 3.2)
+    before_end_m: float = 80.0
+
+    @property
+    def kind(self) -> EventKind:
+        """See :class:`EventScript`."""
+        return EventKind.LATE_MERGE if self.late_merge else EventKind.CUT_IN
+
+    def possible(self, network: RoadNetwork) -> bool:
+        """See :class:`EventScript`."""
+        if self.late_merge:
+            return any(lane.ends or lane.exit_only for lane in network.lanes)
+        return any(lane.left >= 0 for lane in network.lanes)
+
+    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+        """See :class:`EventScript`."""
+        step, side = scene.drawn_step(rng), int(rng.choice([-1, 1]))
+        if self.late_merge:
+            step, side = self._before_an_end(scene, rng)
+        shares = rng.uniform(*self.speed_share), rng.uniform(*self.slower_share)
+        braking, lasts = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
+        if step is None:
+            return None
+        speed = float(scene.motion.speed[0, step])
+        before, after = (float(share) * speed for share in shares)
+        after = min(after, before)
+        gap = cut_in_gap(speed, before, after, braking, severity_mps2)
+        if gap is None or not 0.5 <= gap <= 40.0:
+            return None
+        start = float(scene.track.at[step]) + gap + (scene.ego_size_m[0] + CAR_M[0]) / 2
+        times = DT_S * (np.arange(scene.steps) - step)
+        gone, _ = changed_speed(before, after, braking, times)
+        station = start + gone
+        finish = float(np.interp(lasts, times, station))
+        beside = self._beside(scene, station, start, finish, side)
+        if beside is None or scene.meets_junction(start, float(station[scene.last_step])):
+            return None
+        aside, valid = beside
+        left = side * aside * (1.0 - smooth_step(times, lasts))
+        threat = along_track(scene.track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+        if not threat.valid[scene.first_step : step + 1].all():
+            return None
+        # It is over when the actor has found its new speed in the new lane.
+        last = step + round(max(lasts, (before - after) / braking) / DT_S)
+        last = min(last, scene.last_step)
+        return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, max(last, step + 1))
+
+    def _before_an_end(self, scene: Scene, rng: np.random.Generator) -> tuple[int | None, int]:
+        """A step at which ego is shortly before the end of a lane beside its own, and on which side that lane is."""
+        ends = scene.lane_ends
+        if not ends:
+            return None, 1
+        station, side = ends[int(rng.integers(len(ends)))]
+        speed = scene.motion.speed[0]
+        steps = np.arange(scene.first_step + EARLIEST, scene.first_step + LATEST + 1)
+        # The merge takes some three seconds with its gap, and ends within the last metres of the lane.
+        left = station - scene.track.at[steps] - 3.0 * speed[steps]
+        fits = steps[(left > 0.0) & (left < self.before_end_m) & (speed[steps] > 4.0)]
+        return (int(rng.choice(fits)) if len(fits) else None), side
+
+    def _beside(
+        self, scene: Scene, station: np.ndarray, start: float, finish: float, side: int
+    ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
+        """How far aside the actor's lane is, and when the actor can exist: where there is that lane."""
+        low = max(0.0, float(station.min()))
+        places = np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0)
+        lane = -1
+        reach = finish
+        lanes = scene.cast.network.lanes
+        for place in places.tolist():
+            found = scene.neighbour(place, side)
+            if found < 0:
+                break
+            reach = place
+            lane = found if lane < 0 else lane
+        if lane < 0 or reach > start - _EVERY_M:
+            return None
+        if self.late_merge:
+            if not (lanes[lane].ends or lanes[lane].exit_only):
+                return None
+            end, _ = scene.track.projected(lanes[lane].curve.xy[-1:])
+            if not finish <= float(end[0]) <= finish + self.before_end_m:
+                return None
+        here = scene.track.place(start)[0]
+        apart = float(np.min(np.hypot(*(lanes[scene.neighbour(start, side)].curve.xy - here).T)))
+        aside = max(apart, STEP_M)
+        if not 2.3 < aside < 5.0:
+            return None
+        return aside, station >= reach

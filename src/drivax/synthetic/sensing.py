@@ -1,0 +1,222 @@
+"""What ego's sensors would see of the others, and how exactly: lines of sight, and the tremble of recorded tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.signal import lfilter
+
+from drivax.geometry.angles import wrap
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, corners
+from drivax.scenario.recording import Tracks
+from drivax.scenario.schema import AgentKind
+
+#: Users that move slower than this tremble less, m/s; those that stand by this share of the full noise.
+_FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
+#: No error is larger than this many standard deviations, so that nobody is pushed into somebody else.
+_MOST_SIGMA = 3.0
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """A sensor on the middle of ego's roof that looks in all directions.
+
+    Attributes:
+        range_m: How far it sees, to the centre of a box.
+        above_roof_m: How high over the roof it sits.
+    """
+
+    range_m: float = 80.0
+    above_roof_m: float = 0.2
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Errors of recorded poses and speeds of the others: standard deviations, and correlations over one step.
+
+    The defaults are the level of vehicle tracks in WOMD recordings, as ``benchmarks/perception_noise.py`` measures
+    it; Argoverse 2 is smoother. Speeds tremble more than positions, because trackers differentiate.
+
+    Attributes:
+        level: Factor on all standard deviations; 0 switches noise off.
+        along_m, across_m: Position along and across the heading.
+        heading_rad: Heading.
+        speed_mps: Speed along the heading.
+        position_correlation, heading_correlation, speed_correlation: Of an error with that 0.1 s earlier.
+    """
+
+    level: float = 1.0
+    along_m: float = 0.020
+    across_m: float = 0.007
+    heading_rad: float = 0.002
+    speed_mps: float = 0.2
+    position_correlation: float = 0.4
+    heading_correlation: float = 0.2
+    speed_correlation: float = 0.0
+
+
+def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:
+    """Which steps of which tracks ego's sensor sees (:func:`visible`); vehicles hide what is behind them.
+
+    Args:
+        tracks: The truth.
+        ego: Row of ego.
+        config: The sensor.
+    """
+    order = np.concatenate(([ego], np.delete(np.arange(len(tracks.kind)), ego)))
+    heading, size = tracks.heading[order], tracks.size[order]
+    box = np.concatenate(
+        [tracks.xy[order], np.cos(heading)[..., None], np.sin(heading)[..., None], size[..., :2]], axis=-1
+    )
+    blocks = tracks.kind[order] == AgentKind.VEHICLE
+    seen = np.empty(tracks.valid.shape, bool)
+    seen[order] = visible(box, size[..., 2].max(axis=1), tracks.valid[order], blocks, config)
+    return seen
+
+
+def visible(
+    box: Float64[np.ndarray, "user time 6"],
+    height_m: Float64[np.ndarray, " user"],
+    valid: Bool[np.ndarray, "user time"],
+    blocks: Bool[np.ndarray, " user"],
+    config: SensorConfig,
+) -> Bool[np.ndarray, "user time"]:
+    """Which users ego's sensor sees: those in range of whom a corner or the centre lies in free view.
+
+    Rays run in space, from the sensor to half the height of the other's box. Another user's box hides what is behind
+    it where the ray passes below its roof.
+
+    Args:
+        box: ``geometry.boxes`` of all users; row 0 is ego.
+        height_m: Of the boxes, all standing on level ground.
+        valid: Which users are there.
+        blocks: Users that can hide somebody: vehicles; people are too slim.
+        config: The sensor.
+
+    Returns:
+        False where not valid; ego sees itself.
+    """
+    offset = box[..., :2] - box[:1, :, :2]
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    near = valid & valid[:1] & (distance <= config.range_m)
+    near[0] = False
+    target, step = np.nonzero(near)
+    seen = np.zeros(valid.shape, bool)
+    seen[0] = valid[0]
+    if not len(target):
+        return seen
+    points = np.concatenate((corners(box[target, step]), box[target, step, None, :2]), axis=1)
+    hidden = np.zeros(points.shape[:2], bool)
+    row, other = _in_the_way(box, valid & blocks[:, None], target, step)
+    eye = height_m[0] + config.above_roof_m
+    cut = _cuts(
+        box[0, step[row], :2],
+        points[row],
+        (eye, height_m[target[row]] / 2),
+        box[other, step[row]],
+        height_m[other],
+    )
+    np.logical_or.at(hidden, row, cut)
+    seen[target, step] = ~hidden.all(axis=1)
+    return seen
+
+
+def _in_the_way(
+    box: Float64[np.ndarray, "user time 6"],
+    blocking: Bool[np.ndarray, "user time"],
+    target: Int64[np.ndarray, " look"],
+    step: Int64[np.ndarray, " look"],
+) -> tuple[Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]]:
+    """Pairs of a look at somebody and a user whose circumscribed circle meets the stripe between the two."""
+    eye = box[0, step, :2]
+    ray = box[target, step, :2] - eye
+    length = np.maximum(np.hypot(ray[:, 0], ray[:, 1]), 1e-9)
+    along = ray / length[:, None]
+    radius = np.hypot(box[..., LENGTH], box[..., WIDTH]).max(axis=1) / 2
+    to = box[:, step, :2] - eye
+    ahead = to[..., 0] * along[:, 0] + to[..., 1] * along[:, 1]
+    aside = np.abs(to[..., 1] * along[:, 0] - to[..., 0] * along[:, 1])
+    reach = radius[:, None] + radius[target]
+    meets = blocking[:, step] & (aside < reach) & (ahead > -radius[:, None]) & (ahead < length + reach)
+    meets[0] = False
+    meets[target, np.arange(len(target))] = False
+    other, row = np.nonzero(meets)
+    return row, other
+
+
+def _cuts(
+    eye: Float64[np.ndarray, "pair 2"],
+    points: Float64[np.ndarray, "pair point 2"],
+    heights_m: tuple[float, Float64[np.ndarray, " pair"]],
+    box: Float64[np.ndarray, "pair 6"],
+    top_m: Float64[np.ndarray, " pair"],
+) -> Bool[np.ndarray, "pair point"]:
+    """Whether rays from an eye to points, at two heights, pass through upright boxes (slab test)."""
+    cos, sin = box[:, COS], box[:, SIN]
+
+    def turned(xy: Float64[np.ndarray, "..."]) -> tuple[Float64[np.ndarray, "..."], ...]:
+        """In the frame of the box."""
+        x, y = xy[..., 0] - box[:, X, None], xy[..., 1] - box[:, Y, None]
+        return x * cos[:, None] + y * sin[:, None], y * cos[:, None] - x * sin[:, None]
+
+    enters, leaves = np.zeros(points.shape[:2]), np.ones(points.shape[:2])
+    for start, end, half in zip(
+        turned(eye[:, None]), turned(points), (box[:, LENGTH, None] / 2, box[:, WIDTH, None] / 2), strict=True
+    ):
+        way = end - start
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        first, second = (-half - start) / way, (half - start) / way
+        enters = np.maximum(enters, np.minimum(first, second))
+        leaves = np.minimum(leaves, np.maximum(first, second))
+    high, low = heights_m[0], heights_m[1][:, None]
+    lowest = np.minimum(high + (low - high) * enters, high + (low - high) * leaves)
+    return (enters < leaves) & (lowest < top_m[:, None])
+
+
+def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
+    """Tracks as a perception system would have recorded them; ego's own row is exact.
+
+    Errors are AR(1) processes of zero mean, at most three standard deviations large. Who stands keeps speed 0 and
+    trembles by a few millimetres. Sizes are left alone.
+
+    Args:
+        tracks: The truth.
+        ego: Row of ego.
+        rng: Source of all errors.
+        config: How large they are.
+    """
+    speed = tracks.velocity[..., 0] * np.cos(tracks.heading) + tracks.velocity[..., 1] * np.sin(
+        tracks.heading
+    )
+    share = np.clip(np.abs(speed) / _FULL_NOISE_MPS, 0.0, 1.0)
+    share = (_STANDING_SHARE + (1.0 - _STANDING_SHARE) * share) * tracks.valid
+    share[ego] = 0.0
+    deviations = (config.along_m, config.across_m, config.heading_rad, config.speed_mps)
+    correlations = (config.position_correlation,) * 2 + (config.heading_correlation, config.speed_correlation)
+    along, across, turn, faster = (
+        config.level * sigma * share * _tremble(tracks.valid.shape, correlation, rng)
+        for sigma, correlation in zip(deviations, correlations, strict=True)
+    )
+    cos, sin = np.cos(tracks.heading), np.sin(tracks.heading)
+    heading = np.where(tracks.valid, wrap(tracks.heading + turn), 0.0)
+    # A standing user is not seen to move, and nobody is seen to change direction.
+    speed = np.sign(speed) * np.maximum(np.abs(speed) + np.where(np.abs(speed) > 0.0, faster, 0.0), 0.0)
+    velocity = speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    heading[ego], velocity[ego] = tracks.heading[ego], tracks.velocity[ego]
+    return replace(
+        tracks,
+        xy=tracks.xy + np.stack([along * cos - across * sin, along * sin + across * cos], axis=-1),
+        heading=heading,
+        velocity=velocity,
+    )
+
+
+def _tremble(
+    shape: tuple[int, ...], correlation: float, rng: np.random.Generator
+) -> Float64[np.ndarray, "track time"]:
+    """Unit-variance AR(1) noise x(t+1) = c x(t) + sqrt(1 - c^2) e(t), stationary from the first step on."""
+    pushes = rng.normal(size=shape)
+    pushes[:, 1:] *= np.sqrt(1.0 - correlation**2)
+    return np.clip(lfilter([1.0], [1.0, -correlation], pushes, axis=1), -_MOST_SIGMA, _MOST_SIGMA)

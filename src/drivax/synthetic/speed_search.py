@@ -1,0 +1,191 @@
+"""The best speeds along a way by dynamic programming over place, speed and time.
+
+Steps of 0.5 s, speeds on a grid that holds the present speed, and a grid of places on which every step ends exactly:
+with speeds ``i dv`` a step covers ``(i + j) dv dt / 2``. One step is one gather over (acceleration, speed, place).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from drivax.scenario.schema import DT_S
+
+#: Steps of the recording in one step of the search.
+COARSE = 5
+_STEP_S = COARSE * DT_S
+#: Speeds are at most this far apart, m/s: accelerations are then at most 1.5 m/s2 apart.
+_SPEED_STEP_MPS = 0.75
+#: Bounds of acceleration, m/s2; comfort ends where accelerations begin to cost more.
+_HARDEST_MPS2, _FASTEST_MPS2, _COMFORT_MPS2 = -6.05, 2.3, -3.0
+#: Costs per second: of (m/s2)^2, of (m/s)^2 below and above the liked speed, and of speed beyond what bends allow.
+_ACCELERATION, _SLOW, _FAST, _BEND = 1.0, 0.1, 0.6, 50.0
+#: Cost of acceleration beyond comfort, of driving close behind, of being close at 5 m/s.
+_HARD_BRAKING, _CLOSE_BEHIND, _CLOSE = 3.0, 6.0, 8.0
+#: Liked distance to what is ahead: 1 m and this many seconds.
+_HEADWAY_S = 1.1
+#: Cost of touching, times at least 0.02: larger than any other sum.
+TOUCH = 1e5
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What is taken on a way: at a step (axis 0) and at a distance from ego (axis 1, even spacing).
+
+    Attributes:
+        spacing_m: Distance between places.
+        hard: True where ego's centre must not be.
+        near: How much it should not be there: 0 to 1 or more.
+    """
+
+    spacing_m: float
+    hard: np.ndarray
+    near: np.ndarray
+
+
+@dataclass(frozen=True)
+class SpeedPlan:
+    """Speeds at the coarse steps, and what they cost (``TOUCH`` or more: something is touched)."""
+
+    speed: Float64[np.ndarray, " coarse"]
+    cost: float
+    touches: bool
+
+    def fine(self, steps: int) -> tuple[Float64[np.ndarray, " time"], Float64[np.ndarray, " time"]]:
+        """Distance and speed at every step of the recording."""
+        at = np.arange(steps) / COARSE
+        speed = np.interp(at, np.arange(len(self.speed)), self.speed)
+        travelled = np.cumsum((speed[1:] + speed[:-1]) * DT_S / 2)
+        return np.concatenate([[0.0], travelled]), speed
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Speeds, places, accelerations, and from where each (acceleration, speed, place) is reached."""
+
+    speed: Float32[np.ndarray, " speed"]
+    place: Float64[np.ndarray, " place"]
+    change: Int64[np.ndarray, " change"]
+    source: Int64[np.ndarray, "change speed place"]
+    effort: Float32[np.ndarray, " change"]
+
+
+def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]:
+    """The grid and the index of the present speed on it."""
+    index = int(np.ceil(speed_mps / _SPEED_STEP_MPS - 0.3)) if speed_mps > 0.2 else 0
+    step = speed_mps / index if index else _SPEED_STEP_MPS
+    speeds = max(index, int(np.ceil(top_mps / step))) + 1
+    spacing = step * _STEP_S / 2
+    places = max(2, min(int(reach_m / spacing), 2 * speeds * 40))
+    unit = step / _STEP_S
+    change = np.arange(int(np.ceil(_HARDEST_MPS2 / unit)), int(_FASTEST_MPS2 / unit) + 1)
+    v, s = np.arange(speeds), np.arange(places)
+    before = v - change[:, None]
+    source = s - (before + v)[..., None]
+    possible = (before >= 0)[..., None] & (before < speeds)[..., None] & (source >= 0)
+    # Impossible ones lead to one more entry at the end, which is infinite.
+    source = np.where(possible, before[..., None] * places + source, speeds * places)
+    a = change * unit
+    effort = _ACCELERATION * a**2 + _HARD_BRAKING * np.maximum(_COMFORT_MPS2 - a, 0.0) ** 2
+    grid = _Grid(
+        (v * step).astype(np.float32), s * spacing, change, source, (effort * _STEP_S).astype(np.float32)
+    )
+    return grid, index
+
+
+def search(
+    claims: Claims,
+    fastest_mps: Float64[np.ndarray, " place"],
+    bound_mps: Float64[np.ndarray, " place"],
+    speed_mps: float,
+) -> SpeedPlan:
+    """The cheapest speeds.
+
+    Args:
+        claims: What is taken, from the present step on.
+        fastest_mps: Liked speed at the places of ``claims``.
+        bound_mps: Speed that bends allow there.
+        speed_mps: Speed now.
+    """
+    steps = -(-(len(claims.hard) - 1) // COARSE)
+    reach = claims.spacing_m * (claims.hard.shape[1] - 1)
+    top = max(float(fastest_mps.max()), speed_mps)
+    reach = min(reach, (top + 1.0) * (steps + 1) * _STEP_S)
+    grid, start = _grid(speed_mps, top, reach)
+    speeds, places = len(grid.speed), len(grid.place)
+    liked = np.interp(grid.place, claims.spacing_m * np.arange(len(fastest_mps)), fastest_mps)
+    bound = np.interp(grid.place, claims.spacing_m * np.arange(len(bound_mps)), bound_mps)
+    difference = grid.speed[:, None] - liked
+    over = np.maximum(grid.speed[:, None] - bound, 0.0)
+    always = np.where(difference > 0, _FAST, _SLOW) * difference**2 + _BEND * over**2
+    always = (always * _STEP_S).astype(np.float32)
+    taken = _Taken(claims, grid)
+    layers = np.full((steps + 1, speeds * places + 1), np.inf, np.float32)
+    layers[0, start * places] = 0.0
+    for k in range(1, steps + 1):
+        reached = layers[k - 1].take(grid.source)
+        reached += grid.effort[:, None, None]
+        layers[k, :-1] = (reached.min(axis=0) + always + taken.cost(k * COARSE)).ravel()
+    return _traced(grid, layers, taken)
+
+
+def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Taken) -> SpeedPlan:
+    """Goes back from the cheapest end."""
+    places = len(grid.place)
+    state = int(np.argmin(layers[-1]))
+    cost = float(layers[-1, state])
+    speed, touches = [], False
+    for k in range(len(layers) - 1, 0, -1):
+        v, s = divmod(state, places)
+        speed.append(float(grid.speed[v]))
+        touches |= taken.touched(k * COARSE, v, s)
+        source = grid.source[:, v, s]
+        state = int(source[np.argmin(layers[k - 1][source] + grid.effort)])
+    speed.append(float(grid.speed[state // places]))
+    return SpeedPlan(np.array(speed[::-1]), cost, touches)
+
+
+class _Taken:
+    """Costs of claims at (speed, place); within half a coarse step a state is taken to keep its speed."""
+
+    def __init__(self, claims: Claims, grid: _Grid) -> None:
+        self._claims, self._grid = claims, grid
+        half = COARSE // 2
+        places = claims.hard.shape[1]
+        moved = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]
+        self._index = np.clip(np.rint(moved / claims.spacing_m).astype(int), 0, places - 1)
+        # The steps around one, as one row: what happens at the last step goes on.
+        price = TOUCH * claims.hard + (_CLOSE * DT_S) * claims.near
+        price = np.concatenate([price, np.repeat(price[-1:], COARSE + half, axis=0)]).astype(np.float32)
+        self._price, self._places = price.ravel(), places
+        self._flat = self._index + (places * np.arange(COARSE))[:, None, None]
+        self._ahead = _free_ahead(claims)
+        self._column = np.clip(np.rint(grid.place / claims.spacing_m).astype(int), 0, places - 1)
+        pace = np.minimum(grid.speed[:, None] / 5.0, 2.0)
+        # Even who stands must not be touched.
+        self._pace, self._following = pace + 0.02, (_CLOSE_BEHIND * _STEP_S) * np.minimum(pace, 1.0)
+        self._wanted = _HEADWAY_S * grid.speed[:, None] + 0.5
+
+    def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
+        """Cost of all states around a step."""
+        first = (step - COARSE // 2) * self._places
+        around = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
+        free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
+        close = np.maximum(1.0 - (free - 1.0) / self._wanted, 0.0) ** 2
+        return around * self._pace + close * self._following
+
+    def touched(self, step: int, v: int, s: int) -> bool:
+        """Whether something is touched around a step."""
+        half = COARSE // 2
+        rows = np.minimum(step + np.arange(-half, half + 1), len(self._claims.hard) - 1)
+        return bool(self._claims.hard[rows, self._index[:, v, s]].any())
+
+
+def _free_ahead(claims: Claims) -> Float32[np.ndarray, "time place"]:
+    """Distance from each place to the next one ahead that is taken, m; 1 km where none is."""
+    places = claims.hard.shape[1]
+    index = np.where(claims.hard, np.arange(places), places + round(1000.0 / claims.spacing_m))
+    nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]
+    return ((nearest - np.arange(places)) * claims.spacing_m).astype(np.float32)

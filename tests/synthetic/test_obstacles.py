@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from drivax.scenario.schema import AgentKind
+from drivax.synthetic.cast import Scripted, Staging
+from drivax.synthetic.curves import Pose, straight
+from drivax.synthetic.lateral import around, change_onto, displaced, quintic_step
+from drivax.synthetic.obstacles import Boxes, extents
+from drivax.synthetic.paths import Sway, lane_path
+from drivax.synthetic.roads import Line, RoadKind, RoadNetwork
+
+from .oracles import box_corners, distance_to_polyline, shared_area
+from .traffic_scenes import drivers, road, run
+
+
+def street(high=6.0):
+    """One lane east (y = 0), one west (y = 3.5), and edges: one 2.5 m to the right, one to the left."""
+    network, _ = road(300.0)
+    lanes = list(network.lanes)
+    lanes.append(dataclasses.replace(lanes[0], curve=straight(Pose(300.0, 3.5, math.pi), 300.0)))
+    ring = np.array([[-5.0, -2.5], [305.0, -2.5], [305.0, high], [-5.0, high]])
+    return RoadNetwork("test", tuple(lanes), (Line(RoadKind.EDGE_BOUNDARY, ring),))
+
+
+def parked(x, y, steps, speed=None):
+    one = Scripted.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(x, y, 0.0), steps)
+    return one if speed is None else dataclasses.replace(one, speed=np.full(steps, speed))
+
+
+def touches(motion, a, b):
+    """Steps at which two users' boxes share an area, by clipping polygons."""
+    steps = []
+    for t in range(motion.xy.shape[1]):
+        if (
+            motion.valid[a, t]
+            and motion.valid[b, t]
+            and np.hypot(*(motion.xy[a, t] - motion.xy[b, t])) < 15.0
+        ):
+            boxes = [
+                box_corners(motion.xy[k, t], motion.heading[k, t], *motion.size_m[k, :2]) for k in (a, b)
+            ]
+            if shared_area(*boxes) > 1e-6:
+                steps.append(t)
+    return steps
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.4, math.pi / 2, 2.5])
+def test_extents_are_those_of_the_corners(turned):
+    network, _ = road(100.0)
+    path = lane_path(network, (0,), Sway())
+    boxes = Boxes(np.array([[40.0, 2.0]]), np.array([turned]), np.zeros(1), np.array([[4.0, 1.8]]))
+    seen, which = extents(path, boxes)
+    corners = np.array(box_corners((40.0, 2.0), turned, 4.0, 1.8))
+    assert which.tolist() == [0]
+    assert seen.near_m[0] == pytest.approx(corners[:, 0].min()) and seen.far_m[0] == pytest.approx(
+        corners[:, 0].max()
+    )
+    assert seen.right_m[0] == pytest.approx(corners[:, 1].min()) and seen.left_m[0] == pytest.approx(
+        corners[:, 1].max()
+    )
+
+
+def test_what_is_far_from_a_path_is_not_seen():
+    path = lane_path(road(100.0)[0], (0,), Sway())
+    boxes = Boxes(np.array([[40.0, 30.0]]), np.zeros(1), np.zeros(1), np.array([[4.0, 1.8]]))
+    assert not len(extents(path, boxes)[1])
+
+
+@pytest.mark.parametrize(("high", "passes"), [(6.0, True), (2.2, False)])
+def test_a_double_parked_car_is_passed_where_there_is_room_and_waited_behind_where_there_is_none(
+    high, passes
+):
+    table = drivers(1, speed_factor=0.8)
+    motion = run(street(high), [(0,)], table, [20.0], [10.0], 30.0, parked=(parked(150.0, -0.4, 300),))
+    assert not touches(motion, 0, 1)
+    x, y = motion.xy[0, motion.valid[0]].T
+    assert (x.max() > 180.0) == passes
+    if passes:
+        assert y.max() > 1.5 and abs(y[x > 200.0]).max() < 0.1
+        assert y.max() + 0.95 < high
+    else:
+        assert motion.speed[0, -1] < 0.01
+        assert 150.0 - 2.3 - motion.size_m[0, 0] / 2 - x.max() == pytest.approx(5.0, abs=1.5)
+
+
+def test_oncoming_traffic_is_let_pass_first():
+    table = drivers(2, speed_factor=0.8)
+    network = street()
+    motion = run(
+        network, [(0,), (1,)], table, [90.0, 60.0], [8.0, 10.0], 40.0, parked=(parked(150.0, -0.4, 400),)
+    )
+    assert not touches(motion, 0, 1) and not touches(motion, 0, 2)
+    assert motion.acceleration[1].min() > -1.5
+    assert motion.xy[0, :, 0].max() > 180.0
+    # They meet before the first one swings out.
+    met = int(np.flatnonzero(motion.xy[0, :, 0] > motion.xy[1, :, 0])[0])
+    assert motion.xy[0, met, 1] < 0.5
+
+
+def test_cars_beside_the_lane_change_nothing():
+    table = drivers(1)
+    free = run(street(), [(0,)], table, [20.0], [10.0], 15.0)
+    beside = run(street(), [(0,)], table, [20.0], [10.0], 15.0, parked=(parked(150.0, -2.6, 150),))
+    assert np.array_equal(free.xy[0], beside.xy[0])
+
+
+def test_somebody_who_steps_into_the_lane_is_braked_for():
+    steps = 150
+    times = np.arange(steps) / 10
+    # Walks from the right over the lane at x = 120 at 1.5 m/s from second 4 on, waiting on the lane.
+    y = np.clip(-5.0 + 1.5 * np.maximum(times - 4.0, 0.0), -5.0, 0.0)
+    walker = Scripted(
+        kind=AgentKind.PEDESTRIAN,
+        size_m=(0.6, 0.6, 1.75),
+        xy=np.stack([np.full(steps, 120.0), y], axis=-1),
+        heading=np.full(steps, math.pi / 2),
+        speed=np.gradient(y, times),
+        valid=np.ones(steps, bool),
+    )
+    table = drivers(1, speed_factor=0.8)
+    motion = run(street(), [(0,)], table, [20.0], [11.0], 15.0, Staging(extras=(walker,)))
+    assert not touches(motion, 0, 1)
+    assert motion.speed[0, -1] < 0.1 and motion.xy[0, -1, 0] < 120.0
+    assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
+
+
+def test_the_quintic_leaves_with_value_and_slope_and_ends_level():
+    at = np.linspace(0.0, 60.0, 6001)
+    d = quintic_step(at, (10.0, 1.5, 0.1), 40.0)
+    step = at[1]
+    slope = np.gradient(d, step)
+    assert np.interp(10.0, at, d) == pytest.approx(1.5, abs=1e-6)
+    assert np.interp(10.0, at, slope) == pytest.approx(0.1, abs=1e-3)
+    assert np.abs(d[at >= 50.0]).max() < 1e-9
+    assert np.abs(np.gradient(slope, step)[(at > 10.1) & (at < 60)]).max() < 0.02
+
+
+def test_a_displaced_path_runs_beside_itself():
+    network, _ = road(200.0)
+    path = lane_path(network, (0,), Sway())
+    shifted = around(path, (40.0, 60.0, 90.0, 115.0), 2.0)
+    y = np.interp([20.0, 75.0, 150.0], shifted.curve.xy[:, 0], shifted.curve.xy[:, 1])
+    assert y == pytest.approx([0.0, 2.0, 0.0], abs=1e-6)
+    # Longer by what the detour costs, and what lies beyond is still where it was in the world.
+    longer = np.hypot(*np.diff(shifted.curve.xy, axis=0).T).sum() - 200.0
+    assert shifted.length_m == pytest.approx(200.0 + longer, abs=0.01) and longer > 0.2
+    last = shifted.spans[0]
+    assert last.begin_m + last.scale * 200.0 == pytest.approx(shifted.length_m, abs=0.01)
+    chord = np.arctan2(*np.diff(shifted.curve.xy, axis=0).T[::-1])
+    assert np.abs(chord - (shifted.curve.heading[1:] + shifted.curve.heading[:-1]) / 2).max() < 0.01
+    same, moved = displaced(path, np.zeros(len(path.curve.xy)))
+    assert np.allclose(same.curve.xy, path.curve.xy) and np.allclose(
+        moved, path.step_m * np.arange(len(moved))
+    )
+
+
+def test_a_change_begins_exactly_where_the_vehicle_is():
+    network, columns = road(300.0, lanes=2)
+    here, there = (lane_path(network, (column[0],), Sway((0.2,), (0.05,), (0.3,))) for column in columns)
+    path, at = change_onto(there, here, 80.3, 50.0)
+    xy = [np.interp(at, path.step_m * np.arange(len(path.curve.xy)), path.curve.xy[:, k]) for k in (0, 1)]
+    old = [np.interp(80.3, here.step_m * np.arange(len(here.curve.xy)), here.curve.xy[:, k]) for k in (0, 1)]
+    assert np.hypot(*(np.array(xy) - old)) < 0.02
+    end = path.curve.xy[path.step_m * np.arange(len(path.curve.xy)) > at + 51.0]
+    assert distance_to_polyline(end, there.curve.xy).max() < 0.02
+    both = set(path.lane[round((at + 10.0) / path.step_m)]) - {-1}
+    after = set(path.lane[round((at + 45.0) / path.step_m)]) - {-1}
+    assert both == {columns[0][0], columns[1][0]} and after == {columns[1][0]}

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drivax.scenario.schema import AgentKind, RoadKind
+from drivax.synthetic.cast import Scripted
+from drivax.synthetic.curves import Pose
+from drivax.synthetic.families import CurvedRoad
+from drivax.synthetic.population import Density, drawn_drivers, driven_path, joined_drivers, placed
+
+from .traffic_scenes import drivers, road
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_placed_vehicles_keep_their_distance(seed):
+    rng = np.random.default_rng(seed)
+    network = CurvedRoad().build(rng)
+    where = placed(network, 0, 50.0, Density(spacing_m=(5.0, 10.0), vehicles=200), rng)
+    points = [(0, 50.0), *zip(where.lane, where.along_m, strict=True)]
+    assert len(points) > 20
+    for i, (lane, along) in enumerate(points):
+        assert 0 < along < network.lanes[lane].length_m
+        for other, there in points[i + 1 :]:
+            if other == lane:
+                assert abs(along - there) > 15.0
+            elif other in network.lanes[lane].successors:
+                assert network.lanes[lane].length_m - along + there > 15.0
+
+
+def test_nobody_begins_in_or_right_behind_what_stands_in_a_lane_or_where_a_lane_ends():
+    network, _ = road(600.0, lanes=2)
+    lanes = (network.lanes[0], dataclasses.replace(network.lanes[1], ends=True))
+    network = dataclasses.replace(network, lanes=lanes)
+    stands = Scripted.standing(AgentKind.VEHICLE, (4.6, 1.9, 1.5), Pose(300.0, 0.0, 0.0), 10)
+    density = Density(spacing_m=(4.0, 6.0), vehicles=200, leader_share=0.0)
+    found = [
+        place
+        for seed in range(20)
+        for place in zip(
+            *dataclasses.astuple(placed(network, 0, 20.0, density, np.random.default_rng(seed), (stands,))),
+            strict=True,
+        )
+    ]
+    here = np.array([along for lane, along in found if lane == 0])
+    assert not np.any((here > 275.0) & (here < 310.0)) and np.any((here > 240.0) & (here < 275.0))
+    assert max(along for lane, along in found if lane == 1) <= 525.0
+
+
+def test_shares_of_types_are_those_asked_for():
+    density = Density(van_share=0.2, truck_share=0.1, bus_share=0.05, cyclist_share=0.15)
+    table = drawn_drivers(20000, density, np.random.default_rng(0))
+    length, cyclist = table.size_m[:, 0], table.cyclist
+    counts = [np.mean(cyclist), np.mean(length > 10.0), np.mean((length > 6.9) & (length < 10.0)), np.mean(
+        (table.size_m[:, 2] > 1.99) & (length < 6.5))]  # fmt: skip
+    assert counts == pytest.approx([0.15, 0.05, 0.1, 0.2], abs=4 * 0.5 / np.sqrt(20000))
+    assert np.all(table.kind[~cyclist] == AgentKind.VEHICLE)
+    assert np.all((table.top_speed_mps[cyclist] >= 4.0) & (table.top_speed_mps[cyclist] <= 7.0))
+    assert np.all(table.size_m[cyclist, 1] < 0.71) and np.all(table.size_m[~cyclist, 1] > 1.69)
+    assert table.reaction_s.min() >= 0.1 and table.reaction_s.max() <= 0.6
+    assert table.critical_gap_s.min() >= 3.5 and table.critical_gap_s.max() <= 6.0
+
+
+def test_nobody_cycles_on_fast_roads_and_only_cyclists_use_their_lanes():
+    lane = road()[0].lanes[0]
+    fast, bike = dataclasses.replace(lane, limit_mps=25.0), dataclasses.replace(lane, kind=RoadKind.LANE_BIKE)
+    lanes = [fast] * 300 + [bike] * 10 + [lane] * 300
+    table = drawn_drivers(610, Density(cyclist_share=0.3), np.random.default_rng(1), lanes)
+    assert not table.cyclist[:300].any() and table.cyclist[300:310].all() and table.cyclist[310:].any()
+
+
+def test_cyclists_ride_at_the_right_side_of_the_lane():
+    network, _ = road(300.0, width_m=3.5)
+    rider = driven_path(network, (0,), True, np.random.default_rng(0)).curve.xy[:, 1]
+    car = driven_path(network, (0,), False, np.random.default_rng(0)).curve.xy[:, 1]
+    assert rider.mean() == pytest.approx(-1.2, abs=0.08) and np.ptp(rider) < 0.21
+    assert abs(car).max() < 0.21
+
+
+def test_tables_of_drivers_are_joined_and_chosen_in_order():
+    both = joined_drivers(drivers(2, 1), drivers(3, 2))
+    assert both.size_m.shape == (5, 3)
+    assert np.array_equal(both.headway_s[2:], drivers(3, 2).headway_s)
+    assert np.array_equal(both.chosen(np.array([4, 0])).headway_s, both.headway_s[[4, 0]])

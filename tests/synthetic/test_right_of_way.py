@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from drivax.synthetic.cast import EgoPlan, Heedless, Staging
+from drivax.synthetic.right_of_way import conflict_zones, time_to_cover
+from drivax.synthetic.roads import CLEARANCE_M, Control
+
+from .traffic_scenes import crossroads, drivers, entered, run, twins
+
+WAYS = ((0, 1, 2), (3, 4, 5), (6, 7, 8), (9, 10, 11))
+
+
+def test_conflict_zones_are_where_the_ways_are_near():
+    network = crossroads(2)
+    begin, end = conflict_zones(network)
+    # Two lines at right angles: each is near the other within the clearance of the crossing point (112, -2).
+    assert begin[1, 4] == pytest.approx(12.0 - CLEARANCE_M, abs=1.0)
+    assert end[1, 4] == pytest.approx(12.0 + CLEARANCE_M, abs=1.0)
+    assert np.argwhere(~np.isnan(begin)).tolist() == [[1, 4], [4, 1]]
+    assert np.isnan(begin).tolist() == np.isnan(end).tolist()
+
+
+@pytest.mark.parametrize(
+    ("distance", "speed"), [(0.0, 3.0), (5.0, 0.0), (12.0, 2.0), (80.0, 4.0), (-3.0, 4.0)]
+)
+def test_the_time_to_cover_a_distance_is_that_of_marching(distance, speed):
+    at, v, t = 0.0, speed, 0.0
+    while at < distance:
+        at, v, t = at + v * 1e-4, min(v + 1.5e-4, 9.0), t + 1e-4
+    assert time_to_cover(np.array([distance]), speed, 1.5, 9.0)[0] == pytest.approx(t, abs=0.01)
+
+
+def yielding(seconds_away, control=Control.YIELD, speed=10.0):
+    """Row 1 comes to give way; row 0 with priority would be at the crossing so many seconds later than it asks."""
+    network = crossroads(2, control=[Control.NONE, control], yields_to=[(), (1,)])
+    table = drivers(2, speed_factor=0.7, critical_gap_s=4.5, acceleration_mps2=1.5)
+    # Row 1 stands 2 m before its line.
+    at = [112.0 - 2.0 - speed * seconds_away, 98.0 - table.size_m[1, 0] / 2]
+    motion = run(network, WAYS[:2], table, at, [speed, 0.0], 12.0)
+    return (
+        entered(motion, 1, 100.0, table.size_m[1, 0]),
+        entered(motion, 0, 112.0, table.size_m[0, 0]),
+        motion,
+    )
+
+
+def test_who_must_give_way_waits_for_a_car_three_seconds_away_and_goes_before_one_at_eight():
+    mine, theirs, _ = yielding(3.0)
+    assert theirs < 40 and mine > theirs
+    mine, theirs, motion = yielding(8.0)
+    assert mine < 30 and mine < theirs
+    # And the one with priority was not hindered.
+    assert motion.acceleration[0].min() > -1.0
+
+
+def test_nobody_at_a_yield_sign_stops_when_the_road_is_free():
+    network = crossroads(2, control=[Control.NONE, Control.YIELD], yields_to=[(), (1,)])
+    table = drivers(2, speed_factor=0.7)
+    motion = run(network, WAYS[:2], table, [200.0, 20.0], [10.0, 10.0], 12.0)
+    assert motion.speed[1].min() > 8.0
+
+
+def test_at_a_stop_sign_everybody_stands_first():
+    network = crossroads(2, control=[Control.NONE, Control.STOP], yields_to=[(), (1,)])
+    table = drivers(2, speed_factor=0.7)
+    motion = run(network, WAYS[:2], table, [200.0, 20.0], [10.0, 10.0], 25.0)
+    size = table.size_m[1, 0]
+    line = entered(motion, 1, 100.0, size)
+    stood = np.flatnonzero(motion.speed[1, :line] < 0.21)
+    assert len(stood) and line < 200
+    assert 100.0 - 4.5 < motion.distance_m[1, stood[0]] + size / 2 <= 100.0
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 0, 3, 1)])
+def test_at_an_all_way_stop_who_stood_first_goes_first(order):
+    network = crossroads(4, control=[Control.ALL_WAY_STOP] * 4)
+    table = twins(4, speed_factor=0.6)
+    # Each comes 12 m (more than a second) behind the one before.
+    at = [80.0 - 12.0 * order[row] for row in range(4)]
+    motion = run(network, WAYS, table, at, [6.0] * 4, 40.0)
+    lines = [entered(motion, row, 100.0, table.size_m[row, 0]) for row in range(4)]
+    # Rows 0 and 2 come from opposite sides and do not meet, nor do 1 and 3.
+    for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        assert (lines[a] < lines[b]) == (order[a] < order[b])
+    assert max(lines) < 400
+
+
+def test_of_two_who_come_together_the_one_to_the_right_goes_first():
+    network = crossroads(2, control=[Control.ALL_WAY_STOP] * 2)
+    table = twins(2, speed_factor=0.6)
+    half = table.size_m[:, 0] / 2
+    motion = run(network, WAYS[:2], table, 60.0 - half, [6.0] * 2, 25.0)
+    lines = [entered(motion, row, 100.0, table.size_m[row, 0]) for row in range(2)]
+    # Row 1 goes north and so comes from the right of row 0, who goes east.
+    assert lines[1] < lines[0] < 250
+
+
+def test_nobody_enters_a_junction_that_cannot_be_cleared():
+    network = crossroads(2, control=[Control.YIELD, Control.NONE], yields_to=[(4,), ()])
+    table = drivers(3, speed_factor=0.7)
+    # Row 0 stands right behind the junction on row 1's way (both go east); row 2 goes north later.
+    standing = EgoPlan(0, np.tile([124.0, -2.0], (200, 1)), np.zeros(200), np.zeros(200))
+    motion = run(
+        network, (WAYS[0], WAYS[0], WAYS[1]), table, [124.0, 60.0, 20.0], [0.0, 8.0, 8.0], 20.0, ego=standing
+    )
+    assert (motion.distance_m[1] + table.size_m[1, 0] / 2).max() < 100.0
+    assert motion.distance_m[2, -1] > 120.0
+
+
+def test_the_heedless_neither_stop_nor_give_way_but_are_seen():
+    network = crossroads(2, control=[Control.STOP, Control.NONE], yields_to=[(4,), ()])
+    table = drivers(2, speed_factor=0.7, slowing_mps2=1.5)
+    staging = Staging(heedless=(Heedless(0, 0, 200),))
+    motion = run(network, WAYS[:2], table, [50.0, 40.0], [10.0, 8.0], 14.0, staging)
+    assert motion.speed[0].min() > 8.0
+    first = entered(motion, 0, 100.0, table.size_m[0, 0])
+    assert entered(motion, 1, 100.0, table.size_m[1, 0]) > first
+
+
+def test_ways_from_one_lane_do_not_conflict_and_oncoming_traffic_goes_together():
+    network = crossroads(4)
+    begin, _ = conflict_zones(network)
+    assert math.isnan(begin[1, 7]) and not math.isnan(begin[1, 10])
