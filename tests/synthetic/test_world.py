@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, Flag, LightState
-from drivax.synthetic.events import EventKind
+from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, AgentKind, Flag, LightState
+from drivax.synthetic.domains import DOMAINS
+from drivax.synthetic.events import SEVERITY_MPS2, EventKind
 from drivax.synthetic.sensing import NoiseConfig
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one, generate_recording
 
@@ -55,9 +56,11 @@ def test_nobody_ever_overlaps(index):
         corners = {
             i: box_corners(tracks.xy[i, t], tracks.heading[i, t], *tracks.size[i, t, :2]) for i in present
         }
+        person = tracks.kind == AgentKind.PEDESTRIAN
         for i in present:
             for j in present[present > i]:
-                if np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0:
+                # People pass each other as they like.
+                if not (person[i] and person[j]) and np.hypot(*(tracks.xy[i, t] - tracks.xy[j, t])) < 11.0:
                     assert shared_area(corners[i], corners[j]) == 0.0, (i, j, t)
 
 
@@ -93,7 +96,7 @@ def test_nobody_runs_a_red_light(index):
 @pytest.mark.parametrize("index", range(COUNT))
 def test_motion_is_that_of_a_bicycle_at_the_box_centre(index):
     tracks = drawn(index).recording.tracks
-    for row in range(len(tracks.xy)):
+    for row in np.flatnonzero(np.isin(tracks.kind, (AgentKind.VEHICLE, AgentKind.CYCLIST))):
         ok = tracks.valid[row]
         xy, heading = tracks.xy[row, ok], np.unwrap(tracks.heading[row, ok])
         speed = np.hypot(*tracks.velocity[row, ok].T)
@@ -125,7 +128,7 @@ def test_the_expert_drives_gently_and_makes_way():
 
 
 def test_driving_on_as_before_is_not_enough():
-    """Constant speed and heading leaves the road or meets somebody in well over half of the scenarios."""
+    """Constant speed and heading leaves the road or meets somebody in two of five scenarios, red lights not counted."""
     failed = 0
     for index in range(COUNT):
         recording = drawn(index).recording
@@ -144,7 +147,7 @@ def test_driving_on_as_before_is_not_enough():
             if off or hit:
                 failed += 1
                 break
-    assert failed > 0.55 * COUNT
+    assert failed >= 0.4 * COUNT
 
 
 def test_recordings_are_complete():
@@ -155,8 +158,10 @@ def test_recordings_are_complete():
         families.add(one.family)
         assert recording.dataset == "drivax" and recording.current_step == CURRENT_STEP
         assert recording.scenario_id == f"w{WORLD_VERSION}-grid-s3-{index:06d}-{one.family}"
-        assert recording.segment == f"w{WORLD_VERSION}-grid-s3-m{index // EXACT.scenarios_per_map:06d}"
-        assert one.tags["family"] == one.family and one.tags["domain"] == "grid"
+        if not recording.events:
+            place = f"m{index // EXACT.scenarios_per_map:06d}"
+            assert recording.segment.startswith(f"w{WORLD_VERSION}-grid-s3-{place}.")
+        assert recording.tags["family"] == one.family and recording.tags["domain"] == "grid"
         assert np.allclose(np.diff(recording.timestamps_s), 0.1)
         assert tracks.xy.shape == (len(tracks.kind), STEPS, 2) and tracks.valid.any(axis=1).all()
         assert np.all(np.abs(tracks.heading) <= np.pi)
@@ -168,27 +173,38 @@ def test_recordings_are_complete():
             assert b in ids[a].successors + beside
         # The world knows where there are no lights.
         assert Flag.LIGHTS in recording.flags
-        assert (one.family == "signalised_junction") == bool(recording.lights)
+        assert recording.lights or one.family != "signalised_junction"
         for light in recording.lights:
             assert np.array_equal(light.stop_point, ids[light.lane_id].points[0])
-    assert families == {"curved_road", "signalised_junction"}
+    assert len(families) >= 6 and families <= {family.name for family, _ in DOMAINS["grid"].families}
 
 
-def test_events_happen_as_labelled():
+def test_rare_scenarios_have_one_labelled_event():
     config = dataclasses.replace(EXACT, rare_rate=1.0)
-    labelled = 0
-    for index in range(12):
-        one = drawn(index, config)
-        for event in one.recording.events:
-            labelled += 1
-            assert event.kind == EventKind.LEAD_BRAKES and one.tags["event"] == "lead_brakes"
-            tracks = one.recording.tracks
-            (actor,) = np.flatnonzero(tracks.track_id == event.actors[0])
-            speed = np.hypot(*tracks.velocity[actor].T)
-            assert CURRENT_STEP < event.start < event.end < STEPS
-            assert np.diff(speed)[event.start : event.end].min() < -0.24 or speed[event.end] == 0.0
-    assert labelled >= 3
+    for index in range(6):
+        recording = drawn(index, config).recording
+        (event,) = recording.events
+        assert recording.tags["event"] == EventKind(event.kind).name.lower()
+        low, high = SEVERITY_MPS2
+        assert low <= float(recording.tags["severity_mps2"]) <= high
+        assert CURRENT_STEP < event.start < event.end < STEPS
+        for actor in event.actors:
+            (row,) = np.flatnonzero(recording.tracks.track_id == actor)
+            assert row != recording.ego and recording.tracks.valid[row, event.start]
     assert not drawn(0, WorldConfig(rare_rate=0.0)).recording.events
+
+
+def test_the_domain_decides_about_roads():
+    ring = dataclasses.replace(EXACT, domain="ring")
+    widths = {
+        config.domain: np.mean(
+            [f.width_m for i in range(4) for f in drawn(i, config).recording.features if f.width_m]
+        )
+        for config in (EXACT, ring)
+    }
+    assert widths["ring"] < widths["grid"] - 0.2
+    with pytest.raises(UsageError, match="no domain 'city'"):
+        generate_one(0, 0, WorldConfig(domain="city"))
 
 
 def test_negative_seeds_are_refused():
