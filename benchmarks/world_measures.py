@@ -6,57 +6,23 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.signal import savgol_filter
 from scipy.stats import beta
 
 from drivax.geometry.boxes import overlap, time_to_overlap
-from drivax.scenario.recording import Recording
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
+from drivax.synthetic.comfort import broken_limits
+from drivax.synthetic.sensing import NoiseConfig, farthest_m
 
 Array = np.ndarray[Any, Any]
 
-#: Limits of comfort (nuPlan): low and high.
-LIMITS = {
-    "longitudinal acceleration": (-4.05, 2.40),
-    "lateral acceleration": (-4.89, 4.89),
-    "longitudinal jerk": (-4.13, 4.13),
-    "jerk magnitude": (-8.37, 8.37),
-    "yaw rate": (-0.95, 0.95),
-    "yaw acceleration": (-1.93, 1.93),
-}
 #: Time to collision that makes an event one, s, and how far it is looked for.
 NEAR_S, HORIZON_S = 1.0, 5.0
 
 
-def smoothed(values: Any, window: int, order: int, derivative: int = 0) -> Array:
-    """Savitzky-Golay filter or derivative of a quantity over time."""
-    return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=DT_S))
-
-
-def comfort(recording: Recording) -> dict[str, tuple[float, float]]:
-    """Smallest and largest value of each quantity over ego's log, with nuPlan's Savitzky-Golay windows."""
-    ego = recording.ego
-    speed = np.hypot(*recording.tracks.velocity[ego].T)
-    return extremes(speed, recording.tracks.heading[ego])
-
-
-def extremes(speed: Array, heading: Array) -> dict[str, tuple[float, float]]:
-    """:func:`comfort` of speeds (m/s) and headings at 10 Hz."""
-    heading = np.unwrap(heading)
-    rate = smoothed(heading, 15, 2, 1)
-    along = smoothed(np.gradient(speed, DT_S), 8, 2)
-    aside = smoothed(speed * rate, 8, 2)
-    jerk_along, jerk_aside = smoothed(along, 15, 2, 1), smoothed(aside, 15, 2, 1)
-    yaw = smoothed(heading, 15, 3, 2)
-    values = (along, aside, jerk_along, np.hypot(jerk_along, jerk_aside), rate, yaw)
-    return {name: (float(v.min()), float(v.max())) for name, v in zip(LIMITS, values, strict=True)}
-
-
-def broken_limits(scenario: Scenario) -> list[str]:
+def uncomfortable(scenario: Scenario) -> tuple[str, ...]:
     """Names of the limits of comfort that ego's log breaks."""
-    velocity = scenario.agent_velocity[:, 0].astype(np.float64)
-    found = extremes(np.hypot(*velocity.T), scenario.agent_heading[:, 0].astype(np.float64))
-    return [name for name, (low, high) in LIMITS.items() if found[name][0] < low or found[name][1] > high]
+    speed = np.hypot(*scenario.agent_velocity[:, 0].astype(np.float64).T)
+    return broken_limits(scenario.agent_heading[:, 0].astype(np.float64), speed)
 
 
 def everybody(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
@@ -101,9 +67,9 @@ def overlapping_pairs(scenario: Scenario) -> int:
 def constant_speed_ttc_s(scenario: Scenario) -> float:
     """Smallest time to collision with the labelled actors of an ego that keeps its speed from the event on.
 
-    It starts at the event's first step, with the speed that it has then, and goes on along the way that the log
-    takes, and the log's route beyond its end. Time to collision is that of boxes at constant velocity; 0 where they
-    overlap.
+    It starts at the event's first step, with the speed that it has then, and goes on along its route, as far beside
+    it as it is (the log's own way may already avoid the actor). Time to collision is that of boxes at constant
+    velocity; 0 where they overlap.
     """
     start, actors = int(scenario.event_start[0]), scenario.event_actor[0]
     box, velocity, valid, _, number = everybody(scenario)
@@ -127,26 +93,50 @@ def constant_speed_ttc_s(scenario: Scenario) -> float:
 
 
 def _way(scenario: Scenario, start: int) -> Array:
-    """Points of the log from a step on, at least 5 cm apart, and of the log's route beyond its end."""
-    log = scenario.agent_xy[start:, 0].astype(np.float64)
-    moved = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(log, axis=0).T))))
-    log = log[np.unique((moved / 0.05).astype(np.int64), return_index=True)[1]]
-    count = int(scenario.route_points[1])
-    route = scenario.route_xy[1, :count].astype(np.float64)
-    nearest = int(np.hypot(*(route - log[-1]).T).argmin())
-    return np.concatenate((log, route[nearest + 2 :]))
+    """Points of the route from where the ego is on, as far beside it as the ego is then."""
+    count = int(scenario.route_points[0])
+    route = scenario.route_xy[0, :count].astype(np.float64)
+    heading = scenario.route_heading[0, :count].astype(np.float64)
+    normal = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+    ego = scenario.agent_xy[start, 0].astype(np.float64)
+    nearest = int(np.hypot(*(route - ego).T).argmin())
+    left = float((ego - route[nearest]) @ normal[nearest])
+    return np.concatenate((ego[None], (route + left * normal)[nearest + 1 :]))
 
 
-def binomial(successes: int, trials: int) -> tuple[float, float]:
-    """Clopper and Pearson's 95 % interval of a share."""
+def binomial(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Clopper and Pearson's interval of a share."""
     if not trials:
         return 0.0, 1.0
-    low = 0.0 if successes == 0 else float(beta.ppf(0.025, successes, trials - successes + 1))
-    high = 1.0 if successes == trials else float(beta.ppf(0.975, successes + 1, trials - successes))
+    tail = (1.0 - level) / 2
+    low = 0.0 if successes == 0 else float(beta.ppf(tail, successes, trials - successes + 1))
+    high = 1.0 if successes == trials else float(beta.ppf(1.0 - tail, successes + 1, trials - successes))
     return low, high
 
 
-def share(successes: int, trials: int) -> dict[str, float | int]:
-    """A share with its interval, for tables and JSON."""
+def share(successes: int, trials: int) -> dict[str, Any]:
+    """A share with its 95 % interval, for tables and JSON."""
     low, high = binomial(successes, trials)
     return {"share": successes / trials if trials else math.nan, "low": low, "high": high, "n": trials}
+
+
+def against(wanted: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
+    """A share beside the probability that was configured.
+
+    Of many 95 % intervals one in twenty misses the truth, so ``outside`` says whether the configured value is outside
+    Bonferroni's interval, of level 1 - 0.05 / comparisons; ``outside_95`` says the same of the usual one.
+    """
+    found = share(successes, trials)
+    low, high = binomial(successes, trials, 1.0 - 0.05 / comparisons)
+    return {
+        **found,
+        "wanted": wanted,
+        "outside_95": not found["low"] <= wanted <= found["high"],
+        "outside": not low <= wanted <= high,
+    }
+
+
+def largest_noise_m(scenario: Scenario, config: NoiseConfig) -> float:
+    """How far perception noise can have moved a corner of anybody in a scenario, at most."""
+    sizes = scenario.agent_size[1:][scenario.agent_valid[:, 1:].any(axis=0), :2]
+    return max((farthest_m(config, float(length), float(width)) for length, width in sizes), default=0.0)

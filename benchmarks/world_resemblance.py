@@ -1,8 +1,9 @@
 """How the built-in world compares with the real recordings at hand: one figure, medians, Kolmogorov-Smirnov distances.
 
-Subjects are ego and every other vehicle that is there all the time and drives at least 5 m, in the world as in the
-recordings: with a dozen recordings their egos alone would be a dozen drives. The files at hand are a handful of
-places, no fair sample of any data set: differences in the number of agents say as much about them as about the world.
+Subjects are ego and every other vehicle within 50 m of it on average that is there all the time and drives at least
+5 m, in the world as in the recordings: with a dozen recordings their egos alone would be a dozen drives. The files at
+hand are a handful of places, no fair sample of any data set: differences in the number of agents say as much about
+them as about the world.
 
 Run: python benchmarks/world_resemblance.py --data ../shared/data --scenarios 256 [--write]
 """
@@ -16,22 +17,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.signal import savgol_filter
 from scipy.stats import ks_2samp
 
 from drivax.datasets.formats import reader_named, survey
-from drivax.errors import DrivaxError
+from drivax.errors import DrivaxError, UsageError
 from drivax.scenario.assemble import assemble, windows
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CAPACITIES, DT_S, STEPS, AgentKind, Scenario
+from drivax.show.palette import BLUE, VERMILLION
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 from world_measures import everybody
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURE = ROOT / "docs" / "guide" / "world-resemblance.png"
@@ -48,7 +47,12 @@ QUANTITIES = {
     "agents": ("agents within 50 m", (0.0, 80.0)),
     "nearest_m": ("distance to the nearest agent (m)", (0.0, 40.0)),
 }
+#: Panels that begin a row of the figure.
+FIRST_IN_ROW = tuple(QUANTITIES)[::3]
+#: Who drives less than this is no subject, m.
 DRIVES_M = 5.0
+#: Nor who is farther from ego on average: who surrounds them is not recorded in full, m.
+NEAR_EGO_M = 50.0
 #: A leader is this near, within this distance of the subject's axis, and heads the same way within 45 degrees.
 LEADER_M, LEADER_ASIDE_M = 60.0, 1.6
 #: Yaw rates and time gaps of standing cars mean nothing.
@@ -62,7 +66,8 @@ def quantities(scenario: Scenario) -> dict[str, Array]:
     box, velocity, valid, kind, _ = everybody(scenario)
     subjects = np.flatnonzero(valid.all(axis=0) & (kind == AgentKind.VEHICLE))
     way = np.hypot(*np.moveaxis(np.diff(box[:, subjects, :2], axis=0), -1, 0)).sum(axis=0)
-    subjects = subjects[(way >= DRIVES_M) | (subjects == 0)]
+    apart = np.hypot(*np.moveaxis(box[:, subjects, :2] - box[:, :1, :2], -1, 0)).mean(axis=0)
+    subjects = subjects[(subjects == 0) | ((way >= DRIVES_M) & (apart < NEAR_EGO_M))]
     parts = [_subject(row, box, velocity, valid, kind) for row in subjects]
     return {name: np.concatenate([part[name] for part in parts]) for name in QUANTITIES}
 
@@ -127,7 +132,10 @@ def world(scenarios: int, seed: int, domain: str) -> Iterable[Scenario]:
     """Scenarios of the built-in world."""
     config = replace(WorldConfig(), domain=domain)
     for index in range(scenarios):
-        yield assemble(generate_one(seed, index, config).recording)
+        try:
+            yield assemble(generate_one(seed, index, config).recording)
+        except UsageError as error:
+            print(f"  left out: {error}")
 
 
 def compared(theirs: dict[str, Array], ours: dict[str, Array]) -> dict[str, Any]:
@@ -135,32 +143,43 @@ def compared(theirs: dict[str, Array], ours: dict[str, Array]) -> dict[str, Any]
     result = {}
     for name in QUANTITIES:
         row: dict[str, Any] = {
-            key: {f"p{p}": float(np.percentile(v[name], p)) for p in (5, 50, 95)}
+            key: {f"p{p}": float(np.percentile(v[name], p)) for p in (5, 25, 50, 75, 95)}
+            | {"n": len(v[name])}
             for key, v in (("real", theirs), ("world", ours))
-            if len(v[name])
         }
-        if len(row) == 2:
-            row["ks"] = float(np.asarray(ks_2samp(theirs[name], ours[name]).statistic))
+        row["ks"] = float(np.asarray(ks_2samp(theirs[name], ours[name]))[0])
         result[name] = row
     return result
 
 
 def figure(sources: dict[str, dict[str, Array]], out: Path) -> None:
-    """Histograms side by side, one panel per quantity, shares of the values in range."""
-    picture, axes = plt.subplots(2, 4, figsize=(15, 6.5), layout="constrained")
-    for axis, (name, (label, (low, high))) in zip(axes.flat, QUANTITIES.items(), strict=False):
-        edges = np.linspace(low, high, 41)
-        for source, values in sources.items():
+    """One panel per quantity: the first source as an area, the others as lines; shares of the values per bin.
+
+    The outermost bins hold what lies beyond as well.
+    """
+    page = Figure(figsize=(9.0, 8.6), dpi=120, facecolor="white", layout="constrained")
+    axes = page.subplots(3, 3).flat
+    styles = [{"color": "#c6ccd3", "histtype": "stepfilled"}]
+    styles += [
+        {"color": colour, "histtype": "step", "linewidth": 1.8, "linestyle": dashes}
+        for colour, dashes in ((BLUE, "-"), (VERMILLION, (0, (4, 1.2))))
+    ]
+    for axis, (name, (label, (low, high))) in zip(axes, QUANTITIES.items(), strict=False):
+        edges = np.arange(low, high + 2.0, 2.0) if name == "agents" else np.linspace(low, high, 31)
+        for style, (source, values) in zip(styles, sources.items(), strict=True):
             inside = np.clip(values[name], low, high)
-            weights = np.full(len(inside), 1.0 / max(len(inside), 1))
-            axis.hist(inside, edges, weights=weights, histtype="step", linewidth=1.6, label=source)
-        axis.set_xlabel(label)
-        axis.set_ylabel("share")
-    for axis in axes.flat[len(QUANTITIES) :]:
+            axis.hist(inside, edges, weights=np.full(len(inside), 1.0 / len(inside)), label=source, **style)
+        axis.set_xlabel(label, fontsize=10.5)
+        axis.set_xlim(low, high)
+        axis.set_ylabel("share of values" if name in FIRST_IN_ROW else "", fontsize=10.5)
+        axis.tick_params(labelsize=9.5)
+        for side in ("top", "right"):
+            axis.spines[side].set_visible(False)
+    handles = page.axes[0].get_legend_handles_labels()
+    page.axes[len(QUANTITIES)].legend(*handles, loc="center left", frameon=False, fontsize=11.5)
+    for axis in page.axes[len(QUANTITIES) :]:
         axis.axis("off")
-        axis.legend(*axes.flat[0].get_legend_handles_labels(), loc="center", frameon=False)
-    picture.savefig(out, dpi=110)
-    plt.close(picture)
+    page.savefig(out)
 
 
 def main() -> None:
@@ -187,10 +206,9 @@ def main() -> None:
         for name, (label, _) in QUANTITIES.items():
             row = result[domain][name]
             cells = [
-                ", ".join(f"{v:.2f}" for v in row[key].values()) if key in row else ""
-                for key in ("real", "world")
+                ", ".join(f"{row[key][p]:.2f}" for p in ("p5", "p50", "p95")) for key in ("real", "world")
             ]
-            print(f"| {label} | {cells[0]} | {cells[1]} | {row.get('ks', float('nan')):.2f} |")
+            print(f"| {label} | {cells[0]} | {cells[1]} | {row['ks']:.2f} |")
     figure(sources, FIGURE if args.write else args.figure)
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")

@@ -6,12 +6,13 @@ from dataclasses import replace
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.planners.search import SearchPlanner
+from drivax.planners.search import SearchPlanner, advanced
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
@@ -26,16 +27,17 @@ PERSON = partial(car, length=0.6, width=0.6, kind=AgentKind.PEDESTRIAN)
 
 
 @jax.jit
-def first_action(bank):
+def first_action(bank, stood_s=0.0):
     planner, key = SearchPlanner(), jax.random.key(0)
     state = SIMULATOR.reset(bank, 0, 10, 0)
-    return planner.act(
-        planner.init(bank, state, key), bank, state, SIMULATOR.situation(bank, state), None, key
-    )[0]
+    carry = planner.init(bank, state, key)
+    carry = replace(carry, stood_s=carry.stood_s + stood_s)
+    return planner.act(carry, bank, state, SIMULATOR.situation(bank, state), None, key)[0]
 
 
-def action(recording):
-    return np.asarray(first_action(bank_of(recording)))
+def action(recording, stood_s=0.0):
+    """The first action, after everybody who stands has done so for that long."""
+    return np.asarray(first_action(bank_of(recording), stood_s))
 
 
 def test_a_free_road_is_driven_by_the_law_of_idm():
@@ -90,3 +92,47 @@ def test_it_copes_with_a_person_an_obstacle_a_cut_in_and_a_red_light():
     bank = ScenarioBank.from_scenarios(scenarios, trim=False)
     found = evaluate(SearchPlanner(), bank, scenario_names(scenarios), task=TASK).metrics
     assert found["accuracy"].tolist() == [1.0, 1.0, 1.0, 1.0]
+
+
+def test_it_does_not_leave_its_lane_to_get_past_a_queue():
+    """Two who stand one behind the other are a queue; one who has long stood alone is not."""
+    behind_it, alone = [car(20, 0, 0, 0), car(28, 0, 0, 0)], [car(20, 0, 0, 0), car(45, 0, 0, 0)]
+    _, steering = action(straight_road([car(0, 0, 0, 5), *behind_it]), stood_s=5.0)
+    assert abs(steering) < 0.01
+    _, steering = action(straight_road([car(0, 0, 0, 5), *alone]), stood_s=5.0)
+    assert steering > 0.01
+    _, steering = action(straight_road([car(0, 0, 0, 5), *alone]), stood_s=1.0)
+    assert abs(steering) < 0.01
+
+
+def test_it_brakes_for_what_comes_into_its_lane_and_may_stop_there():
+    """A box that is pushed onto the road at 3.5 m/s would be across it in time, but may stay where ego goes."""
+    pushed = partial(car, length=1.0, width=1.0, kind=AgentKind.OTHER)
+    # Ego is there after 2.5 s; at a constant 3.5 m/s the box has left its lane after 1.8 s.
+    beside = car(2.0, 3.7, 0, 12)
+    throttle, _ = action(straight_road([car(0, 0, 0, 12), pushed(32, -3.5, np.pi / 2, 3.5), beside]))
+    assert throttle < -0.1
+    throttle, _ = action(straight_road([car(0, 0, 0, 12), pushed(32, -3.5, -np.pi / 2, 3.5), beside]))
+    assert throttle > 0.0
+
+
+def test_it_lets_in_who_changes_into_its_lane():
+    """Over a metre out of its lane, 11 degrees towards ego's, 3 m/s slower; another one drives where it leaves."""
+    beside = car(-1, 3.7, 0, 11)
+    throttle, _ = action(straight_road([car(0, 0, 0, 11), car(8, 2.5, -0.2, 8), beside]))
+    assert throttle < -0.2
+    throttle, _ = action(straight_road([car(0, 0, 0, 11), car(8, 3.7, 0.0, 8), beside]))
+    assert throttle > 0.0
+
+
+def test_what_is_driven_in_thought_is_what_happens():
+    """The pose after 0.25 s of the manoeuvre of driving is that on a circle."""
+    speed, curvature = 10.0, 0.02
+    pose, moved_m = jnp.asarray([1.0, 2.0, np.cos(0.3), np.sin(0.3)]), speed * 0.25
+    found = np.asarray(advanced(pose, jnp.asarray(curvature), jnp.asarray(moved_m)))
+    # A circle of 50 m radius, driven for 2.5 m.
+    angle, radius = moved_m * curvature, 1.0 / curvature
+    chord = 2.0 * radius * np.sin(angle / 2)
+    oracle = [1.0 + chord * np.cos(0.3 + angle / 2), 2.0 + chord * np.sin(0.3 + angle / 2)]
+    assert found[:2] == pytest.approx(oracle, abs=1e-3)
+    assert found[2:] == pytest.approx([np.cos(0.3 + angle), np.sin(0.3 + angle)], abs=1e-5)

@@ -11,6 +11,7 @@ from drivax.scenario.exhaustive import without_grid
 from drivax.scenario.queries import (
     EDGE_CUTOFF_M,
     around_lanes,
+    lane_course,
     left_of_edges,
     light_crossing,
     offroad_distance,
@@ -141,6 +142,23 @@ def test_lanes_of_a_two_lane_road():
     assert not bool(between.straddling) and bool(between.leaving_lane)
     edge = at(0, -1.5, 0.0)  # right corners 2.5 m from the right lane's centre
     assert bool(edge.straddling)
+
+
+def test_a_car_follows_the_lane_that_fits_place_and_heading():
+    """Lanes along +x on y = 0 and y = 3.7."""
+    bank = bank_of(straight_road([car(0, 0, 0, 5)]))
+
+    def follow(y, heading):
+        direction = jnp.array([np.cos(heading), np.sin(heading)], jnp.float32)
+        return lane_course(bank, jnp.asarray(0), jnp.array([10.0, y], jnp.float32), direction, jnp.zeros(()))
+
+    for y, centre in ((0.4, 0.0), (-1.2, 0.0), (2.5, 3.7), (4.2, 3.7)):
+        direction, offset, there = follow(y, 0.3)
+        assert np.asarray(direction) == pytest.approx([1.0, 0.0], abs=1e-5)
+        assert float(offset) == pytest.approx(y - centre, abs=1e-4) and bool(there)
+    assert not bool(follow(0.4, np.pi)[2])  # against it
+    assert not bool(follow(0.4, np.deg2rad(61))[2])  # across it
+    assert not bool(follow(-2.6, 0.0)[2])  # beside it
 
 
 def test_route_projection_and_lookahead():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.synthetic.comfort import LIMITS, discomfort, quantities, smoother
+from drivax.synthetic.comfort import LIMITS, broken_limits, discomfort, quantities, smoother
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2), (7, 3, 1)])
@@ -49,3 +49,14 @@ def test_discomfort_names_what_is_too_much():
     assert discomfort(0.50 * step, np.full(91, 10.0)) == "lateral_mps2"
     assert discomfort(1.0 * step, np.full(91, 2.0)) == "yaw_rate_rps"
     assert discomfort(np.zeros(91), np.where(step < 4.0, 10.0, 12.5 - 3.0 * (step - 4.0))) != ""
+
+
+def test_all_broken_limits_are_named_in_order():
+    """Braking at 5 m/s2 from 50 m/s while turning at 1 rad/s: up to 50 m/s2 to the side, which fall by 5 m/s3."""
+    step = np.arange(91) * 0.1
+    assert broken_limits(np.zeros(91), np.full(91, 10.0)) == ()
+    assert broken_limits(1.0 * step, 50.0 - 5.0 * step) == (
+        "longitudinal_mps2",
+        "lateral_mps2",
+        "yaw_rate_rps",
+    )

@@ -76,6 +76,14 @@ def test_common_driving_must_not_brake_hard():
     assert drive(cast, TIMES, Staging(), 0, Runs(motion))[1] == "ego_brakes_hard"
 
 
+@pytest.mark.parametrize(("staging", "cause", "plans"), [(Staging(), "ego_hardly_moves", 0), (EVENT, "", 1)])
+def test_who_stands_all_the_time_is_planned_only_where_something_is_staged(staging, cause, plans):
+    cast, motion = scene(road(), 0.0)
+    runs = Runs(motion)
+    assert drive(cast, TIMES, staging, 0, runs)[1] == cause
+    assert len(runs.plans) == plans
+
+
 def test_others_who_react_are_planned_for_again():
     """The standing car rolls back by 8 m as soon as ego has a plan."""
     cast, motion = scene(road((1,)), 12.0, [user((85.0, 0.0))])

@@ -10,9 +10,11 @@ from drivax.scenario.schema import AgentKind
 from drivax.synthetic.cast import Scripted, Staging
 from drivax.synthetic.curves import Pose, straight
 from drivax.synthetic.lateral import around, change_onto, displaced, quintic_step
-from drivax.synthetic.obstacles import Boxes, extents
+from drivax.synthetic.obstacles import Boxes, Standing, extents
 from drivax.synthetic.paths import Sway, lane_path
 from drivax.synthetic.roads import Line, RoadKind, RoadNetwork
+from drivax.synthetic.scripted import boxes_at
+from drivax.synthetic.tables import PathTables
 
 from .oracles import box_corners, distance_to_polyline, shared_area
 from .traffic_scenes import drivers, road, run
@@ -100,6 +102,22 @@ def test_oncoming_traffic_is_let_pass_first():
     # They meet before the first one swings out.
     met = int(np.flatnonzero(motion.xy[0, :, 0] > motion.xy[1, :, 0])[0])
     assert motion.xy[0, met, 1] < 0.5
+
+
+@pytest.mark.parametrize(("x", "y", "meets"), [
+    (40.0, 0.0, True),
+    (40.0, 2.1, True),  # 2.1 - 0.95 m is nearer than 1.2 m
+    (40.0, 2.2, False),
+    (40.0, -2.2, False),
+    (70.0, 0.0, False),  # its rear is 67.7 - 22.0 m ahead of the front
+    (69.0, 0.0, True),
+    (20.0, 0.0, False),  # passed: its rear is more than half a metre behind the front
+])  # fmt: skip
+def test_what_stands_in_a_band_ahead_is_met(x, y, meets):
+    path = lane_path(street(), (0,), Sway())
+    tables = PathTables(street(), [path], drivers(1))
+    standing = Standing(boxes_at((parked(x, y, 1),), 0), tables, np.array([1.9]))
+    assert standing.meets(0, 22.0, 1.2, 45.0) == meets
 
 
 def test_cars_beside_the_lane_change_nothing():

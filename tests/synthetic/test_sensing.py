@@ -6,7 +6,8 @@ import shapely
 
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, noisy, visible
+from drivax.synthetic.faults import touching
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, visible
 
 SENSOR = SensorConfig()
 
@@ -160,3 +161,66 @@ def test_who_reverses_still_reverses():
         result.heading
     )
     assert along.max() <= 0.0
+
+
+class Extreme(np.random.Generator):
+    """Every error is as large as can be; only the signs are drawn."""
+
+    def __init__(self, seed):
+        super().__init__(np.random.PCG64(seed))
+
+    def normal(self, loc=0.0, scale=1.0, size=None):
+        return 1e6 * self.choice([-1.0, 1.0], size=(size[0], 1)) * np.ones(size)
+
+
+#: The longest vehicles of the world (buses), cars, and people.
+LARGEST = ((12.0, 2.55), (5.3, 2.05), (0.7, 0.7))
+
+
+@pytest.mark.parametrize(("length", "width"), LARGEST)
+def test_no_corner_moves_farther_than_the_bound(length, width):
+    """Against the corners of boxes with the largest errors, of all signs."""
+    plain = tracks(300)
+    plain.size[:] = (length, width, 1.5)
+    moved = noisy(plain, 0, Extreme(0), NoiseConfig())
+
+    def points(them):
+        box = [them.xy, np.cos(them.heading)[..., None], np.sin(them.heading)[..., None], them.size[..., :2]]
+        return corners(np.concatenate(box, axis=-1))[:, 3:]
+
+    shift = np.hypot(*np.moveaxis(points(moved) - points(plain), -1, 0)).max()
+    bound = farthest_m(NoiseConfig(), length, width)
+    assert 0.99 * bound < shift <= bound + 1e-4
+    assert farthest_m(NoiseConfig(level=2.0), length, width) == pytest.approx(2 * bound)
+    assert farthest_m(NoiseConfig(level=0.0), length, width) == 0.0
+
+
+@pytest.mark.parametrize(("length", "width"), LARGEST)
+def test_noise_never_pushes_anybody_into_an_ego_that_was_found_free(length, width):
+    """Whoever just passes the test for overlap with its skin is still clear of ego after the largest errors."""
+    rng = np.random.default_rng(5)
+    count = 100
+    bearing, heading = rng.uniform(-np.pi, np.pi, (2, count))
+    ego = np.array([0.0, 0.0, 1.0, 0.0, 4.6, 1.9])
+    way = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    near, far = np.zeros(count), np.full(count, 20.0)
+    one = np.ones((2, 1), bool)
+
+    def box(distance, k):
+        return np.array([*(distance * way[k]), np.cos(heading[k]), np.sin(heading[k]), length, width])
+
+    for k in range(count):
+        for _ in range(30):
+            middle = (near[k] + far[k]) / 2
+            touches = touching(np.stack([ego, box(middle, k)])[:, None], one, np.ones((2, 2), bool)).min() < 1
+            near[k], far[k] = (middle, far[k]) if touches else (near[k], middle)
+    plain = tracks(count + 1, 4)
+    plain.valid[:] = True
+    plain.xy[1:], plain.heading[1:] = (far[:, None] * way)[:, None], heading[:, None]
+    plain.velocity[:] = 10.0 * np.stack([np.cos(plain.heading), np.sin(plain.heading)], axis=-1)
+    room = shapely.Polygon(corners(ego))
+    for seed in range(8):
+        moved = noisy(plain, 0, Extreme(seed), NoiseConfig())
+        for k in range(count):
+            pose = (*moved.xy[k + 1, 0], np.cos(moved.heading[k + 1, 0]), np.sin(moved.heading[k + 1, 0]))
+            assert room.distance(shapely.Polygon(corners(np.array([*pose, length, width])))) > 0.0

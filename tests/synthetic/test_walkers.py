@@ -8,6 +8,7 @@ import pytest
 from drivax.synthetic.cast import Walker
 from drivax.synthetic.curves import Pose, straight
 from drivax.synthetic.drafting import Draft
+from drivax.synthetic.obstacles import Boxes
 from drivax.synthetic.roads import Control, Crossing, RoadNetwork
 from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.walkers import Walkers, placed_walkers
@@ -51,8 +52,9 @@ def play(network, walkers, cars=None, times=TIMES):
     out = []
     for t in range(len(times)):
         xy, heading, speed = cars(t) if cars else (np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-        size = np.tile(CAR, (len(xy), 1))
-        out.append(people.step(t, xy, heading, speed, size, np.ones(len(xy), bool), colours[t]))
+        vehicles = Boxes(xy, heading, speed, np.tile(CAR[:, :2], (len(xy), 1)))
+        seen, claims = people.step(t, vehicles, np.ones(len(xy), bool), colours[t])
+        out.append((seen.xy, seen.heading, seen.speed, claims))
     return [np.stack(column) for column in zip(*out, strict=True)]
 
 

@@ -123,12 +123,15 @@ def point_to_segment(
 
     All need at least one leading axis; the last one holds the coordinates (any number of them).
     """
-    along, to_point = b - a, point - a
-    square = np.einsum("...i,...i->...", along, along)
-    dot = np.einsum("...i,...i->...", to_point, along)
-    fraction = np.clip(dot / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
-    offset = to_point - fraction[..., None] * along
-    return np.sqrt(np.einsum("...i,...i->...", offset, offset)), fraction
+    # Coordinate by coordinate, which is faster.
+    axes = range(a.shape[-1])
+    along = [b[..., i] - a[..., i] for i in axes]
+    to_point = [point[..., i] - a[..., i] for i in axes]
+    square = sum(u * u for u in along)
+    dot = sum(w * u for w, u in zip(to_point, along, strict=True))
+    fraction = np.minimum(np.maximum(dot / np.where(square > 0.0, square, 1.0), 0.0), 1.0)
+    squared = sum((w - fraction * u) ** 2 for w, u in zip(to_point, along, strict=True))
+    return np.sqrt(squared), fraction
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:

@@ -115,8 +115,8 @@ def desired_speed(path: Array, there: Array, offsets: Array) -> Float[Array, ""]
     return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))
 
 
-def pursuit(me: Float[Array, " 6"], target: Float[Array, " 2"]) -> Float[Array, ""]:
-    """Curvature of the arc from a box to a point that is given relative to its centre; 0 where that lies behind.
+def pursuit(me: Float[Array, " pose"], target: Float[Array, " 2"]) -> Float[Array, ""]:
+    """Curvature of the arc from a pose or box to a point that is given relative to it; 0 where that lies behind.
 
     Pure pursuit (Coulter 1992): k = 2 y / L^2, with the point at (x, y) in the box's frame and L away.
     """

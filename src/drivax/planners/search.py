@@ -1,4 +1,4 @@
-"""A search over braking and steering: rolls a grid of manoeuvres out against others who go on as they went."""
+"""A search over braking and steering: drives a grid of manoeuvres against what others are expected to do."""
 
 from __future__ import annotations
 
@@ -10,44 +10,45 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, corners, overlap
 from drivax.planners.idm import STOP_SHORT_M, desired_speed, project, pursuit, stop_line_m
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
-from drivax.scenario.queries import LEVEL_M, OFFROAD_TOLERANCE_M, left_of_edges, route_ahead
+from drivax.planners.prediction import HORIZON, SAME_WAY, SLOW_MPS, STEP_S, Others, Trend, at
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
 from drivax.scenario.record import record, static
-from drivax.scenario.schema import DT_S, AgentKind
+from drivax.simulator.dynamics import GRIP_MPS2
 from drivax.simulator.idm import IdmParameters, idm_acceleration
-from drivax.simulator.types import Frame, Scene, SimState, Situation
+from drivax.simulator.types import SimState, Situation
 from drivax.tasks.actions import ActionSpace
 
 #: Lateral offsets from the route to go to, m, and accelerations that are not exceeded on the way, m/s2.
-_SHIFTS = (0.0, -1.2, 1.2, -3.4, 3.4)
-_CAPS = (2.0, 0.0, -1.0, -2.0, -3.5, -6.0)
+_SHIFTS = (0.0, -1.2, 1.2, -2.4, 2.4, -3.5, 3.5)
+_CAPS = (2.0, 0.0, -1.5, -3.0, -6.0)
 #: Points along the route and their spacing, m.
-_POINTS, _STEP_M = 41, 2.0
-#: How far ahead in time manoeuvres are rolled out, s, and in which steps.
-_HORIZON, _DT_S = 20, 0.2
-#: Others that are looked at: the nearest.
-_OTHERS = 24
+_POINTS, _STEP_M = 46, 2.0
+#: Lateral acceleration with which the car goes aside, m/s2.
+_ASIDE_MPS2 = 3.5
 #: Free space before and beside the car that is as good as none, and that is enough, m.
 _TIGHT_M, _FREE_M = (0.1, 0.1), (0.6, 0.5)
-#: An agent in the corridor is followed when it heads the same way within 45 degrees or is this slow, m/s.
-_SLOW_MPS = 1.0
-#: Steps over which trends are measured; how long others are expected to accelerate and to turn, s.
-_PAST, _ACCELERATES_S, _TURNS_S = 5, 1.0, 3.0
-_SAME_WAY = 0.7
-#: Prices: of a hit, more the sooner it comes, of one from behind, of leaving the road, of passing closely, per metre
-#: of way lost, per metre aside, per metre of shifting, per squared m/s2 of braking.
-_HIT, _SOONER, _REAR, _OFF, _CLOSE = 60.0, 100.0, 0.3, 50.0, 4.0
-_WAY, _ASIDE, _SHIFTING, _BRAKING = 0.2, 0.8, 0.2, 0.05
+#: Who shifts by more leaves the lane, m.
+_LANE_M = 2.0
+#: What has stood this long is no queue, s, unless something stands this near before it, or a red light, m.
+_STUCK_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
+#: Who is slower is in a queue, m/s.
+_QUEUE_MPS = 4.0
+#: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road,
+#: of driving outside the lanes that go one's way, of passing closely, per metre of way lost, per metre aside, per
+#: metre of shifting, of leaving the lane because of a queue, per squared m/s2 of braking.
+_HIT, _SOONER, _REAR, _MAYBE, _OFF, _ASTRAY, _CLOSE = 60.0, 100.0, 0.3, 40.0, 50.0, 30.0, 4.0
+_WAY, _ASIDE, _SHIFTING, _LEAVES, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
 
 
 @record
 class SearchPlanner:
-    """Chooses among 30 manoeuvres along the route; knows the present truth, and nothing of the future.
+    """Chooses among 35 manoeuvres along the route; knows the present truth, and nothing of the future.
 
     A manoeuvre is a lateral offset to go to and an acceleration that is not exceeded; below that, the car follows
-    what is ahead of it by IDM. Each is rolled out 4 s. It loses by hitting others, the sooner the more, by leaving
-    the road, by passing closely, by losing way and by braking. Others are expected to keep their speed and how fast
-    they turn, and their acceleration for another second; both are measured over the past half second.
+    what is ahead of it by IDM. Each is driven for 5 s with the dynamics and the steering law that the car really
+    has. It loses by hitting others, the sooner the more, by leaving the road and its lanes, by passing closely,
+    by losing way and by braking.
     """
 
     actions: ActionSpace = static(default=ActionSpace())
@@ -71,47 +72,46 @@ class SearchPlanner:
         key: Array,
     ) -> tuple[Float[Array, "2"], Any]:
         """The first step of the cheapest manoeuvre."""
-        scene = situation.scene
-        me = situation.surroundings.frame.box[scene.slot]
-        speed = scene.history[-1, 3]
+        scene, frame = situation.scene, situation.surroundings.frame
+        me, speed = frame.box[scene.slot], scene.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
         wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
         stop = stop_line_m(bank, situation, path, there, offsets)
-        trend = carry.updated(situation.surroundings.frame)
-        others = _Others.near(situation.surroundings.frame, scene.slot, me, trend)
-        beside = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
+        trend = carry.updated(frame)
+        others = Others.near(bank, scene, frame, trend, (path, there, offsets))
+        lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
+        stuck, queue = _ahead(path, there, offsets, others, me, stop)
 
         def line_costs(shift: Array) -> tuple[Array, Array, Array]:
-            line = _line(path, offsets, beside, shift, speed)
-            way, first = self._rolled(line, there, offsets, others, (me, speed, wanted, stop))
-            cost = jax.vmap(lambda at: _danger(line, offsets, at, me, others))(way)
-            off = _off_road(bank, situation, line, there, me) & (shift != 0.0)
-            cost += off * _OFF + _ASIDE * jnp.abs(shift) + _SHIFTING * jnp.abs(shift - beside)
-            cost += _BRAKING * jnp.minimum(first, 0.0) ** 2 - _WAY * way[:, -1]
+            line = _line(path, offsets, (lateral, shift), me, speed)
+            pose, way, first = self._driven(line, there, offsets, others, (me, speed, wanted, stop))
+            cost = jax.vmap(lambda driven: _danger(driven, me, others))(pose)
+            off, astray = _bad_ground(bank, situation, pose[0], (line, there), me)
+            astray_price = jnp.where(stuck, 0.1, 1.0) * _ASTRAY
+            cost += off * _OFF + (shift != 0.0) * astray * astray_price
+            cost += (jnp.abs(shift) > _LANE_M) * queue * _LEAVES
+            cost += _ASIDE * jnp.abs(shift) + _SHIFTING * jnp.abs(shift - lateral)
+            cost += _BRAKING * jnp.minimum(first[:, 0], 0.0) ** 2 - _WAY * way
             return cost, first, line
 
-        costs, accelerations, lines = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
-        best = jnp.argmin(costs)
-        row = best // len(_CAPS)
-        ahead_m = jnp.clip(0.7 * speed + 3.0, 4.0, 16.0)
-        left_m = jnp.maximum(bank.route_points[scene.index, 0] - 1 - scene.route_m, 0.0)
-        target = _at(lines[row], offsets, jnp.minimum(ahead_m, left_m))[:2] - me[:2]
-        action = self.actions.action(accelerations.ravel()[best], pursuit(me, target), me[4])
-        return jnp.clip(action, -1.0, 1.0), trend
+        costs, firsts, _ = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
+        best = firsts.reshape(-1, 2)[jnp.argmin(costs)]
+        return jnp.clip(self.actions.action(best[0], best[1], me[LENGTH]), -1.0, 1.0), trend
 
-    def _rolled(
-        self, line: Array, there: Array, offsets: Array, others: _Others, ego: tuple[Array, ...]
-    ) -> tuple[Float[Array, "C H"], Float[Array, " C"]]:
-        """Way along a line after each step under each cap, and the first acceleration."""
-        me, speed, wanted, stop = ego
+    def _driven(
+        self, line: Array, there: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
+    ) -> tuple[Float[Array, "C H 4"], Float[Array, " C"], Float[Array, "C 2"]]:
+        """Poses along a line under each cap, the way made, and the first acceleration and curvature."""
+        me, start, wanted, stop = ego
         rear, leader_speed = jax.vmap(lambda now: _corridor(line, there, offsets, others, now, me))(
             (others.box, others.speed)
         )
+        left_m = jnp.sum(there) * _STEP_M
 
-        def cap_rolled(cap: Array) -> tuple[Array, Array]:
-            def step(now: tuple[Array, Array], ahead: tuple[Array, Array]) -> Any:
-                way, v = now
+        def cap_driven(cap: Array) -> tuple[Array, Array, Array]:
+            def step(now: tuple[Array, ...], ahead: tuple[Array, Array]) -> Any:
+                pose, way, v = now
                 rear, leader = ahead
                 gaps = jnp.where(rear > way, rear - way, jnp.inf) - me[LENGTH] / 2
                 nearest = jnp.argmin(gaps)
@@ -120,200 +120,123 @@ class SearchPlanner:
                 gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
                 leader_v = jnp.where(line_gap < gaps[nearest], 0.0, leader[nearest])
                 a = jnp.minimum(idm_acceleration(v, wanted, gap, leader_v, self.parameters), cap)
-                slower = jnp.maximum(v + a * _DT_S, 0.0)
-                way = way + (v + slower) / 2 * _DT_S
-                return (way, slower), (way, a)
+                aim = jnp.minimum(way + jnp.clip(0.5 * v + 2.5, 3.0, 14.0), left_m)
+                k = pursuit(pose, at(line, offsets, aim)[:2] - pose[:2])
+                grip = jnp.minimum(GRIP_MPS2 / jnp.maximum(v * v, 1e-3), self.actions.steering)
+                k = jnp.clip(k, -grip, grip)
+                slower = jnp.maximum(v + a * STEP_S, 0.0)
+                moved = (v + slower) / 2 * STEP_S
+                pose = advanced(pose, k, moved)
+                return (pose, way + moved, slower), (pose, a, k)
 
-            _, (way, a) = jax.lax.scan(step, (jnp.zeros(()), speed), (rear, leader_speed))
-            return way, a[0]
+            _, (pose, a, k) = jax.lax.scan(step, (me[:4], jnp.zeros(()), start), (rear, leader_speed))
+            final = jnp.sum(jnp.sqrt(jnp.sum((pose[1:, :2] - pose[:-1, :2]) ** 2, -1)))
+            return pose, final, jnp.stack([a[0], k[0]])
 
-        return jax.vmap(cap_rolled)(jnp.asarray(_CAPS))
-
-
-@record
-class Trend:
-    """How everybody's motion changes, smoothed over about half a second.
-
-    Attributes:
-        direction: Cosine and sine of the heading one step ago.
-        speed: Speed then, m/s.
-        valid: Whether there was somebody.
-        turning: Yaw rate, rad/s.
-        acceleration: Along the heading, m/s2.
-    """
-
-    direction: Float[Array, "S 2"]
-    speed: Float[Array, " S"]
-    valid: Bool[Array, " S"]
-    turning: Float[Array, " S"]
-    acceleration: Float[Array, " S"]
-
-    @classmethod
-    def logged(cls, bank: ScenarioBank, scene: Scene) -> Trend:
-        """From the log's rows of the present step and of half a second ago; parked agents keep still."""
-        now = bank.agents[scene.index, scene.step]
-        before = bank.agents[scene.index, jnp.maximum(scene.step - _PAST, 0)]
-        known = (now[:, AGENT_VALID] > 0) & (before[:, AGENT_VALID] > 0) & (scene.step >= _PAST)
-        turn = _turn(before[:, AGENT_COS : AGENT_SIN + 1], now[:, AGENT_COS : AGENT_SIN + 1])
-        faster = _length(now[:, 5:7]) - _length(before[:, 5:7])
-        still = jnp.zeros(bank.parked.shape[1])
-
-        def whole(moving: Array) -> Array:
-            return jnp.concatenate([moving, still])
-
-        ahead = jnp.concatenate([now[:, AGENT_COS : AGENT_SIN + 1], bank.parked[scene.index, :, 2:4]])
-        return cls(
-            ahead,
-            whole(_length(now[:, 5:7])),
-            jnp.concatenate([now[:, AGENT_VALID] > 0, still > 1.0]),
-            whole(jnp.where(known, turn, 0.0) / (_PAST * DT_S)),
-            whole(jnp.where(known, faster, 0.0) / (_PAST * DT_S)),
-        )
-
-    def updated(self, frame: Frame) -> Trend:
-        """One step later."""
-        direction, speed = frame.box[:, COS : SIN + 1], _length(frame.velocity)
-        known = frame.valid & self.valid
-
-        def smoothed(old: Array, change: Array) -> Array:
-            return jnp.where(known, old + (change / DT_S - old) / _PAST, 0.0)
-
-        turning = smoothed(self.turning, _turn(self.direction, direction))
-        acceleration = smoothed(self.acceleration, speed - self.speed)
-        return Trend(direction, speed, frame.valid, turning, acceleration)
+        return jax.vmap(cap_driven)(jnp.asarray(_CAPS))
 
 
-def _turn(before: Float[Array, "S 2"], now: Float[Array, "S 2"]) -> Float[Array, " S"]:
-    """Angle from one direction to another, rad."""
-    cross = before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]
-    return jnp.arctan2(cross, jnp.sum(before * now, axis=-1))
+def advanced(pose: Float[Array, " 4"], curvature: Array, distance: Array) -> Float[Array, " 4"]:
+    """x, y, cos, sin after a distance at a curvature, along the mean heading, as the kinematic bicycle does it."""
 
+    def turned(cos: Array, sin: Array) -> Float[Array, " 2"]:
+        c, s = jnp.cos(curvature * distance / 2), jnp.sin(curvature * distance / 2)
+        return jnp.stack([cos * c - sin * s, sin * c + cos * s])
 
-@record
-class _Others:
-    """The nearest agents, rolled out: boxes and speeds at each time, who is there, who comes from behind."""
-
-    box: Float[Array, "H K 6"]
-    speed: Float[Array, "H K"]
-    valid: Bool[Array, " K"]
-    behind: Bool[Array, " K"]
-
-    @classmethod
-    def near(cls, frame: Frame, slot: Array, me: Float[Array, " 6"], trend: Trend) -> _Others:
-        """Those of ego's level."""
-        apart = frame.box[:, :2] - me[:2]
-        valid = frame.valid & (jnp.arange(frame.valid.shape[0]) != slot)
-        valid &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
-        # What comes nearer counts as nearer.
-        closing = jnp.sum(apart * frame.velocity, axis=-1) / jnp.maximum(_length(apart), 1.0)
-        rank = jnp.where(valid, _length(apart) + 2.0 * jnp.minimum(closing, 0.0), 1e6)
-        _, rows = jax.lax.top_k(-rank, min(_OTHERS, rank.shape[0]))
-        box = frame.box[rows]
-        ahead = apart[rows, 0] * me[COS] + apart[rows, 1] * me[SIN]
-        aside = apart[rows, 1] * me[COS] - apart[rows, 0] * me[SIN]
-        follows = box[:, COS] * me[COS] + box[:, SIN] * me[SIN] > _SAME_WAY
-        people = frame.kind[rows] == AgentKind.PEDESTRIAN
-        # People change their mind within a step.
-        box = box.at[:, LENGTH : WIDTH + 1].add(jnp.where(people, 0.4, 0.0)[:, None])
-        drives = ~people & (_length(frame.velocity[rows]) > 2.0 * _SLOW_MPS)
-        turning = jnp.where(drives, jnp.clip(trend.turning[rows], -0.8, 0.8), 0.0)
-        faster = jnp.where(people, 0.0, jnp.clip(trend.acceleration[rows], -8.0, 3.0))
-        boxes, speed = _rolled_out(box, frame.velocity[rows], turning, faster)
-        behind = follows & (ahead < -me[LENGTH] / 2) & (jnp.abs(aside) < me[WIDTH])
-        return cls(boxes, speed, valid[rows], behind)
-
-
-def _rolled_out(
-    box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], turning: Float[Array, " K"],
-    faster: Float[Array, " K"],
-) -> tuple[Float[Array, "H K 6"], Float[Array, "H K"]]:  # fmt: skip
-    """Boxes and speeds at each time: constant yaw rate, acceleration for a second, no reversing."""
-    times = _times()[:, None]
-    start = _length(velocity)
-    speed = jnp.maximum(start + faster * jnp.minimum(times, _ACCELERATES_S), 0.0)
-    angle = turning * jnp.minimum(times, _TURNS_S)
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-
-    def turned(vector: Array) -> Array:
-        x, y = vector[:, 0], vector[:, 1]
-        return jnp.stack([x * cos - y * sin, x * sin + y * cos], axis=-1)
-
-    course = turned(velocity / jnp.maximum(start, 1e-3)[:, None])
-    # Who stands and starts goes where it looks.
-    course = jnp.where((start > 0.1)[:, None], course, turned(box[:, COS : SIN + 1]))
-    xy = box[:, :2] + jnp.cumsum(speed[..., None] * course, axis=0) * _DT_S
-    size = jnp.broadcast_to(box[:, LENGTH:], (*speed.shape, 2))
-    return jnp.concatenate([xy, turned(box[:, COS : SIN + 1]), size], axis=-1), speed
-
-
-def _length(vector: Float[Array, "... 2"]) -> Float[Array, ...]:
-    return jnp.sqrt(jnp.sum(vector * vector, axis=-1))
-
-
-def _times() -> Float[Array, " H"]:
-    return (jnp.arange(_HORIZON) + 1.0) * _DT_S
+    mean = turned(pose[2], pose[3])
+    return jnp.concatenate([pose[:2] + distance * mean, turned(mean[0], mean[1])])
 
 
 def _line(
-    path: Float[Array, "P 7"], offsets: Float[Array, " P"], beside: Array, shift: Array, speed: Array
+    path: Float[Array, "P 7"],
+    offsets: Float[Array, " P"],
+    aside: tuple[Array, Array],
+    me: Array,
+    speed: Array,
 ) -> Float[Array, "P 7"]:
-    """The route, shifted: from where the car is beside it to an offset, smoothly within about 2.5 s."""
-    length = jnp.clip(2.5 * speed, 8.0, 30.0)
-    u = jnp.clip(offsets / length, 0.0, 1.0)
-    d = beside + (shift - beside) * u * u * (3.0 - 2.0 * u)
-    slope = (shift - beside) * 6.0 * u * (1.0 - u) / length
+    """The route, shifted: from where the car is beside it, the way it looks, to an offset.
+
+    A cubic whose largest lateral acceleration, 6 d / T^2 for a shift by d within T, is 3.5 m/s2.
+    """
+    beside, shift = aside
     cos, sin = path[:, 3], path[:, 4]
-    norm = jnp.sqrt(1.0 + slope * slope)
-    turned = jnp.stack([(cos - sin * slope) / norm, (sin + cos * slope) / norm], axis=-1)
+    forward, left = me[COS] * cos[0] + me[SIN] * sin[0], me[SIN] * cos[0] - me[COS] * sin[0]
+    slope = jnp.clip(left / jnp.maximum(forward, 0.3), -0.5, 0.5)
+    takes_s = jnp.clip(jnp.sqrt(6.0 * jnp.abs(shift - beside) / _ASIDE_MPS2), 1.0, 2.5)
+    length = jnp.clip(takes_s * speed, 6.0, 40.0)
+    u = jnp.clip(offsets / length, 0.0, 1.0)
+    d = beside + (shift - beside) * u * u * (3.0 - 2.0 * u) + slope * length * u * (1.0 - u) ** 2
+    slopes = (shift - beside) * 6.0 * u * (1.0 - u) / length + slope * (1.0 - u) * (1.0 - 3.0 * u)
+    norm = jnp.sqrt(1.0 + slopes * slopes)
+    turned = jnp.stack([(cos - sin * slopes) / norm, (sin + cos * slopes) / norm], axis=-1)
     xy = path[:, :2] + d[:, None] * jnp.stack([-sin, cos], axis=-1)
     return path.at[:, :2].set(xy).at[:, 3:5].set(turned)
 
 
-def _at(line: Float[Array, "P 7"], offsets: Float[Array, " P"], way: Array) -> Array:
-    """x, y, cos, sin at ways along a line."""
-    low = jnp.clip((way / _STEP_M).astype(jnp.int32), 0, _POINTS - 2)
-    part = jnp.clip(way / _STEP_M - low, 0.0, 1.0)[..., None]
-    row = line[low] * (1.0 - part) + line[low + 1] * part
-    return jnp.concatenate([row[..., :2], row[..., 3:5]], axis=-1)
-
-
 def _corridor(
-    line: Array, there: Array, offsets: Array, others: _Others, now: tuple[Array, Array], me: Array
+    line: Array, there: Array, offsets: Array, others: Others, now: tuple[Array, Array], me: Array
 ) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
     """Where on a line the rears of those are who drive along it at a time, infinite for all others; their speeds."""
     box, speed = now
     along, lateral, cos, sin = project(line, there, offsets, box[:, :2], box[:, COS : SIN + 1])
     half_length = (jnp.abs(cos) * box[:, LENGTH] + jnp.abs(sin) * box[:, WIDTH]) / 2
     half_width = (jnp.abs(sin) * box[:, LENGTH] + jnp.abs(cos) * box[:, WIDTH]) / 2
-    led = others.valid & ((cos > _SAME_WAY) | (speed < _SLOW_MPS)) & ~others.behind
+    led = others.valid & ((cos > SAME_WAY) | (speed < SLOW_MPS)) & ~others.behind
     led &= jnp.abs(lateral) < half_width + me[WIDTH] / 2 + _TIGHT_M[1] + 0.1
     return jnp.where(led, along - half_length, jnp.inf), speed * cos
 
 
-def _danger(line: Array, offsets: Array, way: Float[Array, " H"], me: Array, others: _Others) -> Array:
-    """Price of what a manoeuvre would hit or pass closely."""
-    pose = _at(line, offsets, way)
+def _ahead(
+    path: Array, there: Array, offsets: Array, others: Others, me: Array, stop: Array
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether what is next on the route stays where it is, so that it may be passed, and whether it is a queue."""
+    along, lateral, cos, sin = project(
+        path, there, offsets, others.box[0, :, :2], others.box[0, :, COS : SIN + 1]
+    )
+    half_width = (jnp.abs(sin) * others.box[0, :, LENGTH] + jnp.abs(cos) * others.box[0, :, WIDTH]) / 2
+    on = others.valid & (jnp.abs(lateral) < half_width + me[WIDTH] / 2 + 0.2) & (along > 0.0)
+    ways = jnp.where(on, along, jnp.inf)
+    first = jnp.argmin(ways)
+    queue = (on & others.vehicle & (ways > ways[first]) & (ways < ways[first] + _QUEUE_M)).any()
+    stands = (others.stood_s[first] >= _STUCK_S) | (
+        ~others.vehicle[first] & (others.speed[0, first] < SLOW_MPS)
+    )
+    stuck = stands & ~(queue & others.vehicle[first]) & (stop > _LIGHT_M) & jnp.isfinite(ways[first])
+    slow = on[first] & others.vehicle[first] & (others.speed[0, first] < _QUEUE_MPS)
+    return stuck, slow & ~stuck
 
-    def meets(margin: tuple[float, float]) -> Bool[Array, "H K"]:
-        size = jnp.broadcast_to(me[LENGTH:] + 2.0 * jnp.asarray(margin), (_HORIZON, 2))
-        return overlap(jnp.concatenate([pose, size], -1)[:, None], others.box) & others.valid
 
-    hit = meets(_TIGHT_M)
-    when = jnp.where(hit.any(axis=0), jnp.argmax(hit, axis=0), _HORIZON) / _HORIZON
-    price = jnp.where(when < 1.0, _HIT + _SOONER * (1.0 - when), 0.0)
+def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
+    """Price of what a manoeuvre would hit, might hit, or pass closely."""
+
+    def meets(boxes: Array, margin: tuple[float, float]) -> Bool[Array, "H K"]:
+        size = jnp.broadcast_to(me[LENGTH:] + 2.0 * jnp.asarray(margin), (HORIZON, 2))
+        return overlap(jnp.concatenate([pose, size], -1)[:, None], boxes) & others.valid
+
+    def sooner(hit: Bool[Array, "H K"]) -> Float[Array, " K"]:
+        return jnp.where(hit.any(axis=0), 1.0 - jnp.argmax(hit, axis=0) / HORIZON, 0.0)
+
+    early = sooner(meets(others.box, _TIGHT_M))
+    price = jnp.where(early > 0.0, _HIT + _SOONER * early, 0.0)
+    price = jnp.maximum(price, _MAYBE * sooner(meets(others.maybe, _FREE_M) & others.enters))
     worst = jnp.max(price * jnp.where(others.behind, _REAR, 1.0))
-    return worst + _CLOSE * jnp.mean((meets(_FREE_M) & ~others.behind).any(axis=1))
+    return worst + _CLOSE * jnp.mean((meets(others.box, _FREE_M) & ~others.behind).any(axis=1))
 
 
-def _off_road(bank: ScenarioBank, situation: Situation, line: Array, there: Array, me: Array) -> Array:
-    """Whether the car would be off the road somewhere on the first 30 m of a line."""
+def _bad_ground(
+    bank: ScenarioBank, situation: Situation, pose: Float[Array, "H 4"], line: tuple[Array, Array], me: Array
+) -> tuple[Array, Array]:
+    """Whether the car would leave the road within 3 s, and whether a line leads out of the lanes that go its way."""
     scene = situation.scene
     ground = scene.z - bank.agent_box[scene.index, scene.slot, 2] / 2
 
-    def beyond(row: Array) -> Array:
-        box = jnp.concatenate([row[:2], row[3:5], me[LENGTH:]])
+    def beyond(at: Array) -> Array:
+        box = jnp.concatenate([at, me[LENGTH:]])
         left, known = left_of_edges(bank, scene.index, box[:2], corners(box), ground)
         return (known & (left < -OFFROAD_TOLERANCE_M / 2)).any()
 
-    rows = slice(2, 16, 2)
-    return (jax.vmap(beyond)(line[rows]) & there[rows]).any()
+    def astray(row: Array) -> Array:
+        return around_lanes(bank, scene.index, row[:2], row[3:5], row[None, :2], scene.z).straddling
+
+    few = slice(4, 17, 4)
+    return jax.vmap(beyond)(pose[1:12:2]).any(), (jax.vmap(astray)(line[0][few]) & line[1][few]).any()

@@ -13,7 +13,7 @@ from drivax.geometry.angles import wrap
 from drivax.scenario.lane_paths import walk
 from drivax.scenario.lanes import LaneGraph, LaneSegments
 from drivax.scenario.recording import Tracks
-from drivax.scenario.schema import AgentKind
+from drivax.scenario.schema import AgentKind, among
 
 Array = np.ndarray[Any, Any]
 
@@ -209,7 +209,7 @@ def extend(
     direction = np.stack((np.cos(heading), np.sin(heading)), axis=-1)
     points = xyz[:, None, :2] + distance[:, None] * direction[:, None]
     lane, s, _ = on.nearest(xyz, heading, reach_m=3.0, turn_rad=np.deg2rad(45.0))
-    drives = np.isin(tracks.kind[rows], (AgentKind.VEHICLE, AgentKind.CYCLIST))
+    drives = among(tracks.kind[rows], (AgentKind.VEHICLE, AgentKind.CYCLIST))
     follows = np.flatnonzero((lane >= 0) & drives)
     if len(follows) == 0:
         return points

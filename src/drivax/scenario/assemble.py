@@ -36,6 +36,7 @@ from drivax.scenario.schema import (
     RoadKind,
     Scenario,
     SourceCounts,
+    among,
 )
 from drivax.scenario.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
 from drivax.scenario.sides import cell_sides
@@ -85,7 +86,7 @@ def count_source(recording: Recording) -> SourceCounts:
         steps=len(recording.timestamps_s),
         tracks=len(tracks.track_id),
         tracks_valid_now=int(tracks.valid[:, recording.current_step].sum()),
-        map_features={name: int(np.isin(kinds, group).sum()) for name, group in _COUNTED.items()},
+        map_features={name: int(among(kinds, group).sum()) for name, group in _COUNTED.items()},
         map_points=sum(len(feature.points) for feature in recording.features),
         lights=len({light.lane_id for light in recording.lights}),
     )
@@ -221,8 +222,8 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
     keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
     graph = select(whole, keep)
     polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
-    is_lane = np.isin(segments.kind, CAR_LANE_KINDS)
-    is_edge, is_ring = np.isin(segments.kind, EDGE_KINDS), roads.closed[np.isin(roads.kind, EDGE_KINDS)]
+    is_lane = among(segments.kind, CAR_LANE_KINDS)
+    is_edge, is_ring = among(segments.kind, EDGE_KINDS), roads.closed[among(roads.kind, EDGE_KINDS)]
     rings = len(is_ring) > 0 and bool(is_ring.all())
     stored_on = LaneSegments.of(segments, graph)
     parts = Parts(
@@ -303,7 +304,7 @@ def _kept_lanes(
     rows = np.flatnonzero(np.isin(graph.feature, near))
     far = np.full(graph.count, np.inf)
     np.minimum.at(far, graph.lines.row, path_distance(graph.lines.points[:, :2], path))
-    last = ~np.isin(graph.kind, CAR_LANE_KINDS)
+    last = ~among(graph.kind, CAR_LANE_KINDS)
     first = np.zeros(graph.count, dtype=bool)
     first[on_route] = True
     order = rows[np.lexsort((far[rows], last[rows], ~first[rows]))]
@@ -353,7 +354,7 @@ def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) 
         (Flag.CLOSED_EDGES, rings),
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
-        (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & np.isin(parts.graph.kind, _LIMITED_KINDS)).any()),
+        (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),
         (
             Flag.ELEVATION,
             np.ptp(parts.roads.lines.points[:, 2]) > FLAT_M if len(parts.roads.lines.points) else False,

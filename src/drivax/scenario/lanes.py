@@ -13,7 +13,7 @@ from drivax.errors import DataError
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import Polylines, point_to_segment
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind
+from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
 from drivax.scenario.segments import LONGEST_M, Segments, inside_box
 
 Array = np.ndarray[Any, Any]
@@ -331,7 +331,7 @@ class LaneSegments:
     @classmethod
     def of(cls, segments: Segments, graph: LaneGraph) -> LaneSegments:
         """Car-lane segments among ``segments``, keyed by the graph's dense indices."""
-        rows = np.flatnonzero(np.isin(segments.kind, CAR_LANE_KINDS))
+        rows = np.flatnonzero(among(segments.kind, CAR_LANE_KINDS))
         lane = lane_of_feature(graph, segments.feature[rows])
         rows, lane = rows[lane >= 0], lane[lane >= 0]
         kept = segments.take(rows)

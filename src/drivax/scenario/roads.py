@@ -13,7 +13,7 @@ from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import cut_counts
 from drivax.scenario.lanes import known_limit
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, RoadKind
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, RoadKind, among
 from drivax.scenario.segments import RoadLines, inside_box, path_distance
 
 Array = np.ndarray[Any, Any]
@@ -97,7 +97,7 @@ def road_rows(
 
 def _class_of(kind: Int[Array, " row"]) -> Int[Array, " row"]:
     """0 lane, 1 edge, 2 crosswalk."""
-    return np.where(np.isin(kind, LANE_KINDS), 0, np.where(np.isin(kind, EDGE_KINDS), 1, 2))
+    return np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
 
 
 def _chord(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float[Array, "row 2"]:

@@ -13,9 +13,11 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 SCHEMA_VERSION = 3
 
@@ -67,6 +69,20 @@ CAR_LANE_KINDS = LANE_KINDS[:3]
 LINE_KINDS = tuple(kind for kind in RoadKind if 5 <= kind <= 13)
 EDGE_KINDS = (RoadKind.EDGE_UNKNOWN, RoadKind.EDGE_BOUNDARY, RoadKind.EDGE_MEDIAN)
 POLYGON_KINDS = (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY)
+
+
+def among(kind: Int[np.ndarray, "*n"], group: tuple[int, ...]) -> Bool[np.ndarray, "*n"]:
+    """Which kinds (-1 or more) are in a group: ``np.isin``, but by a table, which is several times faster."""
+    table = _member(group)
+    return table[np.minimum(kind, len(table) - 1)]
+
+
+@cache
+def _member(group: tuple[int, ...]) -> Bool[np.ndarray, " kind"]:
+    """Whether each number is in a group; the last entry stands for all that are larger, and for -1."""
+    result = np.zeros(max(group) + 2, dtype=bool)
+    result[list(group)] = True
+    return result
 
 
 class LightState(enum.IntEnum):

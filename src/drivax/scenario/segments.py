@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.geometry.polylines import Polylines, arc_lengths, cut_counts, simplify
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, RoadKind
+from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, RoadKind, among
 
 Array = np.ndarray[Any, Any]
 
@@ -81,8 +81,8 @@ class Segments:
     @property
     def block(self) -> Int[Array, " segment"]:
         """Storage block: 0 road edge, 1 car lane, 2 the rest."""
-        is_edge = np.isin(self.kind, EDGE_KINDS)
-        return np.where(is_edge, 0, np.where(np.isin(self.kind, CAR_LANE_KINDS), 1, 2))
+        is_edge = among(self.kind, EDGE_KINDS)
+        return np.where(is_edge, 0, np.where(among(self.kind, CAR_LANE_KINDS), 1, 2))
 
 
 def road_lines(
@@ -103,7 +103,7 @@ def road_lines(
     breaks[whole.start[:-1]] = True
     if split_gap_m is not None and len(points):
         step = np.hypot(*np.diff(points[:, :2], axis=0, prepend=points[:1, :2]).T)
-        breaks |= (step > split_gap_m) & ~np.isin(kind, POLYGON_KINDS)[whole.row]
+        breaks |= (step > split_gap_m) & ~among(kind, POLYGON_KINDS)[whole.row]
     source = whole.row
     lines, keep = _long_enough(points, np.flatnonzero(breaks))
     row = source[keep][lines.start[:-1]]

@@ -21,7 +21,7 @@ from drivax.scenario.filling import Parts
 from drivax.scenario.lanes import END_SPAN_M, LaneGraph
 from drivax.scenario.recording import Recording
 from drivax.scenario.routes import STEP_M, Route
-from drivax.scenario.schema import DT_S, AgentKind, Flag
+from drivax.scenario.schema import DT_S, AgentKind, Flag, among
 
 Array = np.ndarray[Any, Any]
 
@@ -199,7 +199,7 @@ def density_of(tracks: LocalTracks, current_step: int) -> str:
 
 def _is_road_user(tracks: LocalTracks) -> Bool[Array, " track"]:
     """Vehicles, pedestrians and cyclists other than ego."""
-    users = np.isin(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
+    users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
     users[tracks.ego] = False
     return users
 
@@ -229,7 +229,7 @@ def _apart(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row t
 
 
 def _meets_vulnerable(tracks: LocalTracks) -> bool:
-    rows = np.flatnonzero(np.isin(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
+    rows = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
     return bool((_apart(tracks, rows) <= VULNERABLE_M).any())
 
 

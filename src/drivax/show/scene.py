@@ -46,17 +46,38 @@ def draw_scenario(scenario: Scenario, step: int, ego: Any = None, reach_m: float
     centre = logged if path is None or not np.isfinite(path[step]).all() else path[step, :2]
     figure = Figure(figsize=(7, 7), dpi=110, facecolor="white")
     axes = figure.add_axes((0, 0, 1, 1), facecolor=LIGHT["ground"])
-    x, y, around = float(centre[0]), float(centre[1]), reach_m + 5.0
+    draw_on(axes, scenario, step, (float(centre[0]), float(centre[1])), reach_m, path)
+    return figure
+
+
+def draw_on(
+    axes: Axes,
+    scenario: Scenario,
+    step: int,
+    centre: tuple[float, float],
+    reach_m: float,
+    path: Any = None,
+) -> None:
+    """Draw a square of a scenario at one step on given axes.
+
+    Args:
+        axes: Where to draw.
+        scenario: The scenario.
+        step: Step to draw.
+        centre: Middle of the square, metres, local frame.
+        reach_m: Half its side, metres.
+        path: Driven path ``[step, 4]`` to draw instead of the log's ego, or None.
+    """
+    (x, y), around = centre, reach_m + 5.0
     _draw_map(axes, scenario, (x - around, y - around, x + around, y + around))
     _draw_lights(axes, scenario, step)
     _draw_agents(axes, scenario, step)
     _draw_ego(axes, scenario, step, path)
-    axes.set(xlim=(centre[0] - reach_m, centre[0] + reach_m), ylim=(centre[1] - reach_m, centre[1] + reach_m))
+    axes.set(xlim=(x - reach_m, x + reach_m), ylim=(y - reach_m, y + reach_m))
     axes.set_aspect("equal")
     axes.set_axis_off()
     axes.add_patch(_rectangle(axes))
     _scale_bar(axes, reach_m)
-    return figure
 
 
 def _rectangle(axes: Axes) -> Any:

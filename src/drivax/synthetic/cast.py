@@ -171,5 +171,16 @@ class Motion:
 
     def since(self, step: int) -> Motion:
         """The same from a step on."""
+        return self._at(slice(step, None))
+
+    def until(self, step: int) -> Motion:
+        """The same before a step."""
+        return self._at(slice(step))
+
+    def every(self, stride: int) -> Motion:
+        """The same at every so-manieth step."""
+        return self._at(slice(None, None, stride))
+
+    def _at(self, steps: slice) -> Motion:
         timed = ("xy", "heading", "speed", "valid", "distance_m", "acceleration")
-        return replace(self, **{name: getattr(self, name)[:, step:] for name in timed})
+        return replace(self, **{name: getattr(self, name)[:, steps] for name in timed})

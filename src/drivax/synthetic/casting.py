@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
 
 from drivax.synthetic import expert
+from drivax.synthetic.aims import Aim, AimedWay, drawn_aimed_way, green_on_arrival, rearranged
 from drivax.synthetic.cast import Cast
 from drivax.synthetic.domains import Domain
 from drivax.synthetic.drivers import Drivers
+from drivax.synthetic.meetings import giving_way, met_on, with_feeders
 from drivax.synthetic.parking import parked_cars
 from drivax.synthetic.paths import Path, random_lanes
 from drivax.synthetic.population import drawn_drivers, driven_path, joined_drivers, placed
@@ -22,6 +25,10 @@ from drivax.synthetic.walkers import placed_walkers
 
 #: Shares of what the light does for ego: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]
+#: Ego begins at least this far along its way, m.
+_LEAST_M = 12.0
+#: Further ways that are drawn for ego in the hope that it has to give way.
+_WAYS = 4
 
 
 def draw_cast(
@@ -31,6 +38,8 @@ def draw_cast(
     lane_change_share: float,
     timing: SignalTiming,
     rng: np.random.Generator,
+    aims: Sequence[Aim] = (),
+    critical: bool = False,
 ) -> Cast:
     """Draws ego, its way and lights, then the others and theirs.
 
@@ -41,30 +50,33 @@ def draw_cast(
         lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
         timing: Shares of what the light does for ego.
         rng: Source of chance.
+        aims: Places of which ego should pass one unhindered; without any it begins and goes where it likes.
+        critical: Ego takes a way on which it has to give way to others if there is one, and these are many.
     """
-    start = network.starts[int(rng.integers(len(network.starts)))]
-    lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
     driver = expert.drawn_expert(rng)
-    path = expert.expert_path(network, lanes, change, rng)
-    if network.signals is not None:
-        ways = [lane for lane in lanes if network.lanes[lane].control == Control.SIGNAL]
-        if ways:
-            network = replace(network, signals=_timed(network.signals, ways[0], timing, rng))
-    # Ego begins so far back that the warm-up brings it to where the recording should begin.
-    cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
-    first = next(span for span in path.spans if span.lane == start.lane)
-    at = max(12.0, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + times_s[0] * cruise))
+    aimed = drawn_aimed_way(network, giving_way(network) if critical else aims, rng)
+    first_s = float(times_s[0])
+    way = _drawn_way(network, driver, first_s, lane_change_share, rng, aimed)
+    for _ in range(_WAYS if critical and aimed is None else 0):
+        if met_on(network, way.path):
+            break
+        way = _drawn_way(network, driver, first_s, lane_change_share, rng, None)
+    rivals = with_feeders(network, met_on(network, way.path)) if critical else frozenset()
+    path, lanes, at = way.path, way.lanes, way.at_m
+    network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
     here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
     density = domain.density
     parked = parked_cars(
         network, float(rng.uniform(*domain.parked_share)), domain.double_share, rng, len(times_s)
     )
-    others = placed(network, here.lane, at - here.begin_m, density, rng, parked)
+    others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
+    if aimed is not None:
+        others = rearranged(others, aimed, (here.lane, at - here.begin_m), rng)
     begin = [network.lanes[lane] for lane in others.lane]
     drivers = joined_drivers(driver, drawn_drivers(len(begin), density, rng, begin))
     paths = [path]
     for lane, cyclist in zip(others.lane, drivers.cyclist[1:], strict=True):
-        paths.append(driven_path(network, random_lanes(network, lane, rng), bool(cyclist), rng))
+        paths.append(driven_path(network, random_lanes(network, lane, rng, rivals), bool(cyclist), rng))
     distance = np.array([at, *others.along_m])
     return Cast(
         network=network,
@@ -76,6 +88,53 @@ def draw_cast(
         walkers=placed_walkers(network, float(rng.uniform(*domain.walkers)), rng, times_s),
         parked=parked,
     )
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Ego's lanes, its path along them, and where on it it begins."""
+
+    lanes: tuple[int, ...]
+    path: Path
+    at_m: float
+
+
+def _drawn_way(
+    network: RoadNetwork,
+    driver: Drivers,
+    first_s: float,
+    lane_change_share: float,
+    rng: np.random.Generator,
+    aimed: AimedWay | None,
+) -> _Way:
+    """Ego begins so far back that the warm-up brings it to where the recording should begin."""
+    if aimed is None:
+        start = network.starts[int(rng.integers(len(network.starts)))]
+        lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
+    else:
+        start, lanes, change = aimed.start, aimed.lanes, None
+    path = expert.expert_path(network, lanes, change, rng)
+    cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
+    first = next(span for span in path.spans if span.lane == start.lane)
+    at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
+    return _Way(lanes, path, at)
+
+
+def _lights(
+    network: RoadNetwork,
+    lanes: tuple[int, ...],
+    timing: SignalTiming,
+    aimed: AimedWay | None,
+    rng: np.random.Generator,
+) -> SignalPlan | None:
+    """The lights with their clock set for the first one on ego's way, or on its way past the place it is aimed at."""
+    plan, ahead = network.signals, lanes if aimed is None else lanes[aimed.place :]
+    lit = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
+    if plan is None or not lit:
+        return plan
+    if aimed is not None and aimed.alone:
+        return green_on_arrival(plan, lit[0])
+    return _timed(plan, lit[0], timing, rng)
 
 
 def _timed(

@@ -80,18 +80,22 @@ def _smoothed(
     return np.einsum("ij,j->i", weights, values) / DT_S**derivative
 
 
-def discomfort(
-    heading: Float64[np.ndarray, " time"], speed: Float64[np.ndarray, " time"], reserve: float = 0.0
-) -> str:
-    """The first quantity that exceeds its limits, or an empty string.
+def broken_limits(
+    heading: Float64[np.ndarray, " time"], speed: Float64[np.ndarray, " time"]
+) -> tuple[str, ...]:
+    """The quantities that exceed their limits, in the order of :data:`LIMITS`.
 
     Args:
         heading: Heading, rad.
         speed: Speed, m/s.
-        reserve: Share of each limit to stay away from it.
     """
-    for name, values in quantities(heading, speed).items():
-        low, high = LIMITS[name]
-        if values.min() < low * (1 - reserve) or values.max() > high * (1 - reserve):
-            return name
-    return ""
+    return tuple(
+        name
+        for name, values in quantities(heading, speed).items()
+        if values.min() < LIMITS[name][0] or values.max() > LIMITS[name][1]
+    )
+
+
+def discomfort(heading: Float64[np.ndarray, " time"], speed: Float64[np.ndarray, " time"]) -> str:
+    """The first of :func:`broken_limits`, or an empty string."""
+    return next(iter(broken_limits(heading, speed)), "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
@@ -50,11 +51,13 @@ class Curve:
     xy: Float64[np.ndarray, "point 2"]
     heading: Float64[np.ndarray, " point"]
 
-    @property
+    @cached_property
     def arc_m(self) -> Float64[np.ndarray, " point"]:
         """Distance along the chords from the first point to each point, m."""
-        steps = np.hypot(*np.diff(self.xy, axis=0).T)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        arc, steps = np.zeros(len(self.xy)), self.xy[1:] - self.xy[:-1]
+        np.cumsum(np.hypot(steps[:, 0], steps[:, 1]), out=arc[1:])
+        arc.flags.writeable = False
+        return arc
 
     @property
     def start(self) -> Pose:

@@ -15,7 +15,9 @@ from drivax.synthetic.roads import RoadNetwork
 from drivax.synthetic.tables import PathTables
 
 #: Drivers begin to look for a way around this far before a thing, m; they pass it with this room, m.
-_LOOK_M, _ROOM_M = 45.0, 0.55
+LOOK_M, _ROOM_M = 45.0, 0.55
+#: What comes so near to the side of a vehicle on its path is in its way, m.
+DETOUR_MARGIN_M = 0.3
 #: Nobody swings out further than this, m, nor more steeply than one metre in this many.
 _FURTHEST_M, _STEEPEST = 4.3, 2.2
 #: So far ahead a swerver takes up the lanes beside, m.
@@ -66,18 +68,18 @@ class Detours:
     def find(self, who: Swerver, standing: Boxes, moving: Boxes) -> tuple[Path, float] | None:
         """A path around what stands ahead, and where it is back on the old one (m); None where there is none."""
         path, half_width, half_length = who.path, who.size_m[1] / 2, who.size_m[0] / 2
-        near = standing.chosen(_close(standing, path, who.at_m, _LOOK_M + 40.0))
+        near = standing.chosen(_close(standing, path, who.at_m, LOOK_M + 40.0))
         seen, _ = extents(path, near)
         front = who.at_m + half_length
         blocks = (
-            (seen.right_m < half_width + 0.3)
-            & (seen.left_m > -half_width - 0.3)
+            (seen.right_m < half_width + DETOUR_MARGIN_M)
+            & (seen.left_m > -half_width - DETOUR_MARGIN_M)
             & (seen.near_m > front - 0.5)
         )
         if not blocks.any():
             return None
         first = float(seen.near_m[blocks].min())
-        if not 2.0 < first - front < _LOOK_M:
+        if not 2.0 < first - front < LOOK_M:
             return None
         last = first
         for k in np.argsort(seen.near_m, kind="stable"):

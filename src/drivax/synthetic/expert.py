@@ -19,8 +19,8 @@ from drivax.synthetic.roads import RoadNetwork
 #: Experts that brake harder than this are not shown, m/s2: comfort (-4.05) in common driving, the end of the
 #: common law's range where an event leaves no choice.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
-#: What no plan for ego can mend.
-_HOPELESS = ("ego_leaves_map", "other_runs_red", "others_collide")
+#: What no plan for ego can mend, and what a plan hardly ever mends unless something is staged.
+_HOPELESS, _STUCK = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
 
 #: Moves everyone: what is staged, and ego's plan.
 TrafficRun = Callable[[Staging, EgoPlan | None], Motion]
@@ -92,6 +92,7 @@ def drive(
     first_step: int,
     traffic_run: TrafficRun,
     aware_step: int = 0,
+    begun: Motion | None = None,
 ) -> tuple[Motion, str]:
     """Lets ego drive well: as the common driver if that is good enough, else as planned with knowledge of the others.
 
@@ -104,11 +105,14 @@ def drive(
         first_step: Where the recording begins; from here on ego may be planned.
         traffic_run: Moves everyone: :meth:`drivax.synthetic.traffic.Traffic.run`.
         aware_step: Ego does not act on what is staged before this step, if it can be mastered from then on.
+        begun: What ``traffic_run`` gives without a plan, where that is known.
 
     Returns:
         What everybody did, and why it must not be shown (empty: it is good).
     """
-    hardest = HARDEST_IN_EVENT_MPS2 if eventful(staging) else HARDEST_MPS2
+    hardest, hopeless = HARDEST_MPS2, (*_HOPELESS, _STUCK)
+    if eventful(staging):
+        hardest, hopeless = HARDEST_IN_EVENT_MPS2, _HOPELESS
 
     def judged(motion: Motion) -> Fault:
         return fault(cast, motion, times_s, first_step, staging, hardest)
@@ -116,9 +120,9 @@ def drive(
     def pleasant(motion: Motion) -> bool:
         return not discomfort(motion.heading[0, first_step:], motion.speed[0, first_step:])
 
-    motion = traffic_run(staging, None)
+    motion = begun or traffic_run(staging, None)
     found = judged(motion)
-    if (not found.cause and pleasant(motion)) or found.cause in _HOPELESS:
+    if (not found.cause and pleasant(motion)) or found.cause in hopeless:
         return motion, found.cause
     # What is safe but rough is kept, unless a plan does better.
     rough = None if found.cause else motion
@@ -130,7 +134,7 @@ def drive(
         minded |= set(found.users)
         if not found.cause and (rough is None or pleasant(motion)):
             return motion, ""
-        if found.cause in ("", *_HOPELESS):
+        if found.cause in ("", *hopeless):
             break
     return (motion, found.cause) if rough is None else (rough, "")
 

@@ -170,25 +170,26 @@ class LaneChanges:
         line = np.where(lane >= 0, chains.chain[lane], -1)
         line[~now.active] = -1
         place = chains.offset_m[lane] + along
-        options = [
-            self._weigh(now, who, side[own[who]], (own[who], along[who, 0]), (line, place))
-            for side in (chains.left, chains.right)
-        ]
-        return self._chosen(now, options)
+        # To the left first, then to the right: who has a lane there, and may or must go over to it.
+        target = np.concatenate([chains.left[own[who]], chains.right[own[who]]])
+        sides = np.flatnonzero(target >= 0)
+        who, target = who[sides % len(who)], target[sides]
+        options = self._possible(now, who, target, (own[who], along[who, 0]))
+        if not len(options.who):
+            return [], Helped(nobody, nobody, np.zeros(0))
+        return self._chosen(now, self._weighed(now, options, (line, place)))
 
-    def _weigh(
+    def _possible(
         self,
         now: Situation,
         who: Int64[np.ndarray, " k"],
         target: Int64[np.ndarray, " k"],
         here: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]],
-        lines: tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]],
     ) -> _Options:
-        """What changing to one side would bring."""
+        """Changes for which there is room on the lanes, and those that have to be made."""
         own, along = here
         chains = self.chains
-        there = target >= 0
-        chain = np.where(there, chains.chain[target], -2)
+        chain = chains.chain[target]
         at = chains.offset_m[target] + along / chains.lane_m[own] * chains.lane_m[target]
         here_chain = chains.chain[own]
         here_at = chains.offset_m[own] + along
@@ -196,95 +197,104 @@ class LaneChanges:
         speed = now.speed[who]
         must = chains.ends[here_chain] & (left < np.maximum(_LEAVE_M, _LEAVE_S * speed))
         length = np.maximum(_DURATION_S * speed, _SHORTEST_M)
-        length = np.where(must, np.clip(length, None, np.maximum(left - 2.0, 8.0)), length)
+        length = np.where(must, np.minimum(length, np.maximum(left - 2.0, 8.0)), length)
         rest = chains.length_m[chain] - at
-        possible = there & (rest > length + 3.0) & (~chains.ends[here_chain] | (left > length))
+        possible = (rest > length + 3.0) & (~chains.ends[here_chain] | (left > length))
         wish = possible & (speed > _LEAST_MPS) & (at > _AFTER_M) & (rest > length + _BEFORE_M)
         wish &= ~chains.exit[target] & ~chains.ends[chain]
         possible = np.where(must, possible & ~chains.ends[chain], wish)
-        ahead, ahead_gap, ahead_speed = new_lead = self._next(now, who, chain, at, lines, forward=True)
-        behind, behind_gap, _ = new = self._next(now, who, chain, at, lines, forward=False)
         limit = now.fastest[who] * chains.limit[target] / chains.limit[own]
-        mine = self._follow(who, speed, limit, ahead_gap, ahead_speed)
+        k = np.flatnonzero(possible | must)
+        return _Options(who[k], target[k], length[k], possible[k], must[k], limit[k], left[k],
+                        (chain[k], at[k]), (here_chain[k], here_at[k]))  # fmt: skip
+
+    def _weighed(
+        self,
+        now: Situation,
+        options: _Options,
+        lines: tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]],
+    ) -> _Weighed:
+        """What changing would bring."""
+        o, who, must = options, options.who, options.must
+        speed = now.speed[who]
+        new_lead, new = self._next(now, who, o.there, lines)
+        ahead, ahead_gap, ahead_speed = new_lead
+        behind, behind_gap, _ = new
+        mine = self._follow(who, speed, o.limit_mps, ahead_gap, ahead_speed)
         # The new follower follows the vehicle ahead today and this one then; with the old one it is the other way.
         new_then, new_today = self._followed(now, who, new, new_lead)
-        old_lead = self._next(now, who, here_chain, here_at, lines, forward=True)
-        old = self._next(now, who, here_chain, here_at, lines, forward=False)
+        old_lead, old = self._next(now, who, o.here, lines)
         old_today, old_then = self._followed(now, who, old, old_lead)
         others = new_then - new_today + old_then - old_today
         gain = mine - now.acceleration[who] + self._drivers.politeness[who] * others
-        urgency = np.where(must, 1.0 - np.clip(left / _LEAVE_M, 0.0, 1.0), 0.0)
+        urgency = np.where(must, 1.0 - np.clip(o.left_m / _LEAVE_M, 0.0, 1.0), 0.0)
         safe = _SAFE_MPS2 + urgency * (_URGENT_MPS2 - _SAFE_MPS2)
         follower_speed = np.where(behind >= 0, now.speed[np.maximum(behind, 0)], 0.0)
-        ok = possible & (new_then > -safe) & (mine > -safe)
+        ok = o.possible & (new_then > -safe) & (mine > -safe)
         ok &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
         ok &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
-        return _Options(who, target, length, ok & (must | (gain > _THRESHOLD_MPS2)), must & there, gain,
+        return _Weighed(o, ok & (must | (gain > _THRESHOLD_MPS2)), gain,
                         ahead, ahead_gap, behind, behind_gap)  # fmt: skip
 
     def _followed(self, now: Situation, who: Int64[np.ndarray, " k"], behind: _Next, ahead: _Next) -> _Pair:
         """Accelerations of followers who have a vehicle ahead of them, and the one ahead of that; 0 without any."""
         row, gap, _ = behind
         there, row = row >= 0, np.maximum(row, 0)
-        speed, fastest = now.speed[row], now.fastest[row]
-        near = self._follow(row, speed, fastest, gap, now.speed[who])
-        far = self._follow(row, speed, fastest, gap + 2 * self._half[who] + ahead[1], ahead[2])
-        return np.where(there, near, 0.0), np.where(there, far, 0.0)
+        gaps = np.stack([gap, gap + 2 * self._half[who] + ahead[1]])
+        then = self._follow(row, now.speed[row], now.fastest[row], gaps, np.stack([now.speed[who], ahead[2]]))
+        near, far = np.where(there, then, 0.0)
+        return near, far
 
     def _follow(
         self,
         rows: Int64[np.ndarray, " k"],
         speed: Float64[np.ndarray, " k"],
         wanted: Float64[np.ndarray, " k"],
-        gap: Float64[np.ndarray, " k"],
-        leader_speed: Float64[np.ndarray, " k"],
-    ) -> Float64[np.ndarray, " k"]:
+        gap: Float64[np.ndarray, "*k"],
+        leader_speed: Float64[np.ndarray, "*k"],
+    ) -> Float64[np.ndarray, "*k"]:
         return idm_acceleration(speed, wanted, gap, leader_speed, _rows(self._idm, rows))
 
     def _next(
         self,
         now: Situation,
         who: Int64[np.ndarray, " k"],
-        chain: Int64[np.ndarray, " k"],
-        at: Float64[np.ndarray, " k"],
+        where: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]],
         lines: tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]],
-        *,
-        forward: bool,
-    ) -> _Next:
-        """The nearest on a chain ahead of or behind a place."""
+    ) -> tuple[_Next, _Next]:
+        """The nearest on a chain ahead of a place, and the nearest behind it."""
         line, place = lines
-        sign = 1.0 if forward else -1.0
-        apart = sign * (place[None] - at[:, None, None])
-        seen = (line[None] == chain[:, None, None]) & (apart >= 0)
-        seen[np.arange(len(who)), who] = False
-        gap = np.where(seen, apart, np.inf).min(axis=2) - self._half
-        row = np.argmin(gap, axis=1)
-        nearest = gap[np.arange(len(who)), row]
-        speed = now.speed[row]
-        row = np.where(np.isfinite(nearest), row, -1)
-        if forward and len(self._thing_m):
-            apart = self._thing_m - at[:, None]
-            there = (self._thing_chain == chain[:, None]) & (apart > -3.0)
-            thing = np.where(there, apart, np.inf).min(axis=1) - 2.4
+        chain, at = where
+        pair = np.arange(len(who))
+        apart = place - at[:, None, None]
+        seen = line == chain[:, None, None]
+        seen[pair, who] = False
+        found = []
+        for distance in (apart, -apart):
+            gap = np.where(seen & (distance >= 0), distance, np.inf).min(axis=2) - self._half
+            row = gap.argmin(axis=1)
+            nearest = gap[pair, row]
+            found.append((np.where(np.isfinite(nearest), row, -1), nearest, now.speed[row]))
+        (row, nearest, speed), (back, behind, slower) = found
+        if len(self._thing_m):
+            ahead = self._thing_m - at[:, None]
+            there = (self._thing_chain == chain[:, None]) & (ahead > -3.0)
+            thing = np.where(there, ahead, np.inf).min(axis=1) - 2.4
             stands = thing < nearest
-            row, nearest, speed = (
-                np.where(stands, -1, row),
-                np.minimum(nearest, thing),
-                np.where(stands, 0.0, speed),
-            )
-        return row, nearest - self._half[who], speed
+            row, speed = np.where(stands, -1, row), np.where(stands, 0.0, speed)
+            nearest = np.minimum(nearest, thing)
+        return (row, nearest - self._half[who], speed), (back, behind - self._half[who], slower)
 
-    def _chosen(self, now: Situation, options: list[_Options]) -> tuple[list[Change], Helped]:
+    def _chosen(self, now: Situation, weighed: _Weighed) -> tuple[list[Change], Helped]:
         changes: list[Change] = []
         taken: list[tuple[int, float]] = []
+        o = weighed.options
         order = sorted(
-            (-float(o.gain[k]) - 100.0 * bool(o.must[k]), int(o.who[k]), side, k)
-            for side, o in enumerate(options)
-            for k in np.flatnonzero(o.ok)
+            (-float(weighed.gain[k]) - 100.0 * bool(o.must[k]), int(o.who[k]), k)
+            for k in np.flatnonzero(weighed.ok)
         )
         moved: set[int] = set()
-        for _, row, side, k in order:
-            o = options[side]
+        for _, row, k in order:
             chain = int(self.chains.chain[o.target[k]])
             # Two who go for the same gap in the same moment would meet in it.
             crowded = any(c == chain and abs(now.at_m[row] - at) < 40.0 for c, at in taken)
@@ -292,18 +302,39 @@ class LaneChanges:
                 moved.add(row)
                 taken.append((chain, float(now.at_m[row])))
                 changes.append(Change(row, int(o.target[k]), float(o.length_m[k])))
-        return changes, _helped(now, options, moved, self._half)
+        return changes, _helped(now, weighed, moved)
 
 
 @dataclass(frozen=True)
 class _Options:
-    """Changes to one side, one entry per candidate."""
+    """Changes that may or must be made, one entry per change: to the left first, each side in order of vehicles.
+
+    Attributes:
+        who, target: The vehicle and its new lane.
+        length_m: How long the change takes.
+        possible, must: Whether it may be made as far as the lanes go, and whether it has to.
+        limit_mps: The speed that the driver likes on the new lane.
+        left_m: What is left of the own chain of lanes.
+        there, here: Chain and place on the new and the own lane.
+    """
 
     who: Int64[np.ndarray, " k"]
     target: Int64[np.ndarray, " k"]
     length_m: Float64[np.ndarray, " k"]
-    ok: Bool[np.ndarray, " k"]
+    possible: Bool[np.ndarray, " k"]
     must: Bool[np.ndarray, " k"]
+    limit_mps: Float64[np.ndarray, " k"]
+    left_m: Float64[np.ndarray, " k"]
+    there: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]
+    here: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]
+
+
+@dataclass(frozen=True)
+class _Weighed:
+    """Options with what they bring, and the nearest ahead and behind on the new lane."""
+
+    options: _Options
+    ok: Bool[np.ndarray, " k"]
     gain: Float64[np.ndarray, " k"]
     ahead: Int64[np.ndarray, " k"]
     ahead_gap: Float64[np.ndarray, " k"]
@@ -311,20 +342,17 @@ class _Options:
     behind_gap: Float64[np.ndarray, " k"]
 
 
-def _helped(
-    now: Situation, options: list[_Options], moved: set[int], half: Float64[np.ndarray, " v"]
-) -> Helped:
+def _helped(now: Situation, weighed: _Weighed, moved: set[int]) -> Helped:
     """Pairs that adjust to each other because one of them must change and has not found room yet."""
     pairs: list[tuple[int, int, float]] = []
-    for o in options:
-        for k in np.flatnonzero(o.must):
-            row = int(o.who[k])
-            if row in moved:
-                continue
-            if o.ahead[k] >= 0 and int(o.ahead[k]) not in moved:
-                pairs.append((row, int(o.ahead[k]), float(o.ahead_gap[k])))
-            if o.behind[k] >= 0 and int(o.behind[k]) not in moved:
-                pairs.append((int(o.behind[k]), row, float(o.behind_gap[k])))
+    for k in np.flatnonzero(weighed.options.must):
+        row, ahead, behind = (int(who[k]) for who in (weighed.options.who, weighed.ahead, weighed.behind))
+        if row in moved:
+            continue
+        if ahead >= 0 and ahead not in moved:
+            pairs.append((row, ahead, float(weighed.ahead_gap[k])))
+        if behind >= 0 and behind not in moved:
+            pairs.append((behind, row, float(weighed.behind_gap[k])))
     behind = np.array([p[0] for p in pairs], int)
     ahead = np.array([p[1] for p in pairs], int)
     gap = np.array([p[2] for p in pairs]) - (now.at_m[ahead] - now.at_m[behind])

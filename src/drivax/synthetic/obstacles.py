@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -24,6 +25,8 @@ _NEAR_M = 25.0
 _WELL_S = 0.8
 #: Sideways motion is foreseen for this long, s.
 _FORESEEN_S = 0.7
+#: Boxes that are looked for together along a path.
+_TOGETHER = 256
 
 
 @dataclass(frozen=True)
@@ -39,12 +42,19 @@ class Boxes:
         """How many."""
         return len(self.speed)
 
+    @cached_property
+    def direction(self) -> tuple[Float64[np.ndarray, " thing"], Float64[np.ndarray, " thing"]]:
+        """Cosine and sine of the headings."""
+        return np.cos(self.heading), np.sin(self.heading)
+
     def chosen(self, which: np.ndarray) -> Boxes:
         """Some of them."""
         return Boxes(self.xy[which], self.heading[which], self.speed[which], self.size_m[which])
 
     def joined(self, other: Boxes) -> Boxes:
         """These and others."""
+        if not len(other):
+            return self
         return Boxes(
             np.concatenate([self.xy, other.xy]),
             np.concatenate([self.heading, other.heading]),
@@ -66,16 +76,34 @@ class Extents:
 def extents(path: Path, boxes: Boxes, within_m: float = 12.0) -> tuple[Extents, Int64[np.ndarray, " thing"]]:
     """Boxes near a path in its coordinates (straight over the length of a box), and which ones they are."""
     coarse = path.curve.xy[::8]
-    gap = np.sum((boxes.xy[:, None] - coarse) ** 2, axis=-1)
-    near = np.flatnonzero(gap.min(axis=1) < within_m**2) if len(boxes) else np.zeros(0, int)
-    rough = 8 * np.argmin(gap[near], axis=1) if len(near) else near
+    around = (boxes.xy > coarse.min(axis=0) - within_m) & (boxes.xy < coarse.max(axis=0) + within_m)
+    inside = np.flatnonzero(around[:, 0] & around[:, 1])
+    near, rough = np.zeros(0, int), np.zeros(0, int)
+    # So few at a time that the table of distances stays in the processor's cache.
+    for first in range(0, len(inside), _TOGETHER):
+        some = inside[first : first + _TOGETHER]
+        gap = _squared(boxes.xy[some, None], coarse)
+        best = gap.argmin(axis=1)
+        close = gap[np.arange(len(some)), best] < within_m**2
+        near, rough = np.append(near, some[close]), np.append(rough, 8 * best[close])
     window = np.clip(rough[:, None] + np.arange(-8, 9), 0, len(path.curve.xy) - 1)
-    fine = np.sum((boxes.xy[near, None] - path.curve.xy[window]) ** 2, axis=-1)
-    place = window[np.arange(len(near)), np.argmin(fine, axis=1)] if len(near) else near
+    fine = _squared(boxes.xy[near, None], path.curve.xy[window])
+    place = window[np.arange(len(near)), fine.argmin(axis=1)]
     at, aside, turned = _relative(boxes, near, path.curve.xy[place], path.curve.heading[place])
     length, width = _reach(boxes.size_m[near], turned)
     at = at + place * path.step_m
     return Extents(at - length, at + length, aside - width, aside + width), near
+
+
+def _squared(
+    a: Float64[np.ndarray, "*#batch 2"], b: Float64[np.ndarray, "*#batch 2"]
+) -> Float64[np.ndarray, "..."]:
+    """Squared distances."""
+    dx, dy = a[..., 0] - b[..., 0], a[..., 1] - b[..., 1]
+    dx *= dx
+    dy *= dy
+    dx += dy
+    return dx
 
 
 def _relative(
@@ -140,6 +168,13 @@ class Standing:
         """Everything near a vehicle's path."""
         return self._seen[row][0]
 
+    def meets(self, row: int, front_m: float, half_m: float, within_m: float) -> bool:
+        """Whether something stands so near ahead of a vehicle's front in a band of this half width."""
+        seen = self._seen[row][0]
+        block = (seen.right_m < half_m) & (seen.left_m > -half_m)
+        block &= (seen.near_m > front_m - 0.5) & (seen.near_m < front_m + within_m)
+        return bool(block.any())
+
     def gap(self, front_m: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
         """Distance from the front bumper to the next thing in the way (infinite: none)."""
         gap = self.near_m - front_m[:, None]
@@ -163,10 +198,8 @@ def in_the_way(
         others: What may be in the way beside vehicles: things in motion, those that stand for once too.
     """
     count, things = len(vehicles), vehicles.joined(others)
-    there = np.concatenate([active, np.ones(len(others), bool)])
-    margin = np.where(np.arange(len(things)) < count, _VEHICLES_M, _MARGIN_M)
     gap, speed = np.full(count, np.inf), np.zeros(count)
-    who, what = np.nonzero(_close(vehicles, things) & active[:, None] & there)
+    who, what = _close(vehicles, things, active)
     if not len(who):
         return gap, speed
     pose, place_m, apart2 = _nearest(tables, at_m, who, things.xy[what])
@@ -174,32 +207,56 @@ def in_the_way(
     at = at + place_m
     length, width = _reach(things.size_m[what], turned)
     # Vehicles keep out of each other's way by the rules: of one that turns, only the middle part counts.
-    width = np.where(what < count, np.minimum(width, _MIDDLE_M), width)
+    vehicle = what < count
+    width = np.where(vehicle, np.minimum(width, _MIDDLE_M), width)
     drift = things.speed[what] * np.sin(turned)
     soon = left + drift * _FORESEEN_S
-    half = vehicles.size_m[who, 1] / 2 + margin[what]
+    size = vehicles.size_m[who]
+    half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
     inside = (np.minimum(left, soon) - width < half) & (np.maximum(left, soon) + width > -half)
     # Beyond the last sample of the path, or beside the vehicle rather than ahead of it: not in the way.
-    inside &= (at > at_m[who] + 0.3 * vehicles.size_m[who, 0]) & (apart2 < 64.0)
-    room = at - length - at_m[who] - vehicles.size_m[who, 0] / 2
-    inside &= ~_gone(left, drift, half + width, room / np.maximum(vehicles.speed[who], 1.0))
-    room = np.where(inside, room, np.inf)
+    inside &= (at > at_m[who] + 0.3 * size[:, 0]) & (apart2 < 64.0)
+    k = inside.nonzero()[0]
+    if not len(k):
+        return gap, speed
+    who, what, left, drift = who[k], what[k], left[k], drift[k]
+    room = at[k] - length[k] - at_m[who] - size[k, 0] / 2
+    stays = ~_gone(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[who], 1.0))
+    # The nearest is entered last.
     order = np.argsort(-room, kind="stable")
+    order = order[stays[order]]
     gap[who[order]] = room[order]
-    speed[who[order]] = np.maximum(things.speed[what] * np.cos(turned), 0.0)[order]
-    return gap, np.where(np.isfinite(gap), speed, 0.0)
+    speed[who[order]] = np.maximum(things.speed[what] * np.cos(turned[k]), 0.0)[order]
+    return gap, speed
 
 
-def _close(vehicles: Boxes, things: Boxes) -> Bool[np.ndarray, "v thing"]:
-    """What is ahead of a vehicle and near enough to matter, roughly."""
-    delta = things.xy[None] - vehicles.xy[:, None]
-    cos, sin = np.cos(vehicles.heading)[:, None], np.sin(vehicles.heading)[:, None]
-    ahead, aside = delta[..., 0] * cos + delta[..., 1] * sin, delta[..., 1] * cos - delta[..., 0] * sin
+def _close(
+    vehicles: Boxes, things: Boxes, active: Bool[np.ndarray, " v"]
+) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+    """Pairs of a vehicle and what is ahead of it and near enough to matter, roughly; vehicles come first in things."""
+    count = len(vehicles)
+    dx, dy = things.xy[:, 0] - vehicles.xy[:, 0, None], things.xy[:, 1] - vehicles.xy[:, 1, None]
+    cos, sin = (part[:, None] for part in vehicles.direction)
+    ahead = dx * cos + dy * sin
+    dy *= cos
+    dx *= sin
+    dy -= dx
     # Within reach: what the vehicle could not stop for comfortably in time, and a little more; of vehicles, which
-    # follow each other and the rules, those that are near.
-    reach = np.minimum(_AHEAD_M, 12.0 + 2.5 * vehicles.speed)[:, None]
-    reach = np.where(np.arange(len(things)) < len(vehicles), np.minimum(reach, _NEAR_M), reach)
-    return (ahead > 0.5) & (ahead < reach) & (np.abs(aside) < np.minimum(_ASIDE_M, 3.0 + 0.5 * ahead))
+    # follow each other and the rules, those that are near. Who is not there sees nothing, and is not seen.
+    reach = np.where(active, np.minimum(_AHEAD_M, 12.0 + 2.5 * vehicles.speed), 0.0)[:, None]
+    near = ahead > 0.5
+    near[:, :count] &= ahead[:, :count] < np.minimum(reach, _NEAR_M)
+    near[:, :count] &= active
+    near[:, count:] &= ahead[:, count:] < reach
+    ahead *= 0.5
+    ahead += 3.0
+    near &= np.abs(dy, out=dy) < np.minimum(ahead, _ASIDE_M, out=ahead)
+    pairs = near.ravel().nonzero()[0]
+    return pairs // len(things), pairs % len(things)
+
+
+#: Where ahead of a vehicle its path is looked at, m.
+_LOOKS_M = np.arange(0.0, _AHEAD_M + 6.0, _EVERY_M)
 
 
 def _nearest(
@@ -209,15 +266,15 @@ def _nearest(
     xy: Float64[np.ndarray, "k 2"],
 ) -> tuple[Float64[np.ndarray, "k 4"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """The sample ahead on the path of a vehicle that is nearest to a point, where it is, and the squared distance."""
-    steps = np.arange(0.0, _AHEAD_M + 6.0, _EVERY_M)
-    users, inverse = np.unique(who, return_inverse=True)
-    place = np.rint((at_m[users, None] + steps) / tables.step_m[users, None]).astype(int)
-    place = np.minimum(place, tables.last[users, None])
-    points = tables.table[users[:, None], place][inverse]
-    apart = (points[..., 0] - xy[:, 0, None]) ** 2 + (points[..., 1] - xy[:, 1, None]) ** 2
-    nearest = np.argmin(apart, axis=1)
-    pair = np.arange(len(who))
-    return points[pair, nearest], place[inverse, nearest] * tables.step_m[who], apart[pair, nearest]
+    step = tables.step_m[who]
+    place = np.rint((at_m[who, None] + _LOOKS_M) / step[:, None]).astype(int)
+    place = np.minimum(place, tables.last[who, None])
+    flat = tables.table.reshape(-1, 4)
+    points = flat.take(place + (who * tables.table.shape[1])[:, None], axis=0)
+    dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
+    apart = dx * dx + dy * dy
+    pair = np.arange(len(who)), apart.argmin(axis=1)
+    return points[pair], place[pair] * step, apart[pair]
 
 
 def _gone(

@@ -90,11 +90,14 @@ def onward(network: RoadNetwork, lanes: list[int]) -> list[int]:
     ]
 
 
-def random_lanes(network: RoadNetwork, first: int, rng: np.random.Generator) -> tuple[int, ...]:
-    """A random way from a lane to the end of the map; where lanes fork each way is as likely."""
+def random_lanes(
+    network: RoadNetwork, first: int, rng: np.random.Generator, preferred: frozenset[int] = frozenset()
+) -> tuple[int, ...]:
+    """A random way from a lane to the end of the map; where lanes fork each way is as likely, preferred ones apart."""
     lanes = [first]
     while network.lanes[lanes[-1]].successors:
-        lanes.append(int(rng.choice(onward(network, lanes))))
+        ways = onward(network, lanes)
+        lanes.append(int(rng.choice([way for way in ways if way in preferred] or ways)))
     return tuple(lanes)
 
 
@@ -180,16 +183,18 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
     for span in spans:
         size = span.scale * network.lanes[span.lane].length_m
         # Samples beyond the last lane's end by rounding still belong to it.
-        inside = (at >= span.begin_m - 1e-6) & (at < span.begin_m + size - 1e-6)
-        inside |= (span is spans[-1]) & (at >= span.begin_m)
-        limit[inside] = np.minimum(limit[inside], network.lanes[span.lane].limit_mps)
-        inside &= (at >= span.from_m) & (at <= span.until_m)
-        along = np.maximum(at - span.begin_m, 0.0) / span.scale
-        for name, here in _sharing(network, span.lane, along):
-            chosen = np.flatnonzero(inside & here & (used < SLOTS))
-            lane[chosen, used[chosen]] = name
-            lane_m[chosen, used[chosen]] = along[chosen]
-            used[chosen] += 1
+        first, last = np.searchsorted(at, [span.begin_m - 1e-6, span.begin_m + size - 1e-6])
+        part = slice(int(first), len(at) if span is spans[-1] else int(last))
+        limit[part] = np.minimum(limit[part], network.lanes[span.lane].limit_mps)
+        here = at[part]
+        inside = (here >= span.from_m) & (here <= span.until_m)
+        along = np.maximum(here - span.begin_m, 0.0) / span.scale
+        for name, shared in _sharing(network, span.lane, along):
+            chosen = np.flatnonzero(inside & shared & (used[part] < SLOTS))
+            slot = used[part][chosen]
+            lane[part][chosen, slot] = name
+            lane_m[part][chosen, slot] = along[chosen]
+            used[part][chosen] += 1
     return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)
 
 
@@ -238,11 +243,11 @@ class Sway:
         """The curve that is really driven; its heading is its own tangent (to first order in the straying)."""
         if not self.amplitude_m:
             return curve
-        arc = curve.arc_m[:, None]
-        amplitude, wave = np.array(self.amplitude_m), np.array(self.wave_per_m)
-        angle = wave * arc + np.array(self.phase)
-        aside = np.sum(amplitude * np.sin(angle), axis=1)
-        slope = np.sum(amplitude * wave * np.cos(angle), axis=1)
+        aside, slope = np.zeros((2, len(curve.xy)))
+        for amplitude, wave, phase in zip(self.amplitude_m, self.wave_per_m, self.phase, strict=True):
+            angle = wave * curve.arc_m + phase
+            aside += amplitude * np.sin(angle)
+            slope += amplitude * wave * np.cos(angle)
         normal = np.stack([-np.sin(curve.heading), np.cos(curve.heading)], axis=-1)
         stretch = 1.0 - aside * np.gradient(curve.heading, np.maximum(curve.arc_m, 1e-9))
         return Curve(curve.xy + aside[:, None] * normal, curve.heading + np.arctan2(slope, stretch))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +77,7 @@ def placed(
     density: Density,
     rng: np.random.Generator,
     parked: tuple[Scripted, ...] = (),
+    busy: Collection[int] = (),
 ) -> Placement:
     """Draws where the others begin: nobody on a connector, and nobody too close to ego or to another.
 
@@ -87,6 +88,7 @@ def placed(
         density: How full the roads are.
         rng: Source of chance.
         parked: Who stands somewhere all the time: nobody begins in it or right behind it.
+        busy: Lanes that are as full as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
     found: list[tuple[int, float]] = []
@@ -100,7 +102,7 @@ def placed(
         least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
         taken = [along for where, along in found if where == index]
         taken += [ego_along_m] if index == ego_lane else []
-        mean = spacing * (_BUSY if index in network.busy else 1.0)
+        mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
         at = rng.uniform(6.0, 6.0 + mean)
         while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
             if all(abs(at - other) > least for other in taken):

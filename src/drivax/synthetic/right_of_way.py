@@ -51,6 +51,7 @@ class Moment:
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
         heedless: Who sees no line, light or right of way.
         promised: Number of connectors on the path that a vehicle will enter whatever others do (-1: it asks).
+        told: Whether anybody is heedless or has promised.
     """
 
     step: int
@@ -65,6 +66,7 @@ class Moment:
     leader_speed: Float64[np.ndarray, " v"]
     heedless: Bool[np.ndarray, " v"]
     promised: Int64[np.ndarray, " v"]
+    told: bool
 
 
 def conflict_zones(
@@ -106,6 +108,11 @@ def time_to_cover(
     return np.where(distance < ramp, early, late)
 
 
+def _number(mask: Bool[np.ndarray, "v k"]) -> Int64[np.ndarray, " v"]:
+    """How many of each row are true."""
+    return np.add.reduce(mask, axis=1, dtype=np.int64)
+
+
 class RightOfWay:
     """Grants connectors to drivers.
 
@@ -125,6 +132,7 @@ class RightOfWay:
         ]
         self._free = ~self._conflict.any(axis=1) & (self._control < _STOP)
         self._length = drivers.size_m[:, 0]
+        self._rows = np.arange(len(self._length))
         self.reset()
 
     def reset(self) -> None:
@@ -142,27 +150,27 @@ class RightOfWay:
 
     def lines(self, now: Moment, tables: PathTables) -> Float64[np.ndarray, " v"]:
         """Distance from the front bumper to the next line at which to stop (infinite: none)."""
-        rows = np.arange(len(now.front_m))
-        entered = np.sum(tables.way_begin < now.front_m[:, None], axis=1)
+        ways = tables.way.shape[1]
+        entered = _number(tables.way_begin < now.front_m[:, None])
         self._granted = np.maximum(self._granted, entered)
-        lights, halts = self._lights(now, tables)
-        self._granted = np.where(
-            halts >= 0, np.maximum(np.minimum(self._granted, halts), entered), self._granted
-        )
+        stop, halts = self._lights(now, tables)
+        self._granted = np.maximum(np.minimum(self._granted, halts), entered)
         ask = now.speed**2 / (2 * _ASK_MPS2) + _ASK_S * now.speed + _ASK_M
-        sure = np.sum(tables.way_begin < (now.front_m + ask)[:, None], axis=1)
-        self._granted = np.where(now.heedless, np.maximum(sure, entered), self._granted)
-        self._granted = np.where(now.promised >= 0, np.maximum(now.promised, entered), self._granted)
-        place = np.minimum(self._granted, tables.way.shape[1] - 1)
-        way, begin = tables.way[rows, place], tables.way_begin[rows, place]
-        distance = begin - now.front_m
-        told = now.heedless | (now.promised >= 0)
-        asks = (way >= 0) & (distance >= 0) & (distance <= ask) & now.active & ~told
-        asks &= ~((halts >= 0) & (halts <= place))
-        stop = lights.copy()
-        stop[told] = np.inf
-        self._denied[~asks] = False
-        who = np.flatnonzero(asks)
+        if now.told:
+            sure = _number(tables.way_begin < (now.front_m + ask)[:, None])
+            self._granted = np.where(now.heedless, np.maximum(sure, entered), self._granted)
+            self._granted = np.where(now.promised >= 0, np.maximum(now.promised, entered), self._granted)
+        place = np.minimum(self._granted, ways - 1)
+        flat = place + ways * self._rows
+        distance = tables.way_begin.ravel().take(flat) - now.front_m
+        # Where there is no connector ahead, it is infinitely far away.
+        asks = (distance >= 0) & (distance <= ask) & now.active & (halts > place)
+        if now.told:
+            told = now.heedless | (now.promised >= 0)
+            asks &= ~told
+            stop[told] = np.inf
+        self._denied &= asks
+        who = asks.nonzero()[0]
         if len(who):
             self._hear(now, tables, who, place, stop)
         return stop
@@ -170,21 +178,24 @@ class RightOfWay:
     def _lights(
         self, now: Moment, tables: PathTables
     ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
-        """Distance to the nearest line held by a light, and which connector on the path that is (-1: none)."""
-        if not now.colour.any():
-            return np.full(len(now.front_m), np.inf), np.full(len(now.front_m), -1)
-        begin, front = tables.way_begin, now.front_m[:, None]
-        distance = np.where((tables.way >= 0) & (front <= begin), begin - front, np.inf)
+        """Distance to the nearest line held by a light, and which connector it is (none: their number)."""
+        begin, count = tables.way_begin, tables.way.shape[1]
+        if not np.count_nonzero(now.colour):
+            return np.full(len(begin), np.inf), np.full(len(begin), count)
+        distance = begin - now.front_m[:, None]
+        distance[distance < 0.0] = np.inf
         speed = now.speed[:, None]
         needed = speed**2 / (2 * np.maximum(distance, 0.05))
-        colour, to_red = now.colour[tables.way], now.to_red[tables.way]
-        late = distance > speed * to_red
+        colour = now.colour.take(tables.way)
+        late = distance > speed * now.to_red.take(tables.way)
         yellow = (colour == _YELLOW) & (
             (needed <= self._drivers.yellow_mps2[:, None]) | (late & (needed <= 5.0))
         )
-        halt = (yellow | ((colour == _RED) & (needed <= 8.0))) & np.isfinite(distance)
-        first = np.where(halt.any(axis=1), np.argmax(halt, axis=1), -1)
-        return np.where(halt, distance, np.inf).min(axis=1), first
+        halt = (yellow | ((colour == _RED) & (needed <= 8.0))) & (distance < np.inf)
+        first = halt.argmax(axis=1)
+        flat = first + count * self._rows
+        held = halt.ravel().take(flat)
+        return np.where(held, distance.ravel().take(flat), np.inf), np.where(held, first, count)
 
     def _hear(
         self,

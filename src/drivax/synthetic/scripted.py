@@ -55,6 +55,7 @@ def everybody(
         paths: The vehicles' paths.
     """
     pose, speed, valid, at, acceleration = vehicles
+    steps = pose.shape[1]
     scripted = (*cast.parked, *staging.extras)
     kinds = [AgentKind.PEDESTRIAN] * len(cast.walkers) + [s.kind for s in scripted]
     sizes = [w.size_m for w in cast.walkers] + [s.size_m for s in scripted]
@@ -62,10 +63,10 @@ def everybody(
     return Motion(
         kind=np.concatenate([cast.drivers.kind, np.array(kinds, np.int8)]),
         size_m=np.concatenate([cast.drivers.size_m, np.array(sizes, float).reshape(-1, 3)]),
-        xy=np.concatenate([pose[..., :2], walked[..., :2], *(s.xy[None] for s in scripted)]),
-        heading=np.concatenate([pose[..., 2], walked[..., 2], *(s.heading[None] for s in scripted)]),
-        speed=np.concatenate([speed, walked[..., 3], *(s.speed[None] for s in scripted)]),
-        valid=np.concatenate([valid, there, *(s.valid[None] for s in scripted)]),
+        xy=np.concatenate([pose[..., :2], walked[..., :2], *(s.xy[None, :steps] for s in scripted)]),
+        heading=np.concatenate([pose[..., 2], walked[..., 2], *(s.heading[None, :steps] for s in scripted)]),
+        speed=np.concatenate([speed, walked[..., 3], *(s.speed[None, :steps] for s in scripted)]),
+        valid=np.concatenate([valid, there, *(s.valid[None, :steps] for s in scripted)]),
         distance_m=at,
         acceleration=acceleration,
         paths=paths,

@@ -126,15 +126,16 @@ class PathTables:
         place = position_m / self.step_m[rows]
         index = np.minimum(np.maximum(place.astype(int), 0), self.last[rows] - 1)
         share = np.minimum(np.maximum(place - index, 0.0), 1.0)[:, None]
-        low, high = self.table[rows, index], self.table[rows, index + 1]
-        return low + share * (high - low)
+        flat, index = self.table.reshape(-1, 4), index + rows * self.table.shape[1]
+        low = flat.take(index, axis=0)
+        return low + share * (flat.take(index + 1, axis=0) - low)
 
     def on(
         self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
     ) -> tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]:
         """The lanes taken up at positions on the paths (-1: no more), and where on them, m."""
-        index = np.minimum(
-            np.maximum(np.rint(position_m / self.step_m[rows]).astype(int), 0), self.last[rows]
-        )
-        along = self.lane_m[rows, index] + (position_m - index * self.step_m[rows])[:, None]
-        return self.lane[rows, index], along
+        step = self.step_m[rows]
+        index = np.minimum(np.maximum(np.rint(position_m / step).astype(int), 0), self.last[rows])
+        beyond, index = position_m - index * step, index + rows * self.lane.shape[1]
+        along = self.lane_m.reshape(-1, SLOTS).take(index, axis=0) + beyond[:, None]
+        return self.lane.reshape(-1, SLOTS).take(index, axis=0), along

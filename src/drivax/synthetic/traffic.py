@@ -8,15 +8,18 @@ few dozen array operations over vehicles, whatever their number. Who may enter a
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from drivax.scenario.schema import DT_S
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.cast import Cast, EgoPlan, Motion, Staging
-from drivax.synthetic.detours import Detours, swerver
+from drivax.synthetic.detours import DETOUR_MARGIN_M, LOOK_M, Detours, swerver
 from drivax.synthetic.lane_changes import HELP_MPS2, Change, Helped, LaneChanges, Situation
 from drivax.synthetic.lateral import change_onto, followed
+from drivax.synthetic.leaders import Leaders
 from drivax.synthetic.obstacles import Boxes, Standing, in_the_way
 from drivax.synthetic.paths import Path, Sway, lane_path, onward
 from drivax.synthetic.right_of_way import Moment, RightOfWay
@@ -28,13 +31,10 @@ from drivax.synthetic.walkers import Walkers
 _STOP_SHORT_M = 1.0
 #: Before a thing that stands in the lane they keep room to pass it, m; before a lane's end, to change.
 _KEEP_M, _END_M = 5.0, 10.0
-#: What a cyclist at a lane's side needs of half its width: half a bicycle, its place, and 1.5 m to a car.
-_PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
 #: A driver follows the speed profile with this reaction, s.
 _SPEED_TIME_S = 0.6
 #: Jerk beyond a driver's own is used when braking harder than this, m/s2.
-_EMERGENCY_MPS2 = 3.6
-_EMERGENCY_JERK = 25.0
+_EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
 #: Lane changes and ways around things are considered every so many steps.
 _DECIDE_EVERY = 5
 #: A driver stays in its lane for this long after a change, s.
@@ -47,6 +47,7 @@ _FIRMLY = 1.3
 _SLOWEST = 6
 #: A planned ego is expected at stop lines this far ahead of time, steps.
 _FORESEEN = 25
+_NOBODY = boxes_at((), 0)
 
 
 class Traffic:
@@ -69,6 +70,12 @@ class Traffic:
         if cast.network.signals is not None:
             self.colour, self.to_red = cast.network.signals.colours(times_s, shape[1])
 
+    def until(self, steps: int) -> Traffic:
+        """The same, ending earlier."""
+        shorter = copy.copy(self)
+        shorter.times_s = self.times_s[:steps]
+        return shorter
+
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
         """Moves everyone through all steps.
 
@@ -88,11 +95,12 @@ class _Run:
         self._network, self._drivers = cast.network, cast.drivers
         for told in staging.tailgates:
             self._drivers = self._drivers.with_headway(told.vehicle, told.headway_s)
-        self._half_m, self._width_m = cast.drivers.size_m[:, 0] / 2, cast.drivers.size_m[:, 1]
-        # Half the widest car that passes a cyclist at the side of a lane.
-        self._spare_m = np.array([lane.width_m for lane in self._network.lanes]) / 2 - _PASS_CYCLIST_M
+        self._size_m = cast.drivers.size_m[:, :2]
+        self._half_m, self._width_m = self._size_m[:, 0] / 2, self._size_m[:, 1]
         count = len(cast.paths)
         self._rows = np.arange(count)
+        self._twice = np.concatenate([self._rows, self._rows])
+        self._idm = self._drivers.idm
         self._tables = traffic.tables.copy()
         self._fixtures, self._movers = standing_and_moving(staging.extras)
         boxes = traffic.parked.joined(boxes_at(self._fixtures, 0))
@@ -114,10 +122,12 @@ class _Run:
         self._busy_m = np.full(count, -np.inf)  # until here on its path a vehicle is changing or passing
         self._rest = np.zeros(count, int)  # from this step on it may change again
         self._helped = Helped(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
-        self._gap, self._leader = np.full(count, np.inf), np.zeros(count, int)
+        self._leaders = Leaders(self._network, self._drivers)
+        # Of leaders, lines and things: the gaps to them, and how fast they are.
+        self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
+        self._heedless, self._promised = np.zeros(count, bool), np.full(count, -1)
         self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
-        self._pose = np.zeros((count, 3))
-        self._people = boxes_at((), 0)
+        self._people = self._vehicles = _NOBODY
 
     def finished(self) -> Motion:
         """Goes through all steps and collects what happened."""
@@ -130,14 +140,16 @@ class _Run:
             planned = self._put_ego(t)
             active = self._at + self._half_m < self._tables.last * self._tables.step_m
             active[0] |= planned
-            row = self._tables.at(self._at, self._rows)
-            self._pose, fastest = row[:, :3], row[:, 3]
+            soon = self._at + self._speed * _SPEED_TIME_S
+            row = self._tables.at(np.concatenate([self._at, soon]), self._twice)
+            here, fastest = row[:count, :3], row[:count, 3]
             if planned and self._ego is not None:
                 k = t - self._ego.first_step
-                self._pose[0] = (*self._ego.xy[k], self._ego.heading[k])
+                here[0] = (*self._ego.xy[k], self._ego.heading[k])
+            self._vehicles = Boxes(here[:, :2], here[:, 2], self._speed, self._size_m)
             self._walk(t, active, walked)
-            pose[:, t], speed[:, t], at[:, t], valid[:, t] = self._pose, self._speed, self._at, active
-            wanted = self._wanted(t, fastest, active)
+            pose[:, t], speed[:, t], at[:, t], valid[:, t] = here, self._speed, self._at, active
+            wanted = self._wanted(t, fastest, row[count:, 3], active)
             if t % _DECIDE_EVERY == 0:
                 self._decide(t, wanted, fastest, active)
             acceleration[:, t] = self._advance(self._acted(t, wanted), active)
@@ -173,47 +185,46 @@ class _Run:
         self, t: int, active: Bool[np.ndarray, " v"], walked: Float64[np.ndarray, "walker time 4"]
     ) -> None:
         """Moves the walkers and gathers everybody who moves as told."""
-        boxes = []
+        self._people = _NOBODY
         if self._walkers is not None:
-            xy, heading, speed, self._claims = self._walkers.step(
-                t, self._pose[:, :2], self._pose[:, 2], self._speed, self._drivers.size_m, active, self._fixed.colour[t]
-            )  # fmt: skip
-            walked[:, t] = np.column_stack([xy, heading, speed])
-            size = np.array([walker.size_m[:2] for walker in self._fixed.cast.walkers])
-            boxes.append(Boxes(xy, heading, speed, size))
+            people, self._claims = self._walkers.step(t, self._vehicles, active, self._fixed.colour[t])
+            walked[:, t, :2], walked[:, t, 2], walked[:, t, 3] = people.xy, people.heading, people.speed
+            self._people = people
         there = tuple(extra for extra in self._movers if extra.valid[t])
         if there:
-            boxes.append(boxes_at(there, t))
-        self._people = boxes[0] if boxes else self._people.chosen(np.zeros(len(self._people), bool))
-        for more in boxes[1:]:
-            self._people = self._people.joined(more)
-
-    def _vehicles(self) -> Boxes:
-        return Boxes(self._pose[:, :2], self._pose[:, 2], self._speed, self._drivers.size_m[:, :2])
+            self._people = self._people.joined(boxes_at(there, t))
 
     def _wanted(
-        self, t: int, fastest: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
+        self,
+        t: int,
+        fastest: Float64[np.ndarray, " v"],
+        ahead: Float64[np.ndarray, " v"],
+        active: Bool[np.ndarray, " v"],
     ) -> Float64[np.ndarray, " v"]:
-        """The acceleration that each driver would like: the least that leaders, lines, things and speed allow."""
-        gap, leader_speed = self._leaders(active)
-        vehicles = self._vehicles()
-        other_gap, other_speed = in_the_way(self._tables, vehicles, self._at, active, self._people)
-        stop_gap = self._stops(t, active, leader_speed)
+        """The acceleration that each driver would like: the least that leaders, lines, things and speed allow.
+
+        The fastest speed that each driver likes is given for here, and for where it will be a little later.
+        """
+        gaps, leads = self._gaps, self._leads
+        gaps[0], leader = self._leaders.ahead(self._tables, self._at, active)
+        leads[0] = self._speed[leader]
+        # Lines and things are looked at by turns; in between they come nearer as they did.
+        if t % 2 or t == 0:
+            gaps[1] = self._stops(t, active, leader)
+        else:
+            gaps[1] -= self._speed * DT_S
+        if t % 2 == 0:
+            gaps[2], leads[2] = in_the_way(self._tables, self._vehicles, self._at, active, self._people)
+        else:
+            gaps[2] += (leads[2] - self._speed) * DT_S
         # Speeds below zero are those of a told ego that reverses: to the law it stands.
-        speed = np.maximum(np.broadcast_to(self._speed, (3, len(self._speed))), 0.0)
-        following = idm_acceleration(
-            speed,
-            np.broadcast_to(fastest, speed.shape),
-            np.stack([gap, stop_gap, other_gap]),
-            np.maximum(np.stack([leader_speed, np.zeros_like(gap), other_speed]), 0.0),
-            self._drivers.idm,
-        )
+        speed = np.maximum(self._speed, 0.0)
+        following = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # What stands still is not braked for harder than it takes to stop there, and a little more.
-        needed = speed[1] ** 2 / (2 * np.maximum(stop_gap - (2.0 - _STOP_SHORT_M), 0.1))
-        following[1] = np.maximum(following[1], -_FIRMLY * needed - 0.5)
-        following = following.min(axis=0)
-        ahead = self._tables.at(self._at + self._speed * _SPEED_TIME_S, self._rows)[:, 3]
-        wanted = np.minimum(following, (ahead - self._speed) / _SPEED_TIME_S)
+        needed = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
+        lines = np.maximum(following[1], -_FIRMLY * needed - 0.5)
+        wanted = np.minimum(np.minimum(following[0], lines), following[2])
+        wanted = np.minimum(wanted, (ahead - self._speed) / _SPEED_TIME_S)
         return self._helping(wanted, fastest)
 
     def _helping(
@@ -231,38 +242,15 @@ class _Run:
             np.minimum.at(wanted, h.behind, helpful)
         return wanted
 
-    def _leaders(
-        self, active: Bool[np.ndarray, " v"]
-    ) -> tuple[Float64[np.ndarray, " v"], Float64[np.ndarray, " v"]]:
-        """Gap to the nearest vehicle ahead on the own lanes (infinite: none) and that vehicle's speed."""
-        p = self._tables
-        lane, along = p.on(self._at, self._rows)
-        lane = np.where(active[:, None], lane, -1)
-        # position[i, k]: where the k-th occupied (vehicle, lane) is on the path of vehicle i.
-        who, slot = np.nonzero(lane >= 0)
-        taken, along = lane[who, slot], along[who, slot]
-        position = p.begin[:, taken] + p.scale[:, taken] * along
-        own = self._at[:, None]
-        seen = (position > own) & (p.since[:, taken] <= own) & (own <= p.until[:, taken])
-        seen &= who != self._rows[:, None]
-        # Cyclists are overtaken within the lane where it is wide enough.
-        seen &= ~(self._drivers.cyclist[who] & (self._spare_m[taken] >= self._width_m[:, None] / 2))
-        gap = np.where(seen, position - self._half_m[who], np.inf) - own - self._half_m[:, None]
-        if not len(who):
-            return self._gap, np.zeros_like(self._gap)
-        nearest = np.argmin(gap, axis=1)
-        self._gap, self._leader = gap[self._rows, nearest], who[nearest]
-        return self._gap, self._speed[self._leader]
-
     def _stops(
-        self, t: int, active: Bool[np.ndarray, " v"], leader_speed: Float64[np.ndarray, " v"]
+        self, t: int, active: Bool[np.ndarray, " v"], leader: Int64[np.ndarray, " v"]
     ) -> Float64[np.ndarray, " v"]:
         """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
         p, front = self._tables, self._at + self._half_m
-        heedless = np.zeros(len(front), bool)
+        heedless, promised = self._heedless, self._promised
+        heedless[:] = False
         for told in self._staging.heedless:
             heedless[told.vehicle] |= told.first_step <= t <= told.last_step
-        promised = np.full(len(front), -1)
         if self._ego is not None and t >= self._ego.first_step:
             then = min(t - self._ego.first_step + _FORESEEN, len(self._plan_at) - 1)
             promised[0] = np.sum(p.way_begin[0] < self._plan_at[then] + self._half_m[0])
@@ -274,18 +262,21 @@ class _Run:
             rear_m=self._at - self._half_m,
             speed=self._speed,
             active=active,
-            room_m=self._gap,
-            leader=self._leader,
-            leader_speed=leader_speed,
+            room_m=self._gaps[0],
+            leader=leader,
+            leader_speed=self._leads[0],
             heedless=heedless,
             promised=promised,
+            told=bool(promised[0] >= 0 or self._staging.heedless),
         )
         # Drivers stop closer to a line than to a bumper.
         room = self._right_of_way.lines(now, p) + 2.0 - _STOP_SHORT_M
-        if self._claims.any():
+        if np.count_nonzero(self._claims):
             room = np.minimum(room, self._crossings(front, heedless) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
-        return np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
+        if len(self._standing.boxes):
+            room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
+        return room
 
     def _crossings(
         self, front: Float64[np.ndarray, " v"], heedless: Bool[np.ndarray, " v"]
@@ -380,21 +371,30 @@ class _Run:
         stuck = np.zeros(len(self._rows), bool)
         for told in self._staging.overrides:
             stuck[told.vehicle] |= told.first_step <= t <= told.last_step and self._speed[told.vehicle] < 0.05
-        vehicles = self._vehicles()
-        standing = self._standing.boxes.joined(vehicles.chosen(stuck))
-        gap = self._standing.gap(self._at + self._half_m)
-        if stuck.any() or len(halted):
+        anybody = bool(stuck.any())
+        standing = self._standing.boxes
+        if anybody or len(halted):
             near = calm & (self._speed < 3.0)
-            standing = standing.joined(halted.chosen(halted.size_m[:, 0] > 1.2))
+            big = halted.chosen(halted.size_m[:, 0] > 1.2)
+            anybody |= len(big) > 0
+            standing = standing.joined(self._vehicles.chosen(stuck)).joined(big)
         else:
-            near = calm & (gap < 45.0)
-        for row in np.flatnonzero(near & (self._speed < 9.0)):
-            others = vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
-            moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
-            size = (float(2 * self._half_m[row]), float(self._width_m[row]))
-            who = swerver(self._network, self._tables, int(row), (self._at[row], self._speed[row]), size)
-            found = self._fixed.detours.find(who, standing, moving)
-            if found is not None:
-                path, end = found
-                self._swap(int(row), path, float(self._at[row]))
-                self._busy_m[row], self._rest[row] = end, t + round(_REST_S / DT_S)
+            near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
+        if not len(standing):
+            return
+        for row in np.flatnonzero(near & (self._speed < 9.0)).tolist():
+            front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
+            if anybody or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
+                self._pass_by(t, row, standing, stuck)
+
+    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: Bool[np.ndarray, " v"]) -> None:
+        """A way around what stands ahead of a vehicle, if there is one."""
+        others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
+        moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
+        size = (float(2 * self._half_m[row]), float(self._width_m[row]))
+        who = swerver(self._network, self._tables, row, (self._at[row], self._speed[row]), size)
+        found = self._fixed.detours.find(who, standing, moving)
+        if found is not None:
+            path, end = found
+            self._swap(row, path, float(self._at[row]))
+            self._busy_m[row], self._rest[row] = end, t + round(_REST_S / DT_S)

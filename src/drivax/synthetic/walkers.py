@@ -13,6 +13,7 @@ from drivax.geometry.boxes import overlap
 from drivax.scenario.schema import DT_S
 from drivax.synthetic.cast import Walker
 from drivax.synthetic.curves import STEP_M, Curve, resampled
+from drivax.synthetic.obstacles import Boxes
 from drivax.synthetic.roads import Control, Crossing, RoadNetwork
 from drivax.synthetic.signals import Colour
 
@@ -30,6 +31,8 @@ _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
 _BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
 #: People keep this distance from the side of a vehicle, m.
 _BERTH_M = 0.4
+#: They look at vehicles every so many steps.
+_LOOK_STEPS = 2
 #: Lanes that begin or end so near to a crossing have the lights of their neighbours, m.
 _NEAR_JUNCTION_M = 25.0
 
@@ -122,93 +125,79 @@ class Walkers:
         ways = [resampled(walker.way, STEP_M) for walker in walkers]
         self._last = np.array([len(way.xy) - 1 for way in ways], int)
         self._table = np.zeros((len(ways), max([*self._last, 0]) + 1, 3))
+        self._begin = np.arange(len(ways)) * self._table.shape[1]
         for row, way in zip(self._table, ways, strict=True):
             row[: len(way.xy)] = np.column_stack([way.xy, way.heading])
             row[len(way.xy) :] = row[len(way.xy) - 1]
         self._step_m = np.array([float(way.arc_m[-1]) / (len(way.xy) - 1) for way in ways])
         self._at = np.array([walker.start_m for walker in walkers], float)
         self._wanted = np.array([walker.speed_mps for walker in walkers], float)
+        self._size_m = np.array([walker.size_m[:2] for walker in walkers], float).reshape(-1, 2)
         self._speed = self._wanted.copy()
         self._crossing = np.array([walker.crossing for walker in walkers], int)
         self._kerb = np.array([walker.kerb_m for walker in walkers], float)
         self._across = np.array([walker.across_m for walker in walkers], float)
-        self._released = np.zeros(len(ways), bool)
+        self._crosses = self._crossing >= 0
+        self._any_crosses = bool(self._crosses.any())
+        # At lights and where nobody has to yield only those count who are on their way over.
+        asking = self._meet.marked & ~self._meet.red.any(axis=1)
+        self._asking = asking[self._crossing] if len(asking) else np.zeros(len(ways), bool)
+        self._released, self._into = np.zeros((2, len(ways)), bool)
 
     def step(
         self,
         t: int,
-        vehicles_xy: Float64[np.ndarray, "v 2"],
-        vehicles_heading: Float64[np.ndarray, " v"],
-        vehicles_speed: Float64[np.ndarray, " v"],
-        vehicles_size: Float64[np.ndarray, "v 3"],
-        vehicles_active: Bool[np.ndarray, " v"],
+        vehicles: Boxes,
+        active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
-    ) -> tuple[
-        Float64[np.ndarray, "w 2"],
-        Float64[np.ndarray, " w"],
-        Float64[np.ndarray, " w"],
-        Bool[np.ndarray, " crossing"],
-    ]:
+    ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
         """Tells where everybody is at step ``t``, and moves them on to the next one.
 
         Args:
             t: The step; steps come in order.
-            vehicles_xy: Everybody to be careful of.
-            vehicles_heading: Their headings.
-            vehicles_speed: Their speeds.
-            vehicles_size: Their lengths, widths, heights.
-            vehicles_active: Which of them are there.
+            vehicles: Everybody to be careful of.
+            active: Which of them are there.
             colour_row: What every lane's light shows now.
 
         Returns:
-            Position, heading and speed of every walker, and which crossings drivers have to leave free: somebody is
-            on it or, where drivers must yield, about to step on it.
+            The walkers, and which crossings drivers have to leave free: somebody is on it or, where drivers must
+            yield, about to step on it.
         """
-        place = np.clip(self._at / self._step_m, 0.0, self._last)
+        place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(place.astype(int), self._last - 1)
-        rows = np.arange(len(place))
-        low, high = self._table[rows, index], self._table[rows, index + 1]
-        pose = low + (place - index)[:, None] * (high - low)
-        boxes = np.column_stack(
-            [
-                vehicles_xy,
-                np.cos(vehicles_heading),
-                np.sin(vehicles_heading),
-                vehicles_size[:, :2],
-            ]
-        )[vehicles_active]
-        speed = vehicles_speed[vehicles_active]
-        self._release(t, boxes, speed, colour_row)
-        claims = self._claims()
-        now = self._speed.copy()
-        self._advance(pose, boxes)
-        return pose[:, :2], wrap(pose[:, 2]), now, claims
+        flat, rows = self._table.reshape(-1, 3), index + self._begin
+        low = flat.take(rows, axis=0)
+        pose = low + (place - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
+        claims = np.zeros(len(self._meet.marked), bool)
+        if t % _LOOK_STEPS == 0:
+            self._into = _walks_into(pose, vehicles, active)
+            self._release(t, vehicles, active, colour_row)
+        if self._any_crosses:
+            self._claim(claims)
+        result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
+        self._advance()
+        return result, claims
 
-    def _claims(self) -> Bool[np.ndarray, " crossing"]:
-        meet = self._meet
-        signalled = np.asarray(meet.red.any(axis=1))
-        claims = np.zeros(len(meet.marked), bool)
-        some = (self._crossing >= 0) & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
-        on = self._released | (self._at > self._kerb)
-        # At lights and where nobody has to yield only those count who are on their way over.
-        asking = meet.marked[self._crossing] & ~signalled[self._crossing] if len(claims) else some
-        claims[self._crossing[some & (on | asking)]] = True
-        return claims
+    def _claim(self, claims: Bool[np.ndarray, " crossing"]) -> None:
+        some = self._crosses & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
+        some &= self._released | self._asking | (self._at > self._kerb)
+        claims[self._crossing[some]] = True
 
     def _release(
         self,
         t: int,
-        boxes: Float64[np.ndarray, "v 6"],
-        speed: Float64[np.ndarray, " v"],
+        vehicles: Boxes,
+        active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
     ) -> None:
         """Lets those go who are at the kerb of a crossing that is safe for as long as they need."""
         before = self._kerb - self._at
-        asks = (self._crossing >= 0) & ~self._released & (before >= 0) & (before < _LOOK_M)
-        if not asks.any():
+        asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
+        if not np.count_nonzero(asks):
             return
         meet, crossing = self._meet, self._crossing[asks]
-        any_s, hard_s = _arrivals(meet, boxes, speed)
+        boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
+        any_s, hard_s = _arrivals(meet, boxes, vehicles.speed[active])
         # Who stands first has to gain speed, which takes v / (2 a) longer.
         start_s = self._wanted / (2 * _ACCELERATION_MPS2)
         needed = ((self._across - self._at) / self._wanted + start_s)[asks]
@@ -224,22 +213,20 @@ class Walkers:
         lasting = self._red_left_s[t, crossing] >= needed
         self._released[asks] = gap & free[crossing] & red[crossing] & lasting
 
-    def _advance(self, pose: Float64[np.ndarray, "w 3"], boxes: Float64[np.ndarray, "v 6"]) -> None:
+    def _advance(self) -> None:
         """One step on; who is not released stops at the kerb, and nobody walks into a vehicle."""
-        room = np.where(
-            (self._crossing >= 0) & ~self._released & (self._at <= self._kerb),
-            self._kerb - _WAIT_M - self._at,
-            math.inf,
-        )
-        room = np.minimum(np.maximum(room, 0.0), self._last * self._step_m - self._at)
+        room = self._last * self._step_m - self._at
+        if self._any_crosses:
+            waits = self._crosses & ~self._released & (self._at <= self._kerb)
+            kerb = np.where(waits, self._kerb - _WAIT_M - self._at, math.inf)
+            room = np.minimum(np.maximum(kerb, 0.0), room)
         # v^2 / (2 a) is the way to stop; a step ahead, so that the end is not passed.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
         after = np.minimum(self._wanted, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
-        ahead = pose[:, :2] + 0.6 * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
-        into = _within(ahead, boxes, _BERTH_M) & ~_within(pose[:, :2], boxes, _BERTH_M)
-        after = np.where(into, 0.0, np.maximum(after, 0.0))
+        after = np.maximum(after, 0.0)
         moved = np.minimum((self._speed + after) / 2 * DT_S, np.maximum(room, 0.0))
-        self._at = self._at + np.where(into, 0.0, moved)
+        after[self._into], moved[self._into] = 0.0, 0.0
+        self._at = self._at + moved
         self._speed = after
 
 
@@ -283,15 +270,33 @@ def _arrivals(
     return any_s, hard_s
 
 
-def _within(
-    points: Float64[np.ndarray, "w 2"], boxes: Float64[np.ndarray, "v 6"], margin_m: float
+def _walks_into(
+    pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, " w"]:
-    """Which points lie in any box grown by a margin."""
-    rel = points[:, None] - boxes[None, :, :2]
-    along = np.abs(rel[..., 0] * boxes[:, 2] + rel[..., 1] * boxes[:, 3])
-    aside = np.abs(rel[..., 1] * boxes[:, 2] - rel[..., 0] * boxes[:, 3])
-    inside = (along < boxes[:, 4] / 2 + margin_m) & (aside < boxes[:, 5] / 2 + margin_m)
-    return np.asarray(inside.any(axis=1))
+    """Who would come too near to a vehicle right ahead, and is not near one already."""
+    x, y, angle = pose.T
+    into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
+    if np.count_nonzero(into):
+        into &= ~_within(x, y, vehicles, active)
+    return into
+
+
+def _within(
+    x: Float64[np.ndarray, " w"],
+    y: Float64[np.ndarray, " w"],
+    vehicles: Boxes,
+    active: Bool[np.ndarray, " v"],
+) -> Bool[np.ndarray, " w"]:
+    """Which points lie in any vehicle grown by the berth that people give it."""
+    cos, sin = vehicles.direction
+    half = vehicles.size_m / 2 + _BERTH_M
+    dx, dy = x[:, None] - vehicles.xy[:, 0], y[:, None] - vehicles.xy[:, 1]
+    along = np.abs(dx * cos + dy * sin)
+    dy *= cos
+    dx *= sin
+    dy -= dx
+    inside = (along < np.where(active, half[:, 0], -1.0)) & (np.abs(dy, out=dy) < half[:, 1])
+    return np.logical_or.reduce(inside, axis=1)
 
 
 def placed_walkers(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,10 +18,23 @@ from drivax.geometry.angles import wrap
 from drivax.scenario.recording import Event, Light, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, Flag
 from drivax.synthetic import expert
+from drivax.synthetic.aims import Aim
 from drivax.synthetic.cast import Cast, Motion, Staging
 from drivax.synthetic.casting import SignalTiming, draw_cast
+from drivax.synthetic.critical import critical_steps
 from drivax.synthetic.domains import DOMAINS, Domain
-from drivax.synthetic.events import EventKind, Staged, possible, stage
+from drivax.synthetic.events import (
+    EventKind,
+    Scene,
+    Staged,
+    aims,
+    drawn_severity,
+    possible,
+    stage,
+    threatens,
+)
+from drivax.synthetic.families import RoadFamily
+from drivax.synthetic.meetings import met_on
 from drivax.synthetic.roads import RoadNetwork, feature_id, map_features
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, noisy, sight
 from drivax.synthetic.signals import light_states
@@ -31,12 +45,16 @@ WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
 _WARM_UP_S = 6.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
+#: A recording of a critical moment begins so early or so much later, and at one of every so many steps.
+_EARLIEST, _LATER, _EVERY = 30, 16, 4
 #: Ego may act on an event this many steps before it begins.
 _FORESEEN = 8
 #: Lights of a next junction are recorded within this distance of ego's log: a scenario's map ends a little further on.
 _LIGHTS_M = 95.0
 #: Draws before a scenario is given up, and draws on one map.
 _ATTEMPTS, _PER_MAP = 400, 12
+#: Events that are tried with the same cast.
+_STAGINGS = 3
 #: Of the others, so many that come nearest to ego are recorded.
 _RECORDED = 76
 
@@ -118,14 +136,14 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
     domain = config.check()
-    event = _drawn_event(config, np.random.default_rng([seed, 0, index]))
+    event, severity = _drawn_event(config, np.random.default_rng([seed, 0, index]))
     rejected: Counter[str] = Counter()
     for attempt in range(_ATTEMPTS):
         place = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
-        roads = np.random.default_rng([seed, 3 if event else 1, *place])
-        family = domain.drawn_family(roads)
+        family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *place))
         rng = np.random.default_rng([seed, 2, index, attempt])
-        result = _attempt(family.build(roads, domain.style), domain, config, event, rng)
+        places = aims(event, network, attempt > 0) if event else ()
+        result = _attempt((network, places), domain, config, (event, severity), rng)
         if isinstance(result, str):
             rejected[result] += 1
             continue
@@ -143,38 +161,62 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     )
 
 
-def _drawn_event(config: WorldConfig, rng: np.random.Generator) -> EventKind:
+def _drawn_event(config: WorldConfig, rng: np.random.Generator) -> tuple[EventKind, float]:
+    """Whether there is an event, of which kind, and the deceleration that it should require of ego, m/s2."""
     kinds = [kind for kind in EventKind if kind]
     rare, kind = rng.random() < config.rare_rate, kinds[int(rng.integers(len(kinds)))]
-    return kind if rare else EventKind.NONE
+    return (kind if rare else EventKind.NONE), drawn_severity(rng)
+
+
+@lru_cache(maxsize=1)
+def _drawn_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[RoadFamily, RoadNetwork]:
+    """Roads of a domain, again and again until they have what the event needs; built once for draws in a row."""
+    domain, rng = DOMAINS[name], np.random.default_rng(seed)
+    for _ in range(_ATTEMPTS):
+        family = domain.drawn_family(rng)
+        network = family.build(rng, domain.style)
+        if not event or possible(event, network):
+            return family, network
+    raise UsageError(
+        f"no family of roads of the domain {domain.name} has what a {event.name.lower()} needs",
+        cure="use other families or a rare_rate of 0",
+    )
 
 
 def _attempt(
-    network: RoadNetwork,
+    roads: tuple[RoadNetwork, tuple[Aim, ...]],
     domain: Domain,
     config: WorldConfig,
-    event: EventKind,
+    event: tuple[EventKind, float],
     rng: np.random.Generator,
 ) -> Recording | str:
-    """One draw: the recording, or why it was thrown away."""
-    if event and not possible(event, network):
-        return "no_occasion"
-    times = (np.arange(_WARM_UP + STEPS) - _WARM_UP) * DT_S
-    cast = draw_cast(network, domain, times, config.lane_change_share, config.signal_timing, rng)
+    """One draw on roads, some with places that ego should pass: the recording, or why it was thrown away."""
+    (network, places), (kind, severity) = roads, event
+    critical = not kind and rng.random() < domain.critical_share
+    times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
+    cast = draw_cast(
+        network, domain, times, config.lane_change_share, config.signal_timing, rng, places, critical
+    )
     traffic = Traffic(cast, times)
-    staged: Staged | None = None
-    if event:
-        staged = stage(event, cast, traffic.run(), _WARM_UP, rng)
+    if not kind:
+        motion, first = traffic.run(), _WARM_UP
+        if critical:
+            first = _critical_step(traffic, motion, rng)
+            traffic, motion = traffic.until(first + STEPS), motion.until(first + STEPS)
+        motion, cause = expert.drive(cast, traffic.times_s, Staging(), first, traffic.run, begun=motion)
+        return cause or _perceived(_recorded(cast, motion, first, None), config, rng)
+    scene, cause = Scene(cast, traffic.run(), _WARM_UP), "no_occasion"
+    for _ in range(_STAGINGS):
+        staged = stage(kind, scene, severity, rng)
         if staged is None:
-            return "no_occasion"
-    staging, aware = Staging(), 0
-    if staged is not None:
+            break
         # Ego may foresee an event a little: an attentive driver sees it coming.
-        staging, aware = staged.staging, staged.first_step - _FORESEEN
-    motion, cause = expert.drive(cast, times, staging, _WARM_UP, traffic.run, aware)
-    if cause:
-        return cause
-    return _perceived(_recorded(cast, motion, staged), config, rng)
+        aware = staged.first_step - _FORESEEN
+        motion, cause = expert.drive(cast, times, staged.staging, _WARM_UP, traffic.run, aware)
+        if not cause and threatens(scene, motion, staged):
+            return _perceived(_recorded(cast, motion, _WARM_UP, staged), config, rng)
+        cause = cause or "no_threat"
+    return cause
 
 
 def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
@@ -184,13 +226,24 @@ def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generat
     return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
 
 
-def _recorded(cast: Cast, motion: Motion, staged: Staged | None) -> Recording:
-    """The log of the last 91 steps, without names."""
-    network = cast.network
+def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int:
+    """Where a recording begins in which ego has to give way or to go around somebody, if there is such a step."""
+    network = traffic.cast.network
+    if not met_on(network, motion.paths[0]):
+        return _WARM_UP
+    steps = np.arange(_EARLIEST, _WARM_UP + _LATER + 1, _EVERY)
+    found = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
+    return int(steps[rng.choice(found)]) if len(found) else _WARM_UP
+
+
+def _recorded(cast: Cast, motion: Motion, first: int, staged: Staged | None) -> Recording:
+    """The log from a step on, without names."""
+    network, motion = cast.network, motion.since(first)
     times = np.arange(STEPS) * DT_S
     lights: tuple[Light, ...] = ()
     if network.signals is not None:
-        colour, _ = network.signals.colours(times, len(network.lanes))
+        begin_s = (first - _WARM_UP) * DT_S
+        colour, _ = network.signals.colours(begin_s + times, len(network.lanes))
         low, high = motion.xy[0].min(axis=0) - _LIGHTS_M, motion.xy[0].max(axis=0) + _LIGHTS_M
         lights = tuple(
             Light(
@@ -206,9 +259,9 @@ def _recorded(cast: Cast, motion: Motion, staged: Staged | None) -> Recording:
     events, tags = (), {}
     if staged is not None:
         tags = {"event": staged.kind.name.lower(), "severity_mps2": f"{staged.severity_mps2:.1f}"}
-        first, last = staged.first_step - _WARM_UP, staged.last_step - _WARM_UP
+        begin, last = staged.first_step - first, staged.last_step - first
         actors = tuple(map(_track_id, staged.actors))
-        events = (Event(int(staged.kind), first, min(last, STEPS - 1), actors),)
+        events = (Event(int(staged.kind), begin, min(last, STEPS - 1), actors),)
     return Recording(
         scenario_id="",
         dataset="drivax",
@@ -238,18 +291,17 @@ def _track_id(user: int) -> int:
 
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
     """Ego, the actors of an event and the nearest others; zeros where they were not."""
-    now = slice(_WARM_UP, None)
-    valid = motion.valid[:, now]
-    apart = np.hypot(*np.moveaxis(motion.xy[:, now] - motion.xy[:1, now], -1, 0))
+    valid = motion.valid
+    apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
     nearest = np.where(valid, apart, np.inf).min(axis=1)
     nearest[[0, *actors]] = -1.0
     seen = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
     seen = seen[np.isfinite(nearest[seen])]
     valid = valid[seen]
-    heading = np.where(valid, wrap(motion.heading[seen, now]), 0.0)
-    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[seen, now], 0.0)
+    heading = np.where(valid, wrap(motion.heading[seen]), 0.0)
+    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[seen], 0.0)
     return Tracks(
-        xy=np.where(valid[..., None], motion.xy[seen, now], 0.0),
+        xy=np.where(valid[..., None], motion.xy[seen], 0.0),
         z=np.zeros(valid.shape),
         heading=heading,
         velocity=speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1),

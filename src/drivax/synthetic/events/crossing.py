@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.aims import Aim
 from drivax.synthetic.cast import Scripted, Staging
-from drivax.synthetic.curves import STEP_M, Curve, joined
+from drivax.synthetic.curves import Curve, joined
 from drivax.synthetic.events.actors import CAR_M, along_curve
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
-from drivax.synthetic.events.scene import EARLIEST, FULL_SWING, LATEST, Scene
-from drivax.synthetic.events.threat import comes_close, first_blocked, in_its_lane, required_deceleration
+from drivax.synthetic.events.scene import EARLIEST, FULL_SWING, LATEST, NOTICED, Scene
+from drivax.synthetic.events.threat import comes_close, first_blocked, in_its_lane, required_by_samples
 from drivax.synthetic.roads import Control, Lane, RoadNetwork
 from drivax.synthetic.signals import Colour
 
@@ -25,6 +26,8 @@ _FROM_M, _BEYOND_M = 180.0, 60.0
 _BRAKING_MPS2 = 5.0
 #: How hard a turn slows its driver before it, m/s2, and how much lateral acceleration it takes.
 _SLOWING_MPS2, _LATERAL_MPS2 = 2.0, 3.0
+#: Who turns less goes straight on, rad; whose directions have a larger cosine than this drive along one road.
+_TURN_RAD, _ALONG = math.radians(45.0), 0.7
 
 
 @dataclass(frozen=True)
@@ -90,17 +93,23 @@ def _chain(
     return result
 
 
+def _straight_on(lane: Lane) -> bool:
+    return abs(float(lane.curve.heading[-1] - lane.curve.heading[0])) < _TURN_RAD
+
+
 @dataclass(frozen=True)
 class CrossTraffic:
     """Somebody crosses ego's way in a junction although ego goes first.
 
     Attributes:
-        turning: Somebody, mostly oncoming, who turns left and does not yield; else somebody who runs a red light.
+        turning: Somebody oncoming, who turns left and does not yield; else somebody who runs a red light.
         speed_share: The actor's speed before the junction as a share of its limit, low and high.
+        arrival_s: Ego should come to the junction so long after the recording's beginning, low and high.
     """
 
     turning: bool = False
     speed_share: tuple[float, float] = (0.7, 1.1)
+    arrival_s: tuple[float, float] = (2.5, 5.5)
 
     @property
     def kind(self) -> EventKind:
@@ -109,12 +118,17 @@ class CrossTraffic:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        if self.turning:
-            return any(
-                lane.connector and (lane.yields_to or lane.control == Control.SIGNAL)
-                for lane in network.lanes
-            )
-        return network.signals is not None
+        return bool(self.aims(network))
+
+    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+        """See :class:`AimedScript`: stop lines of ways that somebody may cross who ought to wait."""
+        if network.signals is None and not self.turning:
+            return ()
+        return tuple(
+            Aim(index, (0.0, 0.0), self.arrival_s)
+            for index, lane in enumerate(network.lanes)
+            if lane.connector and lane.predecessors and self._crossing(network, index)
+        )
 
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -144,24 +158,26 @@ class CrossTraffic:
 
     def _ways(self, scene: Scene) -> list[int]:
         """Connectors of actors that cross one that ego will drive through during the recording."""
-        network, mine = scene.cast.network, scene.connectors
-        result = []
-        for other, lane in enumerate(network.lanes):
-            if any(
-                network.conflicts[one, other] and self._suits(network.lanes[one], lane, one) for one in mine
-            ):
-                result.append(other)
-        return result
+        network = scene.cast.network
+        return sorted({other for mine in scene.connectors for other in self._crossing(network, mine)})
+
+    def _crossing(self, network: RoadNetwork, mine: int) -> list[int]:
+        """Connectors whose users would cross this one's, which lead straight on, although they ought to wait."""
+        lane = network.lanes[mine]
+        if not _straight_on(lane):
+            return []
+        others = np.flatnonzero(network.conflicts[mine]).tolist()
+        return [other for other in others if self._suits(lane, network.lanes[other], mine)]
 
     def _suits(self, mine: Lane, other: Lane, index: int) -> bool:
         if not other.predecessors or not other.connector:
             return False
-        turn = float(other.curve.heading[-1] - other.curve.heading[0])
-        oncoming = math.cos(other.curve.heading[0] - mine.curve.heading[0]) < -0.7
+        along = math.cos(other.curve.heading[0] - mine.curve.heading[0])
         if self.turning:
-            left = turn > math.radians(45.0)
-            return left and (index in other.yields_to or (oncoming and other.control == Control.SIGNAL))
-        return not oncoming and other.control == Control.SIGNAL and abs(turn) < math.radians(45.0)
+            left = not _straight_on(other) and other.curve.heading[-1] > other.curve.heading[0]
+            return left and along < -_ALONG and index in other.yields_to
+        lit = other.control == mine.control == Control.SIGNAL
+        return lit and _straight_on(other) and abs(along) < _ALONG
 
     def _timed(
         self, scene: Scene, lane: int, way: _Way, pace: tuple[float, int], wanted: float
@@ -181,12 +197,11 @@ class CrossTraffic:
         blocked = first_blocked(scene, entering(first), first - decides)
         requires = np.zeros(last + 1)
         for entry in range(first, last + 1):
-            begin = entry - decides
+            begin = entry - decides + NOTICED
             speed = float(scene.motion.speed[0, begin])
             if speed > 4.0:
-                room = np.where(np.isfinite(blocked), blocked - STEP_M / 2 - track.at[begin], 1e9)
-                room = room[: scene.last_step + 1 - begin]
-                requires[entry] = required_deceleration(speed, room, DT_S * np.arange(len(room)))
+                room = blocked[NOTICED:][: scene.last_step + 1 - begin] - track.at[begin]
+                requires[entry] = required_by_samples(speed, room)
         low, high = SEVERITY_MPS2
         # The step at which the actor comes into ego's way, in time with the entry.
         enters = np.arange(last + 1) - decides + int(np.argmax(np.isfinite(blocked)))

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from drivax.synthetic.aims import Aim
 from drivax.synthetic.cast import Scripted, Staging
 from drivax.synthetic.events.scene import Scene
 from drivax.synthetic.roads import RoadNetwork
@@ -43,7 +44,8 @@ class Staged:
         staging: What has to change in how traffic goes.
         actors: Rows of the motion that comes of it: of vehicles, or of the extras, which come last.
         first_step, last_step: From when to when the actor does what it should not, both included.
-        severity_mps2: The constant deceleration from the first step on with which ego just avoids the actor.
+        severity_mps2: The constant deceleration with which ego just avoids the actor if it begins when it can see
+            what the actor is about to do, 0.4 s after the first step, and keeps its speed until then.
     """
 
     kind: EventKind
@@ -91,4 +93,13 @@ class EventScript(Protocol):
 
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """Proposes an event of about this severity, or None where this draw finds no occasion."""
+        ...
+
+
+@runtime_checkable
+class AimedScript(EventScript, Protocol):
+    """One that needs ego at certain places; all others may happen on any open road."""
+
+    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+        """Places of which ego should pass one."""
         ...

@@ -7,12 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.aims import Aim, open_road
 from drivax.synthetic.cast import Override, Staging, Tailgate
 from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, slowed
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
-from drivax.synthetic.events.scene import Scene
+from drivax.synthetic.events.scene import NOTICED, Scene
+from drivax.synthetic.events.threat import severity
 from drivax.synthetic.roads import RoadNetwork
 
+#: Where everybody drives this slowly who brakes requires little of who follows, m/s.
+_LEAST_MPS = 10.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
 #: Who stopped for no reason stands so long, s, and at least until an ego that keeps its speed would be there.
@@ -73,8 +77,13 @@ class LeadBrakes:
         return EventKind.TAILGATER if self.tailgater else EventKind.LEAD_BRAKES
 
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`: anywhere."""
-        return bool(network.lanes)
+        """See :class:`EventScript`."""
+        return bool(self.aims(network))
+
+    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+        """See :class:`AimedScript`: behind somebody who brakes on a slow street nobody has to brake."""
+        places = open_road(network, _LEAST_MPS)
+        return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
 
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
@@ -105,7 +114,8 @@ class LeadBrakes:
             return None
         staging = Staging(overrides=(Override(leader, step, last, -drawn[0]),), tailgates=tailgates)
         threat = slowed(motion, leader, step, drawn[0])
-        return Proposal(staging, drawn[1], threat, step, last, leader, followers)
+        required = severity(scene, threat, step + NOTICED)
+        return Proposal(staging, required, threat, step, last, leader, followers)
 
 
 @dataclass(frozen=True)
@@ -120,8 +130,12 @@ class StalledVehicle:
     kind: EventKind = EventKind.STALLED_VEHICLE
 
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`: anywhere."""
-        return bool(network.lanes)
+        """See :class:`EventScript`."""
+        return bool(self.aims(network))
+
+    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+        """See :class:`AimedScript`: behind somebody who brakes on a slow street nobody has to brake."""
+        return open_road(network, _LEAST_MPS)
 
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
@@ -177,4 +191,5 @@ def _put_ahead(
     valid, left = np.arange(scene.steps) >= appears, np.zeros(scene.steps)
     threat = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
     staging = replace(drives_on or Staging(), extras=(threat,))
-    return Proposal(staging, drawn[1], threat, step, last, None, others, after)
+    required = severity(after, threat, step + NOTICED)
+    return Proposal(staging, required, threat, step, last, None, others, after)

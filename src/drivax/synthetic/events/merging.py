@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.aims import Aim, open_road
 from drivax.synthetic.cast import Staging
 from drivax.synthetic.curves import STEP_M
 from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, smooth_step
 from drivax.synthetic.events.kinds import EventKind, Proposal
-from drivax.synthetic.events.scene import EARLIEST, LATEST, Scene
+from drivax.synthetic.events.scene import EARLIEST, LATEST, NOTICED_S, Scene
 from drivax.synthetic.roads import RoadNetwork
 
 #: The lane beside ego's is looked for at stations so far apart, m.
@@ -44,6 +45,7 @@ class CutIn:
         braking_mps2: How it slows, low and high.
         lasts_s: Duration of the lane change, low and high.
         before_end_m: A late merge ends at most this far before the lane does.
+        end_after_s: Ego should come to that end so long after the recording's beginning, low and high.
     """
 
     late_merge: bool = False
@@ -52,6 +54,7 @@ class CutIn:
     braking_mps2: tuple[float, float] = (2.5, 6.0)
     lasts_s: tuple[float, float] = (2.0, 3.2)
     before_end_m: float = 80.0
+    end_after_s: tuple[float, float] = (5.5, 9.0)
 
     @property
     def kind(self) -> EventKind:
@@ -60,9 +63,22 @@ class CutIn:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        if self.late_merge:
-            return any(lane.ends or lane.exit_only for lane in network.lanes)
-        return any(lane.left >= 0 for lane in network.lanes)
+        return bool(self.aims(network))
+
+    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+        """See :class:`AimedScript`: for a late merge the ends of lanes, on the lanes beside them."""
+        lanes = network.lanes
+        if not self.late_merge:
+            return open_road(network, beside=True)
+        places = []
+        for lane in lanes:
+            for beside in (lane.left, lane.right) if lane.ends or lane.exit_only else ():
+                if beside >= 0 and not (lanes[beside].ends or lanes[beside].exit_only):
+                    curve = lanes[beside].curve
+                    nearest = int(np.argmin(np.hypot(*(curve.xy - lane.curve.xy[-1]).T)))
+                    at = float(curve.arc_m[nearest])
+                    places.append(Aim(beside, (at, at), self.end_after_s))
+        return tuple(places)
 
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
@@ -76,8 +92,13 @@ class CutIn:
         speed = float(scene.motion.speed[0, step])
         before, after = (float(share) * speed for share in shares)
         after = min(after, before)
-        gap = cut_in_gap(speed, before, after, braking, severity_mps2)
-        if gap is None or not 0.5 <= gap <= 40.0:
+        slowed = max(after, before - braking * NOTICED_S)
+        gap = cut_in_gap(speed, slowed, after, braking, severity_mps2)
+        if gap is None:
+            return None
+        # What ego comes nearer until it notices.
+        gap += NOTICED_S * (speed - (before + slowed) / 2)
+        if not 0.5 <= gap <= 40.0:
             return None
         start = float(scene.track.at[step]) + gap + (scene.ego_size_m[0] + CAR_M[0]) / 2
         times = DT_S * (np.arange(scene.steps) - step)

@@ -12,7 +12,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.cast import Scripted, Staging
 from drivax.synthetic.events.actors import CAR_M, along_track, moving, smooth_step, travel_s, walked
 from drivax.synthetic.events.kinds import EventKind, Proposal
-from drivax.synthetic.events.scene import EARLIEST, LATEST, Scene
+from drivax.synthetic.events.scene import EARLIEST, LATEST, NOTICED_S, Scene
 from drivax.synthetic.events.threat import waiting_room
 from drivax.synthetic.roads import RoadNetwork
 
@@ -97,7 +97,8 @@ class Jaywalker:
         """Room from ego's front to the walker's line at the first step, or None where ego would be gone first."""
         half = (scene.ego_size_m[1] + _PERSON_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
-        room = waiting_room(speed, wanted, travel_s(abs(offset) + half, pace, _START_MPS2))
+        leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
+        room = speed * NOTICED_S + waiting_room(speed, wanted, leaves - NOTICED_S)
         return room if room > speed * enters + 0.5 else None
 
     def _from_kerb(
@@ -105,7 +106,7 @@ class Jaywalker:
     ) -> tuple[int, float, float] | None:
         step = scene.drawn_step(rng)
         side = -1 if rng.random() < 0.7 else 1
-        back = float(rng.uniform(0.3, 0.7))
+        back = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
         speed, own = float(scene.motion.speed[0, step]), float(scene.track.at[step])
@@ -153,7 +154,7 @@ class LaneBlocked:
         speed_mps: How fast it rolls, low and high.
     """
 
-    speed_mps: tuple[float, float] = (2.5, 5.0)
+    speed_mps: tuple[float, float] = (2.5, 7.0)
     kind: EventKind = EventKind.LANE_BLOCKED
 
     def possible(self, network: RoadNetwork) -> bool:
@@ -164,12 +165,13 @@ class LaneBlocked:
         """See :class:`EventScript`."""
         step, side = scene.drawn_step(rng), int(rng.choice([-1, 1]))
         pace, rest = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
+        out = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
         speed = float(scene.motion.speed[0, step])
-        room = speed**2 / (2 * severity_mps2)
+        room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
         station = float(scene.track.at[step]) + room + (scene.ego_size_m[0] + _THING_M[0]) / 2
-        offset = scene.edge_m(station, side) + 0.7
+        offset = scene.edge_m(station, side) + out
         half = (scene.ego_size_m[1] + _THING_M[1]) / 2
         if not offset < 9.0 or not scene.plain_road(station):
             return None
@@ -194,8 +196,8 @@ class ReversingCar:
         gain_mps2: How it gains that speed.
     """
 
-    speed_mps: tuple[float, float] = (2.0, 3.5)
-    gain_mps2: float = 2.5
+    speed_mps: tuple[float, float] = (2.0, 4.0)
+    gain_mps2: float = 3.0
     kind: EventKind = EventKind.REVERSING_CAR
 
     def possible(self, network: RoadNetwork) -> bool:
@@ -205,11 +207,11 @@ class ReversingCar:
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         step, pace = scene.drawn_step(rng), float(rng.uniform(*self.speed_mps))
-        into, back = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.3, 0.5))
+        into, back = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
             return None
         speed = float(scene.motion.speed[0, step])
-        room = speed**2 / (2 * severity_mps2)
+        room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
         station = float(scene.track.at[step]) + room + (scene.ego_size_m[0] + CAR_M[1]) / 2
         # Its rear bumper stands near the kerb on the right, and ends beyond the middle of ego's way.
         rear = scene.edge_m(station, -1) + back
@@ -256,7 +258,7 @@ class WrongWayCyclist:
         if step is None:
             return None
         speed, own = float(scene.motion.speed[0, step]), float(scene.track.at[step])
-        room = waiting_room(speed, severity_mps2, clear)
+        room = speed * NOTICED_S + waiting_room(speed, severity_mps2, clear - NOTICED_S)
         start = own + (scene.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace * clear
         if not _place(scene, own + room) or not _place(scene, start):
             return None

@@ -16,6 +16,9 @@ from drivax.synthetic.curves import STEP_M
 
 #: Events begin in this range of steps of the recording, and are over or in full swing at the last one.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
+#: Steps from an event's first one until it can be seen what the actor is about to do, and the time, s.
+NOTICED = 4
+NOTICED_S = NOTICED * DT_S
 #: Ego's way goes on so far beyond the end of its drive, m.
 _BEYOND_M = 160.0
 #: Slower than this ego is no occasion for an event, m/s.

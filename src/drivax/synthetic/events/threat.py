@@ -18,10 +18,14 @@ from jaxtyping import Bool, Float64
 
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind
-from drivax.synthetic.cast import Scripted
+from drivax.synthetic.cast import Motion, Scripted
 from drivax.synthetic.curves import STEP_M
+from drivax.synthetic.events.kinds import Staged
 from drivax.synthetic.events.scene import Scene
 
+#: Time to collision that makes a threat one, s; in what really happens a little less, and of a box of ego that is
+#: smaller, m: events that perception noise, or a hand's breadth, would undo are none.
+NEAR_S, SURELY_S, _SMALLER_M = 1.0, 0.8, 0.3
 #: Ego keeps its speed where it changes by less than this share.
 _STEADY = 0.12
 #: Nobody appears nearer to ego than this, m.
@@ -30,6 +34,9 @@ _VIEW_M = 40.0
 _APART_M, _APART_ON_FOOT_M = (1.5, 0.3), (0.2, 0.05)
 #: Whose centres come so near to each other are in one lane, m.
 _IN_LANE_M = 6.5
+#: Who comes this near to somebody that crosses its way would hit it, along and across both together, m; and how far
+#: apart centres are then at most.
+_CROSSED_M, _NEAR_M = np.array([4.0, 1.2]), 15.0
 #: Time gap to who drives behind an actor when it appears, s.
 _BEHIND_S = 0.8
 
@@ -85,13 +92,21 @@ def first_blocked(scene: Scene, threat: Scripted, step: int) -> Float64[np.ndarr
 
 def severity(scene: Scene, threat: Scripted, step: int) -> float:
     """The constant deceleration from a step on with which ego just avoids the threat, m/s2."""
-    blocked = first_blocked(scene, threat, step)
-    # The samples of the way are half a metre apart: the first that touches lies a quarter too far on average.
-    room = blocked - STEP_M / 2 - scene.track.at[step]
-    room[~np.isfinite(room)] = 1e9
-    return required_deceleration(
-        float(scene.motion.speed[0, step]), np.maximum(room, 0.0), DT_S * np.arange(len(room))
-    )
+    room = first_blocked(scene, threat, step) - scene.track.at[step]
+    return required_by_samples(float(scene.motion.speed[0, step]), room)
+
+
+def required_by_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) -> float:
+    """:func:`required_deceleration` of the room until the first blocked sample of the way, at each step from now on.
+
+    The way's samples are half a metre apart: the first that touches lies a quarter too far on average. In the same
+    way who has left ego's way at a step has been in it for half of the step on average.
+    """
+    time, taken = DT_S * np.arange(len(room_m)), np.isfinite(room_m)
+    leaves = np.flatnonzero(taken[:-1] & ~taken[1:])
+    time = np.concatenate([time, time[leaves] + DT_S / 2])
+    room = np.concatenate([room_m, room_m[leaves]]) - STEP_M / 2
+    return required_deceleration(speed_mps, np.maximum(room, 0.0), time)
 
 
 def least_ttc(scene: Scene, threat: Scripted, hold_from: int, since: int) -> float:
@@ -106,15 +121,48 @@ def least_ttc(scene: Scene, threat: Scripted, hold_from: int, since: int) -> flo
     track, steps = scene.track, np.arange(max(since, hold_from), scene.last_step + 1)
     speed = float(scene.motion.speed[0, hold_from])
     xy, heading = track.pose(track.at[hold_from] + speed * DT_S * (steps - hold_from))
+    time = _times_to_collision(scene, (xy, heading, speed), boxes(threat)[steps], threat.speed[steps])
+    return float(np.min(np.where(threat.valid[steps], time, 5.0), initial=5.0))
+
+
+def threatens(scene: Scene, motion: Motion, staged: Staged) -> bool:
+    """Whether ego comes within 1 s of collision with the actor if it keeps its speed when the event begins.
+
+    Ego goes on along the way that it takes without the event, as far beside it as it is. That is the last word on an
+    event: others may have disturbed it, and ego may have become slower before.
+
+    Args:
+        scene: The scenario without the event.
+        motion: With it.
+        staged: What was staged.
+    """
+    begin, actor = staged.first_step, staged.actors[0]
+    (station,), (left,) = scene.track.projected(motion.xy[:1, begin])
+    steps = np.arange(begin, scene.last_step + 1)
+    speed = float(motion.speed[0, begin])
+    xy, heading = scene.track.pose(station + speed * DT_S * (steps - begin), left)
+    acts = slice(begin, scene.last_step + 1)
+    turned, size = motion.heading[actor, acts], np.broadcast_to(motion.size_m[actor, :2], xy.shape)
+    other = np.column_stack([motion.xy[actor, acts], np.cos(turned), np.sin(turned), size])
+    time = _times_to_collision(scene, (xy, heading, speed), other, motion.speed[actor, acts])
+    return bool(np.any(motion.valid[actor, acts] & (time < SURELY_S)))
+
+
+def _times_to_collision(
+    scene: Scene,
+    ego: tuple[Float64[np.ndarray, "time 2"], Float64[np.ndarray, " time"], float],
+    other: Float64[np.ndarray, "time 6"],
+    speed: Float64[np.ndarray, " time"],
+) -> Float64[np.ndarray, " time"]:
+    """Time to collision of ego, given by positions, headings and its speed, with somebody ahead, s (at most 5)."""
+    xy, heading, own = ego
     toward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    size = np.broadcast_to(scene.ego_size_m[:2], xy.shape)
-    ego = np.column_stack([xy, toward, size])
-    other = boxes(threat)[steps]
-    time = time_to_overlap(ego, speed * toward, other, threat.speed[steps, None] * other[:, 2:4], 5.0)
-    time = np.where(overlap(ego, other), 0.0, time)
+    box = np.column_stack([xy, toward, np.broadcast_to(scene.ego_size_m[:2] - _SMALLER_M, xy.shape)])
+    time = time_to_overlap(box, own * toward, other, speed[:, None] * other[:, 2:4], 5.0)
+    time = np.where(overlap(box, other), 0.0, time)
     # Who comes from behind is no threat that ego could brake for.
     ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -scene.ego_size_m[0] / 2
-    return float(np.min(np.where(threat.valid[steps] & ahead, time, 5.0), initial=5.0))
+    return np.where(ahead, time, 5.0)
 
 
 def comes_close(scene: Scene, threat: Scripted, step: int) -> bool:
@@ -123,10 +171,10 @@ def comes_close(scene: Scene, threat: Scripted, step: int) -> bool:
     Where ego changes its speed in between (a turn, a queue) it would be elsewhere anyway, and only the first counts.
     """
     current, speed = scene.first_step + CURRENT_STEP, scene.motion.speed[0]
-    if least_ttc(scene, threat, step, step) >= 1.0:
+    if least_ttc(scene, threat, step, step) >= NEAR_S:
         return False
     steady = abs(speed[step] - speed[current]) < _STEADY * speed[current]
-    return not steady or least_ttc(scene, threat, current, step) < 1.0
+    return not steady or least_ttc(scene, threat, current, step) < NEAR_S
 
 
 def in_its_lane(scene: Scene, extra: Scripted, until: int) -> tuple[int, ...]:
@@ -137,6 +185,26 @@ def in_its_lane(scene: Scene, extra: Scripted, until: int) -> tuple[int, ...]:
     same = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
     met = motion.valid[rows, : until + 1] & extra.valid[steps] & (gap < _IN_LANE_M**2) & same
     return tuple(rows[met.any(axis=1)].tolist())
+
+
+def in_its_cross_way(scene: Scene, extra: Scripted) -> tuple[int, ...]:
+    """Rows of vehicles that would run into somebody who crosses their way, or stand in it, as ego goes on without it.
+
+    Ego's own lane is not alone: who is to be avoided by ego should not be hit by others for whom nobody planned.
+    """
+    motion, last = scene.motion, scene.last_step
+    rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
+    moves = moves[moves <= last]
+    gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
+    turned = motion.heading[rows][:, moves]
+    crosses = np.abs(np.cos(turned - extra.heading[moves])) < 0.7
+    row, step = np.nonzero(motion.valid[rows][:, moves] & crosses & (gap < _NEAR_M**2))
+    size = motion.size_m[rows[row], :2] + _CROSSED_M
+    other = np.column_stack(
+        [motion.xy[rows[row], moves[step]], np.cos(turned[row, step]), np.sin(turned[row, step]), size]
+    )
+    hit = overlap(boxes(extra)[moves[step]], other)
+    return tuple(np.unique(rows[row[hit]]).tolist())
 
 
 def with_room(scene: Scene, extra: Scripted, until: int, removed: tuple[int, ...] = ()) -> Scripted | None:

@@ -1,0 +1,92 @@
+"""Ego's way past a place at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drivax.synthetic.aims import (
+    Aim,
+    AimedWay,
+    aimed_way,
+    drawn_aimed_way,
+    green_on_arrival,
+    open_road,
+    rearranged,
+)
+from drivax.synthetic.curves import Pose, straight
+from drivax.synthetic.drafting import Draft
+from drivax.synthetic.population import Placement
+from drivax.synthetic.roads import Control, RoadNetwork, Start
+from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
+
+LIMIT = 10.0
+
+
+def chain(lengths, control=Control.NONE):
+    """Lanes one after the other along +x; the second one from the end is a connector with a rule."""
+    draft, at = Draft(), 0.0
+    for k, length in enumerate(lengths):
+        cross = k == len(lengths) - 2
+        rule = control if cross else Control.NONE
+        draft.lane(straight(Pose(at, 0.0, 0.0), length), 3.5, LIMIT, connector=cross, control=rule)
+        at += length
+        if k:
+            draft.link(k - 1, k)
+    return RoadNetwork("test", tuple(draft.lanes), ())
+
+
+def test_ego_starts_as_far_back_as_it_drives_in_the_time():
+    network = chain([100.0, 80.0, 20.0, 120.0], Control.SIGNAL)
+    way = aimed_way(network, Aim(2, (0.0, 0.0), (5.0, 5.0)), np.random.default_rng(0))
+    assert way is not None and way.lanes == (0, 1, 2, 3) and way.lanes[way.place] == 2
+    # 5 s at 88 % of 10 m/s before the end of lane 1.
+    assert way.start.lane == 1 and way.start.low_m == pytest.approx(80.0 - 44.0)
+    further = aimed_way(network, Aim(2, (10.0, 10.0), (12.5, 12.5)), np.random.default_rng(0))
+    assert further is not None and further.start.lane == 0
+    assert further.start.low_m == pytest.approx(100.0 + 80.0 + 10.0 - 110.0)
+
+
+def test_no_way_where_the_map_begins_too_late_or_a_rule_comes_before():
+    network = chain([100.0, 80.0, 20.0, 120.0], Control.STOP)
+    rng = np.random.default_rng(0)
+    assert aimed_way(network, Aim(1, (10.0, 10.0), (20.0, 20.0)), rng) is None
+    assert aimed_way(network, Aim(3, (5.0, 5.0), (6.0, 6.0)), rng) is None
+    # Nor does ego begin on a connector.
+    assert aimed_way(network, Aim(3, (5.0, 5.0), (1.0, 1.0)), rng) is None
+    hopeless, good = Aim(1, (10.0, 10.0), (20.0, 20.0)), Aim(3, (60.0, 60.0), (3.0, 3.0))
+    for seed in range(4):
+        way = drawn_aimed_way(network, (hopeless, good), np.random.default_rng(seed))
+        assert way is not None and way.start.lane == 3
+    assert drawn_aimed_way(network, (hopeless,), rng) is None and drawn_aimed_way(network, (), rng) is None
+
+
+@pytest.mark.parametrize("green_s", [7.0, 20.0])
+def test_the_light_is_green_when_ego_comes(green_s):
+    plan = SignalPlan(
+        (LightGroup((0,), False), LightGroup((1,), False)), ((0,), (1,)), (30.0, green_s), offset_s=3.0
+    )
+    colour, _ = green_on_arrival(plan, 1).colours(np.arange(0.0, 5.9, 0.1), 2)
+    assert np.all(colour[:, 1] == Colour.GREEN)
+
+
+def test_the_road_ahead_is_free_and_somebody_follows():
+    way = AimedWay(Start(1, 40.0, 40.0), (0, 1, 2, 3, 4), 2, alone=True, followed=True)
+    others = Placement((1, 1, 2, 3, 4, 7), (60.0, 5.0, 3.0, 30.0, 10.0, 50.0))
+    rng = np.random.default_rng(0)
+    found = rearranged(others, way, (1, 40.0), rng)
+    # Somebody stands where the follower would be, or so near that there is no room.
+    assert (found.lane, found.along_m) == ((1, 4, 7), (5.0, 10.0, 50.0))
+    found = rearranged(Placement((7,), (50.0,)), way, (1, 40.0), rng)
+    assert found.lane == (7, 1) and 12.0 <= found.along_m[1] <= 24.0
+    plain = dataclasses.replace(way, alone=False, followed=False)
+    assert rearranged(others, plain, (1, 40.0), rng) == others
+
+
+def test_open_road():
+    network = chain([100.0, 80.0, 20.0, 50.0])
+    assert [aim.lane for aim in open_road(network)] == [0, 1]
+    assert open_road(network, least_mps=12.0) == () and open_road(network, beside=True) == ()
+    assert all(30.0 <= aim.along_m[0] < aim.along_m[1] for aim in open_road(network))

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivax.scenario.schema import CURRENT_STEP, STEPS
+from drivax.synthetic.critical import critical_steps
+from drivax.synthetic.roads import Control
+from drivax.synthetic.signals import Colour
+
+from .traffic_scenes import crossroads, run, twins
+
+#: The middle of the crossing roads, and lanes east: before it, across it, beyond it.
+MIDDLE, EAST, NORTH = 110.0, (0, 1, 2), (3, 4, 5)
+SPEED = 10.0
+
+
+def moved(at, speeds=(SPEED, SPEED), ways=(EAST, NORTH)):
+    """Vehicles that keep their speeds all the time, whatever happens; the first one is ego."""
+    network = crossroads()
+    seconds = (STEPS + 30) / 10
+    motion = run(network, ways, twins(len(at)), at, speeds, seconds)
+    times = np.arange(motion.xy.shape[1]) / 10
+    for row, (begin, speed) in enumerate(zip(at, speeds, strict=True)):
+        path = motion.paths[row]
+        distance = begin + speed * times
+        motion.distance_m[row] = distance
+        motion.speed[row] = speed
+        motion.valid[row] = distance < path.length_m
+        sample = np.minimum((distance / path.step_m).astype(int), len(path.curve.xy) - 1)
+        motion.xy[row], motion.heading[row] = path.curve.xy[sample], path.curve.heading[sample]
+    colour = np.zeros((len(times), len(network.lanes)), np.int8)
+    return network, motion, colour
+
+
+def critical(network, motion, colour, steps=(0,)):
+    return critical_steps(network, motion, colour, np.array(steps)).tolist()
+
+
+def test_who_crosses_at_the_same_time_is_hit_and_who_has_long_passed_is_not():
+    # Ego reaches the middle 5 s after the start, so do others who are as far away and as fast.
+    together = moved((60.0, 60.0))
+    assert critical(*together) == [True]
+    passed = moved((40.0, 90.0))
+    assert critical(*passed) == [False]
+
+
+def test_steps_are_told_apart():
+    # The other crosses 6.5 s after the start. An ego at the limit of 15 m/s is there at about the same time if it
+    # takes over at 10 m/s 50 m before the middle, and not if it has already passed.
+    network, motion, colour = moved((45.0, 45.0))
+    late = round((MIDDLE + 10.0 - 45.0) / SPEED * 10) - CURRENT_STEP
+    assert critical(network, motion, colour, (0, late)) == [True, False]
+
+
+def test_a_leader_is_followed_and_not_hit():
+    leader = moved((30.0, 50.0), (SPEED, 3.0), (EAST, EAST))
+    assert critical(*leader) == [False]
+
+
+def test_who_comes_from_behind_does_not_count():
+    tail = moved((40.0, 20.0), (2.0, 14.0), (EAST, EAST))
+    assert critical(*tail) == [False]
+
+
+@pytest.mark.parametrize(
+    ("shown", "hit"), [(Colour.RED, False), (Colour.YELLOW, False), (Colour.GREEN, True)]
+)
+def test_it_stops_for_lights(shown, hit):
+    network, motion, colour = moved((60.0, 60.0))
+    network = crossroads(control=[Control.SIGNAL, Control.SIGNAL])
+    colour[:, EAST[1]] = shown
+    assert critical(network, motion, colour) == [hit]
+
+
+def test_an_empty_road_is_never_critical():
+    network, motion, colour = moved((60.0,), (SPEED,), (EAST,))
+    assert critical(network, motion, colour, (0, 10, 20)) == [False, False, False]
