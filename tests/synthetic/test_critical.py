@@ -18,7 +18,7 @@ SPEED = 10.0
 def moved(at, speeds=(SPEED, SPEED), ways=(EAST, NORTH)):
     """Vehicles that keep their speeds all the time, whatever happens; the first one is ego."""
     network = crossroads()
-    seconds = (STEPS + 30) / 10
+    seconds = 2 * STEPS / 10
     motion = run(network, ways, twins(len(at)), at, speeds, seconds)
     times = np.arange(motion.xy.shape[1]) / 10
     for row, (begin, speed) in enumerate(zip(at, speeds, strict=True)):
@@ -46,11 +46,10 @@ def test_who_crosses_at_the_same_time_is_hit_and_who_has_long_passed_is_not():
 
 
 def test_steps_are_told_apart():
-    # The other crosses 6.5 s after the start. An ego at the limit of 15 m/s is there at about the same time if it
-    # takes over at 10 m/s 50 m before the middle, and not if it has already passed.
-    network, motion, colour = moved((45.0, 45.0))
-    late = round((MIDDLE + 10.0 - 45.0) / SPEED * 10) - CURRENT_STEP
-    assert critical(network, motion, colour, (0, late)) == [True, False]
+    # Ego and the other cross 5 s after the start: whoever takes over 4 s before that meets it, and who does so when
+    # both have crossed does not.
+    network, motion, colour = moved((60.0, 60.0))
+    assert critical(network, motion, colour, (0, 70 - CURRENT_STEP)) == [True, False]
 
 
 def test_a_leader_is_followed_and_not_hit():

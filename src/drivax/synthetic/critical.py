@@ -64,7 +64,7 @@ def critical_steps(
     now = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
     at, speed = motion.distance_m[0, now], motion.speed[0, now]
     fastest = speed_profile(path, 1.0, _LATERAL_MPS2, _SLOWING_MPS2)
-    hit = np.zeros(len(now), bool)
+    hit, behind = np.zeros(len(now), bool), np.zeros((len(others.near_m), len(now)), bool)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
         gap, leader = _leader(others, now, at, (float(length), float(width)))
         line = _line(network, path, colour[now], at + length / 2) + 2.0 - _STOP_SHORT_M
@@ -78,7 +78,7 @@ def critical_steps(
         ).min(axis=0)
         after = np.maximum(speed + a * _STRIDE * DT_S, 0.0)
         at, speed, now = at + (speed + after) / 2 * _STRIDE * DT_S, after, now + 1
-        hit |= _hits(others, now, path, at, (float(length), float(width)))
+        hit |= _hits(others, now, path, at, (float(length), float(width)), behind)
     return hit
 
 
@@ -157,16 +157,18 @@ def _hits(
     path: Path,
     at: Float64[np.ndarray, " start"],
     size_m: tuple[float, float],
+    behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:
-    """Whether somebody who does not come from behind is where ego is."""
+    """Whether somebody is where ego is who did not come from behind; adds those who do to ``behind``."""
     result = np.zeros(len(at), bool)
     if not len(others.near_m):
         return result
     half = size_m[0] / 2
     near, far = others.near_m[:, now], others.far_m[:, now]
-    maybe = (near < at + half) & (far > at - half) & ((near + far) / 2 > at - half)
+    maybe = (near < at + half) & (far > at - half)
     maybe &= (others.right_m[:, now] < size_m[1] / 2) & (others.left_m[:, now] > -size_m[1] / 2)
-    who, start = np.nonzero(maybe)
+    behind |= maybe & ((near + far) / 2 <= at - half)
+    who, start = np.nonzero(maybe & ~behind)
     if len(who):
         place = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
         heading = path.curve.heading[place]

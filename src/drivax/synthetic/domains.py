@@ -33,7 +33,7 @@ class Domain:
     walkers: tuple[float, float] = (0.3, 2.0)
     parked_share: tuple[float, float] = (0.4, 0.9)
     double_share: float = 0.1
-    critical_share: float = 0.75
+    critical_share: float = 0.62
 
     @property
     def families(self) -> tuple[tuple[RoadFamily, float], ...]:

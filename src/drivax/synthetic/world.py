@@ -43,10 +43,10 @@ from drivax.synthetic.traffic import Traffic
 #: Raised whenever the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
-_WARM_UP_S = 6.0
+_WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
 #: A recording of a critical moment begins so early or so much later, and at one of every so many steps.
-_EARLIEST, _LATER, _EVERY = 30, 16, 4
+_EARLIEST, _LATER, _EVERY = 28, 16, 4
 #: Ego may act on an event this many steps before it begins.
 _FORESEEN = 8
 #: Lights of a next junction are recorded within this distance of ego's log: a scenario's map ends a little further on.
