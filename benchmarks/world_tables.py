@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from drivax.synthetic.faults import EGO_SKIN_M
+
 GUIDE = Path(__file__).resolve().parents[1] / "docs" / "guide" / "world.md"
 #: The table of targets stands between these lines of the guide.
 BEGIN, END = "<!-- targets: python benchmarks/world.py --table -->\n", "<!-- end of targets -->\n"
-#: Ego is judged with so much around it before noise is added (``drivax.synthetic.faults``), m.
-SKIN_M = 0.1
 
 Result = dict[str, Any]
 
@@ -126,7 +126,9 @@ def lines(result: Result) -> list[tuple[str, str]]:
     found.append(("expert comfortable, common (0.95)", text(result["expert_comfortable_common"])))
     found += [(f"  within {name}", text(one)) for name, one in result["within_limits_common"].items()]
     found.append(("background overlaps (0.005)", text(result["background_overlap"])))
-    room = f"{result['largest_noise_m']:.3f} m; ego was judged with {SKIN_M:.2f} m to spare, without noise"
+    room = (
+        f"{result['largest_noise_m']:.3f} m; ego was judged with {EGO_SKIN_M:.2f} m to spare, without noise"
+    )
     found.append(("noise moves a corner at most", room))
     for name, one in result["difficulty"].items():
         ratio = one["failure_ratio"]

@@ -11,6 +11,7 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, AgentKind, Flag, LightState
+from drivax.synthetic import world
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import SEVERITY_MPS2, EventKind
 from drivax.synthetic.sensing import NoiseConfig
@@ -229,3 +230,31 @@ def test_the_others_are_recorded_with_errors_and_ego_and_the_mask_are_exact():
     apart = np.hypot(*np.moveaxis(exact.tracks.xy - noisy.tracks.xy, -1, 0))[1:][exact.tracks.valid[1:]]
     assert 0.003 < apart.std() < 0.03 and apart.max() < 0.1
     assert exact.seen is not None and exact.seen[0].all() and not exact.seen[~exact.tracks.valid].any()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"critical_share": -0.1}, "critical_share is -0.1; use a share from 0 to 1"),
+        ({"lane_change_share": 2.0}, "lane_change_share is 2.0; use a share from 0 to 1"),
+        ({"noise": NoiseConfig(level=2.0)}, "noise.level 2.0 could make a recorded vehicle touch ego"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(settings, message):
+    with pytest.raises(UsageError) as error:
+        WorldConfig(**settings).check()
+    assert message in str(error.value)
+
+
+def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
+    tried = []
+
+    def refused(kind, scene, severity, rng):
+        tried.append(kind)
+
+    monkeypatch.setattr(world, "stage", refused)
+    monkeypatch.setattr(world, "_PER_KIND", 1)
+    monkeypatch.setattr(world, "_ATTEMPTS", 12)
+    with pytest.raises(UsageError, match="no clean expert in 12 attempts"):
+        world.generate_one(0, 0, WorldConfig(rare_rate=1.0))
+    assert len(tried) == len(set(tried)) == 12

@@ -25,6 +25,8 @@ _OTHERS = 20
 SLOW_MPS, SAME_WAY = 1.0, 0.7
 #: Steps over which trends are measured; how long others are expected to accelerate and to turn, s.
 _PAST, _ACCELERATES_S, _TURNS_S = 5, 1.0, 3.0
+#: For how long, s, and up to which speed, m/s, who accelerates goes on to do so.
+_SPEEDS_UP_S, _USUAL_MPS = 2.0, 13.4
 #: Who moves sideways towards ego's way this fast, m/s, and gets there this soon, s, may stay in it.
 _ENTERS_MPS, _ENTERS_S = 0.4, 2.5
 #: Who crosses faster than this is expected to cross, m/s.
@@ -174,7 +176,9 @@ def _rolled_out(
     """Boxes and speeds at each time: constant yaw rate, acceleration for a second, no reversing."""
     times = prediction_times()[:, None]
     start = _length(velocity)
-    speed = jnp.maximum(start + faster * jnp.minimum(times, _ACCELERATES_S), 0.0)
+    longer = jnp.minimum(times, jnp.where(faster > 0.0, _SPEEDS_UP_S, _ACCELERATES_S))
+    speed = start + faster * longer
+    speed = jnp.clip(speed, 0.0, jnp.maximum(start, _USUAL_MPS))
     angle = turning * jnp.minimum(times, _TURNS_S)
     cos, sin = jnp.cos(angle), jnp.sin(angle)
 

@@ -10,7 +10,16 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, corners, overlap
 from drivax.planners.idm import STOP_SHORT_M, desired_speed, project, pursuit, stop_line_m
-from drivax.planners.prediction import HORIZON, SAME_WAY, SLOW_MPS, STEP_S, Others, Trend, at
+from drivax.planners.prediction import (
+    HORIZON,
+    SAME_WAY,
+    SLOW_MPS,
+    STEP_S,
+    Others,
+    Trend,
+    at,
+    prediction_times,
+)
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
 from drivax.scenario.record import record, static
@@ -21,7 +30,9 @@ from drivax.tasks.actions import ActionSpace
 
 #: Lateral offsets from the route to go to, m, and accelerations that are not exceeded on the way, m/s2.
 _SHIFTS = (0.0, -1.2, 1.2, -2.4, 2.4, -3.5, 3.5)
-_CAPS = (2.0, 0.0, -1.5, -3.0, -6.0)
+_CAPS = (2.0, 0.0, -1.5, -3.0, -6.0, 2.0)
+#: By how much each exceeds the speed that is wanted: the last one hurries out of others' way.
+_HASTE = (1.0, 1.0, 1.0, 1.0, 1.0, 1.4)
 #: Points along the route and their spacing, m.
 _POINTS, _STEP_M = 46, 2.0
 #: Lateral acceleration with which the car goes aside, m/s2.
@@ -34,11 +45,14 @@ _LANE_M = 2.0
 _STUCK_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
 #: Who is slower is in a queue, m/s.
 _QUEUE_MPS = 4.0
+#: Who crosses may come sooner or later than expected by this, s, and m per squared s of foresight, at most by m.
+_EARLY_S, _EARLY_MPS2, _EARLY_M = 0.25, 0.2, 6.0
 #: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road,
 #: of driving outside the lanes that go one's way, of passing closely, per metre of way lost, per metre aside, per
 #: metre of shifting, of leaving the lane because of a queue, per squared m/s2 of braking.
 _HIT, _SOONER, _REAR, _MAYBE, _OFF, _ASTRAY, _CLOSE = 60.0, 100.0, 0.3, 40.0, 50.0, 30.0, 4.0
 _WAY, _ASIDE, _SHIFTING, _LEAVES, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
+_CUTS, _CUTS_LONG, _HURRY = 10.0, 30.0, 4.0
 
 
 @record
@@ -92,6 +106,7 @@ class SearchPlanner:
             cost += off * _OFF + (shift != 0.0) * astray * astray_price
             cost += (jnp.abs(shift) > _LANE_M) * queue * _LEAVES
             cost += _ASIDE * jnp.abs(shift) + _SHIFTING * jnp.abs(shift - lateral)
+            cost += _HURRY * (jnp.asarray(_HASTE) > 1.0)
             cost += _BRAKING * jnp.minimum(first[:, 0], 0.0) ** 2 - _WAY * way
             return cost, first, line
 
@@ -109,7 +124,9 @@ class SearchPlanner:
         )
         left_m = jnp.sum(there) * _STEP_M
 
-        def cap_driven(cap: Array) -> tuple[Array, Array, Array]:
+        def cap_driven(cap: Array, haste: Array) -> tuple[Array, Array, Array]:
+            hurried = wanted * haste
+
             def step(now: tuple[Array, ...], ahead: tuple[Array, Array]) -> Any:
                 pose, way, v = now
                 rear, leader = ahead
@@ -119,7 +136,7 @@ class SearchPlanner:
                 gap = jnp.minimum(gaps[nearest], line_gap)
                 gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
                 leader_v = jnp.where(line_gap < gaps[nearest], 0.0, leader[nearest])
-                a = jnp.minimum(idm_acceleration(v, wanted, gap, leader_v, self.parameters), cap)
+                a = jnp.minimum(idm_acceleration(v, hurried, gap, leader_v, self.parameters), cap)
                 aim = jnp.minimum(way + jnp.clip(0.5 * v + 2.5, 3.0, 14.0), left_m)
                 k = pursuit(pose, at(line, offsets, aim)[:2] - pose[:2])
                 grip = jnp.minimum(GRIP_MPS2 / jnp.maximum(v * v, 1e-3), self.actions.steering)
@@ -133,7 +150,7 @@ class SearchPlanner:
             final = jnp.sum(jnp.sqrt(jnp.sum((pose[1:, :2] - pose[:-1, :2]) ** 2, -1)))
             return pose, final, jnp.stack([a[0], k[0]])
 
-        return jax.vmap(cap_driven)(jnp.asarray(_CAPS))
+        return jax.vmap(cap_driven)(jnp.asarray(_CAPS), jnp.asarray(_HASTE))
 
 
 def advanced(pose: Float[Array, " 4"], curvature: Array, distance: Array) -> Float[Array, " 4"]:
@@ -220,7 +237,16 @@ def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
     price = jnp.where(early > 0.0, _HIT + _SOONER * early, 0.0)
     price = jnp.maximum(price, _MAYBE * sooner(meets(others.maybe, _FREE_M) & others.enters))
     worst = jnp.max(price * jnp.where(others.behind, _REAR, 1.0))
-    return worst + _CLOSE * jnp.mean((meets(others.box, _FREE_M) & ~others.behind).any(axis=1))
+    # Who crosses ego's way may be there a little sooner or later.
+    cos = jnp.einsum("hi,hki->hk", pose[:, 2:4], others.box[..., COS : SIN + 1])
+    crosses = (cos < SAME_WAY) & (others.speed > SLOW_MPS) & others.vehicle
+    times = prediction_times()[:, None]
+    early = jnp.minimum(_EARLY_S * others.speed + _EARLY_MPS2 * times * times, _EARLY_M)
+    wide = others.box.at[..., LENGTH].add(jnp.where(crosses, 2.0 * early, 0.0))
+    near = meets(wide, _FREE_M) & ~others.behind
+    cut = (near & crosses).any(axis=1)
+    worst += jnp.where(cut.any(), _CUTS, 0.0) + _CUTS_LONG * jnp.mean(cut)
+    return worst + _CLOSE * jnp.mean((near & ~crosses).any(axis=1))
 
 
 def _bad_ground(

@@ -23,7 +23,6 @@ class Domain:
         walkers: People per 100 m of sidewalk, low and high, drawn per scenario.
         parked_share: Share of bays with a car in them, low and high, drawn per scenario.
         double_share: Share of scenarios with bays in which somebody is double-parked.
-        critical_share: Share of scenarios recorded from when on ego has to give way, if there is such a moment.
     """
 
     name: str
@@ -33,7 +32,6 @@ class Domain:
     walkers: tuple[float, float] = (0.3, 2.0)
     parked_share: tuple[float, float] = (0.4, 0.9)
     double_share: float = 0.1
-    critical_share: float = 0.62
 
     @property
     def families(self) -> tuple[tuple[RoadFamily, float], ...]:

@@ -14,8 +14,9 @@ from drivax.synthetic.cast import Cast, Motion, Staging
 from drivax.synthetic.roads import Control, Lane, RoadNetwork
 from drivax.synthetic.signals import Colour
 
-#: Added to ego's length and width before overlap is tested, m: replay in float32 must not touch either.
-_SKIN_M = 0.2
+#: Ego is tested for overlap with so much around it, m: its replay in float32, beside others who are recorded with
+#: noise, must not touch either.
+EGO_SKIN_M = 0.1
 #: An ego that moves less than this shows nothing, m.
 _LEAST_M = 5.0
 #: A car stands below this, within so many metres before a stop line, in the last seconds before it passes.
@@ -118,7 +119,7 @@ def touching(
         The step, or the number of steps for pairs that never do.
     """
     box = box.copy()
-    box[0, :, 4:] += _SKIN_M
+    box[0, :, 4:] += 2 * EGO_SKIN_M
     reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
     # Who never comes near: the rectangles that hold the centres, the reaches added, do not meet.
     at = np.where(valid[..., None], box[..., :2], np.nan)

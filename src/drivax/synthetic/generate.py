@@ -65,10 +65,7 @@ class Generation:
             raise UsageError(
                 f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
             )
-        if not 0.0 <= self.world.rare_rate <= 1.0:
-            raise UsageError(f"rare_rate is {self.world.rare_rate}", cure="use a share from 0 to 1")
-        if self.world.scenarios_per_map < 1:
-            raise UsageError(f"scenarios_per_map is {self.world.scenarios_per_map}", cure="use 1 or more")
+        self.world.check()
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ _SIZES = np.array(
         [[1.7, 0.6, 1.65], [1.9, 0.7, 1.85]],
     ]
 )
+#: Length and width of the largest vehicle, m.
+LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
 
 
 @dataclass(frozen=True)

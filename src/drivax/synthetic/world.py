@@ -34,9 +34,11 @@ from drivax.synthetic.events import (
     threatens,
 )
 from drivax.synthetic.families import RoadFamily
+from drivax.synthetic.faults import EGO_SKIN_M
 from drivax.synthetic.meetings import met_on
+from drivax.synthetic.population import LONGEST_M
 from drivax.synthetic.roads import RoadNetwork, feature_id, map_features
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, noisy, sight
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, sight
 from drivax.synthetic.signals import light_states
 from drivax.synthetic.traffic import Traffic
 
@@ -51,8 +53,8 @@ _EARLIEST, _LATER, _EVERY = 28, 16, 4
 _FORESEEN = 8
 #: Lights of a next junction are recorded within this distance of ego's log: a scenario's map ends a little further on.
 _LIGHTS_M = 95.0
-#: Draws before a scenario is given up, and draws on one map.
-_ATTEMPTS, _PER_MAP = 400, 12
+#: Draws before a scenario is given up, draws on one map, and draws before a kind of event is given up.
+_ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
 #: Events that are tried with the same cast.
 _STAGINGS = 3
 #: Of the others, so many that come nearest to ego are recorded.
@@ -66,6 +68,8 @@ class WorldConfig:
     Attributes:
         domain: Name of the domain (``grid`` or ``ring``), a tag of every scenario.
         rare_rate: Share of scenarios in which a rare event is staged.
+        critical_share: Share of the others in which ego's way leads it where it has to give way, if the roads have
+            such a place; they are recorded from when on somebody comes, if somebody does.
         lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
         signal_timing: Shares of what the light does for ego: green on arrival, turning green, turning red.
         scenarios_per_map: How many scenarios, one after the other, take place on the same roads; they share a segment.
@@ -75,6 +79,7 @@ class WorldConfig:
 
     domain: str = "grid"
     rare_rate: float = 0.05
+    critical_share: float = 0.65
     lane_change_share: float = 0.35
     signal_timing: SignalTiming = (0.34, 0.33, 0.33)
     scenarios_per_map: int = 2
@@ -89,10 +94,16 @@ class WorldConfig:
         """
         if self.domain not in DOMAINS:
             raise UsageError(f"there is no domain {self.domain!r}", cure=f"use one of {', '.join(DOMAINS)}")
-        if not 0.0 <= self.rare_rate <= 1.0:
-            raise UsageError(f"rare_rate is {self.rare_rate}", cure="use a share from 0 to 1")
+        for name in ("rare_rate", "critical_share", "lane_change_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
         if self.scenarios_per_map < 1:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
+        if farthest_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
+            raise UsageError(
+                f"noise.level {self.noise.level} could make a recorded vehicle touch ego that did not",
+                cure="use a smaller one",
+            )
         return DOMAINS[self.domain]
 
 
@@ -136,9 +147,10 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     if seed < 0 or index < 0:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
     domain = config.check()
-    event, severity = _drawn_event(config, np.random.default_rng([seed, 0, index]))
+    events, severity = _drawn_events(config, np.random.default_rng([seed, 0, index]))
     rejected: Counter[str] = Counter()
     for attempt in range(_ATTEMPTS):
+        event = events[attempt // _PER_KIND % len(events)]
         place = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
         family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *place))
         rng = np.random.default_rng([seed, 2, index, attempt])
@@ -161,11 +173,11 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
     )
 
 
-def _drawn_event(config: WorldConfig, rng: np.random.Generator) -> tuple[EventKind, float]:
-    """Whether there is an event, of which kind, and the deceleration that it should require of ego, m/s2."""
+def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
+    """The kind of event (another one where that fails too often), or none, and what it should require of ego, m/s2."""
     kinds = [kind for kind in EventKind if kind]
-    rare, kind = rng.random() < config.rare_rate, kinds[int(rng.integers(len(kinds)))]
-    return (kind if rare else EventKind.NONE), drawn_severity(rng)
+    rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
+    return ([kinds[k] for k in order] if rare else [EventKind.NONE]), drawn_severity(rng)
 
 
 @lru_cache(maxsize=1)
@@ -192,7 +204,7 @@ def _attempt(
 ) -> Recording | str:
     """One draw on roads, some with places that ego should pass: the recording, or why it was thrown away."""
     (network, places), (kind, severity) = roads, event
-    critical = not kind and rng.random() < domain.critical_share
+    critical = not kind and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
     cast = draw_cast(
         network, domain, times, config.lane_change_share, config.signal_timing, rng, places, critical
