@@ -129,7 +129,7 @@ def test_the_expert_drives_gently_and_makes_way():
 
 
 def test_driving_on_as_before_is_not_enough():
-    """Constant speed and heading leaves the road or meets somebody in two of five scenarios, red lights not counted."""
+    """Constant speed and heading leaves the road or meets somebody in three of ten scenarios, red lights not counted."""
     failed = 0
     for index in range(COUNT):
         recording = drawn(index).recording
@@ -148,7 +148,7 @@ def test_driving_on_as_before_is_not_enough():
             if off or hit:
                 failed += 1
                 break
-    assert failed >= 0.4 * COUNT
+    assert failed >= 0.3 * COUNT
 
 
 def test_recordings_are_complete():
@@ -253,6 +253,7 @@ def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
         tried.append(kind)
 
     monkeypatch.setattr(world, "stage", refused)
+    monkeypatch.setattr(world, "possible", lambda kind, network: True)
     monkeypatch.setattr(world, "_PER_KIND", 1)
     monkeypatch.setattr(world, "_ATTEMPTS", 12)
     with pytest.raises(UsageError, match="no clean expert in 12 attempts"):

@@ -172,9 +172,9 @@ class CrossTraffic:
     def _suits(self, mine: Lane, other: Lane, index: int) -> bool:
         if not other.predecessors or not other.connector:
             return False
-        along = math.cos(other.curve.heading[0] - mine.curve.heading[0])
+        along = math.cos(float(other.curve.heading[0] - mine.curve.heading[0]))
         if self.turning:
-            left = not _straight_on(other) and other.curve.heading[-1] > other.curve.heading[0]
+            left = not _straight_on(other) and float(other.curve.heading[-1]) > float(other.curve.heading[0])
             return left and along < -_ALONG and index in other.yields_to
         lit = other.control == mine.control == Control.SIGNAL
         return lit and _straight_on(other) and abs(along) < _ALONG
