@@ -43,8 +43,6 @@ _TIGHT_M, _FREE_M = (0.1, 0.1), (0.6, 0.5)
 _LANE_M = 2.0
 #: What has stood this long is no queue, s, unless something stands this near before it, or a red light, m.
 _STUCK_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
-#: Who is slower is in a queue, m/s.
-_QUEUE_MPS = 4.0
 #: Who crosses may come sooner or later than expected by this, s, and m per squared s of foresight, at most by m.
 _EARLY_S, _EARLY_MPS2, _EARLY_M = 0.25, 0.2, 6.0
 #: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road,
@@ -95,7 +93,7 @@ class SearchPlanner:
         trend = carry.updated(frame)
         others = Others.near(bank, scene, frame, trend, (path, there, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
-        stuck, queue = _ahead(path, there, offsets, others, me, stop)
+        stuck = _stuck(path, there, offsets, others, me, stop)
 
         def line_costs(shift: Array) -> tuple[Array, Array, Array]:
             line = _line(path, offsets, (lateral, shift), me, speed)
@@ -103,8 +101,8 @@ class SearchPlanner:
             cost = jax.vmap(lambda driven: _danger(driven, me, others))(pose)
             off, astray = _bad_ground(bank, situation, pose[0], (line, there), me)
             astray_price = jnp.where(stuck, 0.1, 1.0) * _ASTRAY
-            cost += off * _OFF + (shift != 0.0) * astray * astray_price
-            cost += (jnp.abs(shift) > _LANE_M) * queue * _LEAVES
+            cost += _OFF * ((off > 0.0) + off) + (shift != 0.0) * astray * astray_price
+            cost += (jnp.abs(shift) > _LANE_M) * ~stuck * _LEAVES
             cost += _ASIDE * jnp.abs(shift) + _SHIFTING * jnp.abs(shift - lateral)
             cost += _HURRY * (jnp.asarray(_HASTE) > 1.0)
             cost += _BRAKING * jnp.minimum(first[:, 0], 0.0) ** 2 - _WAY * way
@@ -203,10 +201,10 @@ def _corridor(
     return jnp.where(led, along - half_length, jnp.inf), speed * cos
 
 
-def _ahead(
+def _stuck(
     path: Array, there: Array, offsets: Array, others: Others, me: Array, stop: Array
-) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether what is next on the route stays where it is, so that it may be passed, and whether it is a queue."""
+) -> Bool[Array, ""]:
+    """Whether what is next on the route stays where it is, so that it may be passed."""
     along, lateral, cos, sin = project(
         path, there, offsets, others.box[0, :, :2], others.box[0, :, COS : SIN + 1]
     )
@@ -218,9 +216,7 @@ def _ahead(
     stands = (others.stood_s[first] >= _STUCK_S) | (
         ~others.vehicle[first] & (others.speed[0, first] < SLOW_MPS)
     )
-    stuck = stands & ~(queue & others.vehicle[first]) & (stop > _LIGHT_M) & jnp.isfinite(ways[first])
-    slow = on[first] & others.vehicle[first] & (others.speed[0, first] < _QUEUE_MPS)
-    return stuck, slow & ~stuck
+    return stands & ~(queue & others.vehicle[first]) & (stop > _LIGHT_M) & jnp.isfinite(ways[first])
 
 
 def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
@@ -265,4 +261,4 @@ def _bad_ground(
         return around_lanes(bank, scene.index, row[:2], row[3:5], row[None, :2], scene.z).straddling
 
     few = slice(4, 17, 4)
-    return jax.vmap(beyond)(pose[1:12:2]).any(), (jax.vmap(astray)(line[0][few]) & line[1][few]).any()
+    return jnp.mean(jax.vmap(beyond)(pose[1:12:2])), (jax.vmap(astray)(line[0][few]) & line[1][few]).any()
