@@ -9,7 +9,7 @@ import pytest
 
 from drivax.cli import main
 from drivax.evaluation.results import KEYS
-from drivax.metrics.episode import METRICS
+from drivax.metrics.catalogue import METRICS
 from drivax.synthetic.generate import Generation, generate
 
 NUMBER, WHOLE = {"type": "number"}, {"type": "integer", "minimum": 0}
@@ -24,7 +24,7 @@ def exactly(**properties):
 
 SUMMARY = exactly(
     planner={"type": "string"},
-    traffic={"enum": ["log"]},
+    traffic={"enum": ["log", "idm"]},
     metrics={
         "type": "object",
         "additionalProperties": exactly(mean=MAYBE, low=MAYBE, high=MAYBE, n=WHOLE),

@@ -15,7 +15,7 @@ from drivax.scenario.record import record, static
 from drivax.scenario.schema import LightState
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import SimState, Situation
-from drivax.tasks.actions import ActionSpace
+from drivax.tasks.actions import ActionSpace, Physical
 
 #: Look-ahead along the route and its spacing, m.
 _STEP_M, _POINTS = 2.0, 46
@@ -36,7 +36,7 @@ class IdmPlanner(Memoryless):
     route on lanes it follows the path that the log takes.
     """
 
-    actions: ActionSpace = static(default=ActionSpace())
+    actions: ActionSpace = static(default=Physical())
     parameters: IdmParameters = static(default=IdmParameters())
     name: str = static(default="idm")
     replays: bool = static(default=False)
@@ -49,7 +49,7 @@ class IdmPlanner(Memoryless):
         situation: Situation,
         observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:
         """IDM acceleration and pure-pursuit curvature."""
         scene = situation.scene
         me = situation.surroundings.frame.box[scene.slot]
@@ -63,7 +63,9 @@ class IdmPlanner(Memoryless):
         left_m = bank.route_points[scene.index, 0] - 1 - scene.route_m
         ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
         target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, :2] - me[:2]
-        return jnp.clip(self.actions.action(acceleration, pursuit(me, target), me[4]), -1.0, 1.0), carry
+        motion = scene.history[-1]
+        action = self.actions.action(motion, acceleration, pursuit(me, target), me[4])
+        return self.actions.actuated(motion, action, scene.action), carry
 
     def _leader(
         self, bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array

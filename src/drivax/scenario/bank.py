@@ -49,6 +49,9 @@ class ScenarioBank:
         log_ahead: Distance that the logged ego still drives.
         road: Observation pieces in order of rank: x, y, direction, length, kind, limit (-1), curvature.
         flags: ``scenario.schema.Flag`` bits.
+        extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
+        paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
+        given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
     """
@@ -74,10 +77,13 @@ class ScenarioBank:
     road: Float[Array, "N O 8"]
     road_rows: Int[Array, " N"]
     flags: UInt[Array, " N"]
+    extension: Float[Array, "N A X 2"]
     cell_m: float = static()
     edge_run: int = static()
     lane_run: int = static()
     long_ego: bool = static()
+    paths: Any = None
+    given: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -185,6 +191,7 @@ def _stack_agents(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.nda
     return {
         "agents": agents,
         "agent_box": np.concatenate([size, kind[..., None]], -1, dtype=np.float32)[:, :slots],
+        "extension": _column(scenarios, "agent_extension")[:, :slots],
         "parked": parked[:, :places],
         "parked_valid": parked_valid[:, :, :places],
         "flags": _column(scenarios, "flags"),

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import root
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
@@ -54,7 +55,7 @@ def _runs(
     for below in (-1, 0, 1):
         first = (cell[1] + below) * grid + cell[0] - 1
         bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
-        block = jax.lax.dynamic_slice(rows, (index, 0, bounds[0]), (1, rows.shape[1], run))[0]
+        block = jax.lax.dynamic_slice(rows, (index, jnp.int32(0), bounds[0]), (1, rows.shape[1], run))[0]
         features.append(block)
         inside.append(jnp.arange(run) < bounds[3] - bounds[0])
     # Read once: without the barrier XLA repeats the reads in every operation that uses them.
@@ -99,7 +100,7 @@ def left_of_edges(
     tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
     left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
     right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
-    distance = jnp.sqrt(nearest)
+    distance = root(nearest)
     return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
 
 
@@ -281,7 +282,9 @@ def project_on_route(
     count = bank.routes.shape[2]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
     size = min(_WINDOW, count)
-    window = jax.lax.dynamic_slice(bank.routes, (index, route, first, 0), (1, 1, size, 5))[0, 0]
+    window = jax.lax.dynamic_slice(
+        bank.routes, (index, jnp.int32(route), first, jnp.int32(0)), (1, 1, size, 5)
+    )[0, 0]
     a, b = window[:-1], window[1:]
     place = first + jnp.arange(size - 1)
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
@@ -290,7 +293,7 @@ def project_on_route(
     k = _first_smallest(jnp.where(real, squared[0], _FAR))
     u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
-    distance = jnp.sqrt(squared[0, k])
+    distance = root(squared[0, k])
     return RouteHit(
         along_m=(first + k).astype(jnp.float32) + part,
         lateral_m=jnp.where(side[0, k] >= 0, distance, -distance),

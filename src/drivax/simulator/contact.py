@@ -35,7 +35,13 @@ class Contact(enum.IntEnum):
 
 
 class CollisionType(enum.IntEnum):
-    """Kind of the first collision, seen from the judged agent."""
+    """Kind of the first collision, seen from the judged agent.
+
+    The first that fits, in this order: ``VULNERABLE``: a pedestrian or cyclist; ``STOPPED_OBJECT``: the agent's front
+    hits somebody who stands; ``HEAD_ON``: headings differ by more than 135 deg; ``REAR_END``: the front hits somebody
+    whose heading differs by less than 45 deg; ``REAR_ENDED``: hit from behind; ``SIDE_SWIPE``: everything else,
+    crossing traffic included.
+    """
 
     NONE = 0
     REAR_END = 1
@@ -122,7 +128,7 @@ def judge_contacts(
     stopped, other_stopped = speed < STOPPED_MPS, others_speed < STOPPED_MPS
     fault = ~stopped & (other_stopped | (~behind & (front | unlawful)))
     vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
-    head_on = cos < -(0.5**0.5)
+    head_on, same_way = cos < -(0.5**0.5), cos > 0.5**0.5
     kind = jnp.where(
         vulnerable,
         CollisionType.VULNERABLE,
@@ -133,7 +139,7 @@ def judge_contacts(
                 head_on & (front | ~behind),
                 CollisionType.HEAD_ON,
                 jnp.where(
-                    front,
+                    front & same_way,
                     CollisionType.REAR_END,
                     jnp.where(behind, CollisionType.REAR_ENDED, CollisionType.SIDE_SWIPE),
                 ),

@@ -44,7 +44,7 @@ def judge_lights(
     """Whether a red light was run, found out at this step, and what to remember.
 
     On the route only its own lights count, at once. Off it, of the lines that were crossed together the one counts
-    whose lane ends most nearly in the heading that the agent has two seconds later.
+    whose lane ends most nearly in the heading that the agent has two seconds later, or at the end of the log.
     """
     front_before, front = _fronts(scene, me[4])[-2:]
     crossed, before_m = light_crossing(bank, scene.index, front_before, front, ground)
@@ -58,12 +58,13 @@ def judge_lights(
     line = bank.light_line[scene.index]
     ran = (crossed & is_red & (line[:, 7] > 0)).any() & on_route
 
-    age = memory.crossed + jnp.sign(memory.crossed)
-    due = jnp.abs(age) > JUDGED_AFTER
+    begins = crossed & ~on_route
+    age = jnp.where(begins, jnp.where(is_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
+    # What is still open when the log ends is judged then.
+    due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (scene.step >= last))
     fit = jnp.where(due, jnp.cos(line[:, 6] - jnp.arctan2(me[3], me[2])), -2.0)
     ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
-    begins = crossed & ~on_route
-    age = jnp.where(begins, jnp.where(is_red, 1, -1), jnp.where(due, 0, age))
+    age = jnp.where(due, 0, age)
     stands = (scene.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
     pause = jnp.where(stands, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
     return ran, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))

@@ -9,20 +9,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.scenario.bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import remember_lights
 from drivax.simulator.situation import measure
-from drivax.simulator.traffic import LogTraffic, alone, frame_of, logged_history
+from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.together import is_driven
+from drivax.simulator.traffic import LogTraffic, alone, frame_of
 from drivax.simulator.types import Frame, Scene, SimState, Situation, Task, Traffic, Transition
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """A task in a kind of traffic. Holds configuration only; everything computed is an argument or a result.
+    """A task in a kind of traffic, with a kind of start. Holds configuration only; the rest is argument or result.
 
     Functions are unbatched; ``jax.vmap(simulator.step, in_axes=(None, 0, 0))`` steps a batch. ``step`` never resets;
     :meth:`step_or_begin` is for collectors.
@@ -30,29 +32,37 @@ class Simulator:
 
     task: Task
     traffic: Traffic = field(default_factory=LogTraffic)
+    start: Start = field(default_factory=LogStart)
 
-    def reset(self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0) -> SimState:
-        """The state of agent ``slot`` at ``step`` of scenario ``index``, as logged."""
-        scene = self.scene(bank, index, step, slot)
-        cast = alone(scene)
+    def reset(
+        self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
+    ) -> SimState:
+        """The state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws a start other than the log's."""
+        scene = self.scene(bank, index, step, slot, key)
+        return self._begin(bank, scene, alone(scene))
+
+    def _begin(self, bank: ScenarioBank, scene: Scene, cast: Scene) -> SimState:
+        """The state in which an episode begins at a scene."""
         now, before = self.frame(bank, scene, cast, 0), self.frame(bank, scene, cast, 1)
         # Overlaps at the start are ignored until they part, as if everyone had just appeared.
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
-        found, contacts, lights = measure(bank, scene, now, before, contacts, remember_lights(bank, scene))
+        lights = remember_lights(bank, scene)
+        found, contacts, lights = measure(bank, scene, now, before, contacts, lights, self.task.reads)
         return SimState(
             found.scene, found.facts, contacts, lights, self.task.episode_start(), found.scene.step
         )
 
-    def scene(self, bank: ScenarioBank, index: Any, step: Any, slot: Any = 0) -> Scene:
-        """A logged moment as a scene: what offline sampling and resets start from."""
+    def scene(self, bank: ScenarioBank, index: Any, step: Any, slot: Any = 0, key: Any = None) -> Scene:
+        """A moment as a scene: what offline sampling and resets start from; logged unless ``start`` says otherwise."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
+        history, route_m = self.start.begin(bank, index, step, slot, key)
         return Scene(
             index=index,
             step=step,
             slot=slot,
-            history=logged_history(bank, index, step, slot),
-            action=jnp.zeros(2),
-            route_m=bank.log_progress[index, step],
+            history=history,
+            action=self.task.first_action(history, bank.agent_box[index, slot, 0]),
+            route_m=route_m,
             z=bank.agents[index, step, slot, AGENT_Z],
             traffic=self.traffic.start(bank, index, step),
         )
@@ -62,23 +72,48 @@ class Simulator:
         return frame_of(bank, scene.index, scene.step, self.traffic.agents(bank, scene, back), cast, back)
 
     def step(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " 2"]
+        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
     ) -> tuple[SimState, Transition]:
         """Drives one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
     def replay(
-        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " 2"]
+        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " D"]
     ) -> tuple[SimState, Transition]:
         """Puts the agent at ``motion`` one step later, without dynamics (the exact expert); ``action`` is recorded."""
         return self._drive(bank, state, action, motion)
 
+    def reset_together(
+        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP, key: Any = None
+    ) -> SimState:  # fmt: skip
+        """The stack of the states of several agents of one scenario (``simulator.together.slots_of`` chooses them)."""
+        keys = None if key is None else jax.random.split(key, slots.shape[0])
+        scenes = jax.vmap(lambda slot, k: self.scene(bank, index, step, slot, k))(slots, keys)
+        return jax.vmap(lambda scene: self._begin(bank, scene, scenes))(scenes)
+
     def step_together(
-        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K 2"]
+        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"]
     ) -> tuple[SimState, Transition]:
-        """Drives K agents of one scenario at once; ``states`` is the stack of their states."""
-        moved = jax.vmap(lambda s, a: self._move(bank, s.scene, states.scene, a, None))(states, actions)
-        return jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, a))(states, moved, actions)
+        """Drives K agents of one scenario at once; they see each other, and traffic sees them.
+
+        Args:
+            bank: The scenarios.
+            states: The stack of their states. One whose slot is beyond the moving agents fills up the stack: it is on
+                no road, and is never rewarded nor over.
+            actions: An action each.
+        """
+        first = jax.tree.map(lambda leaf: leaf[0], states.scene)
+        traffic = self.traffic.advance(bank, first, self.frame(bank, first, states.scene, 0))
+        moved = jax.vmap(lambda s, a: self._drive_on(bank, s.scene, a, None, traffic))(states, actions)
+        after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, a))(states, moved, actions)
+        real = is_driven(bank, states)
+        terms = {name: jnp.where(real, term, 0.0) for name, term in done.reward_terms.items()}
+        ends = {name: getattr(done, name) & real for name in ("terminated", "truncated")}
+        return after, replace(done, reward=jnp.where(real, done.reward, 0.0), reward_terms=terms, **ends)
+
+    def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
+        """The observation of each of K agents of one scenario, stacked."""
+        return jax.vmap(lambda scene: self.observe(bank, scene, states.scene))(states.scene)
 
     def situation(self, bank: ScenarioBank, state: SimState, cast: Scene | None = None) -> Situation:
         """The state's facts with the surroundings that they were measured in; for planners.
@@ -90,7 +125,7 @@ class Simulator:
         """
         cast = alone(state.scene) if cast is None else cast
         now, before = self.frame(bank, state.scene, cast, 0), self.frame(bank, state.scene, cast, 1)
-        again, _, _ = measure(bank, state.scene, now, before, state.contacts, state.lights)
+        again, _, _ = measure(bank, state.scene, now, before, state.contacts, state.lights, frozenset())
         return Situation(state.scene, state.facts, again.surroundings)
 
     def observe(self, bank: ScenarioBank, scene: Scene, cast: Scene | None = None) -> Mapping[str, Any]:
@@ -106,11 +141,12 @@ class Simulator:
         self,
         bank: ScenarioBank,
         state: SimState,
-        action: Float[Array, "2"],
+        action: Float[Array, " D"],
         over: Bool[Array, ""],
         index: Any,
         step: Any = CURRENT_STEP,
         slot: Any = 0,
+        key: Any = None,
     ) -> tuple[SimState, Transition]:
         """A step, or where the episode is ``over`` the beginning of scenario ``index`` instead.
 
@@ -118,7 +154,7 @@ class Simulator:
         be masked; in exchange nothing is measured or observed twice, and every state that a policy sees, final ones
         included, is seen once.
         """
-        fresh = self.scene(bank, index, step, slot)
+        fresh = self.scene(bank, index, step, slot, key)
         moved = self._move(bank, state.scene, alone(state.scene), action, None)
         scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
         before = replace(
@@ -144,15 +180,22 @@ class Simulator:
         self, bank: ScenarioBank, scene: Scene, cast: Scene, action: Array, motion: Array | None
     ) -> Scene:
         """Everyone moves one step; nothing is measured yet."""
+        traffic = self.traffic.advance(bank, scene, self.frame(bank, scene, cast, 0))
+        return self._drive_on(bank, scene, action, motion, traffic)
+
+    def _drive_on(
+        self, bank: ScenarioBank, scene: Scene, action: Array, motion: Array | None, traffic: Any
+    ) -> Scene:
+        """The agent moves one step, in traffic that has moved."""
         if motion is None:
+            action = self.task.actuated(scene.history[-1], action, scene.action)
             motion = self.task.motion(scene.history[-1], action, bank.agent_box[scene.index, scene.slot, 0])
-        frame = self.frame(bank, scene, cast, 0)
         return replace(
             scene,
             step=scene.step + 1,
             history=jnp.concatenate([scene.history[1:], motion[None]]),
             action=action,
-            traffic=self.traffic.advance(bank, scene, frame),
+            traffic=traffic,
         )
 
     def _settle(
@@ -160,12 +203,13 @@ class Simulator:
     ) -> tuple[SimState, Transition]:
         """Measures an agent after everyone has moved, and turns the step into a transition."""
         now, previous = self.frame(bank, moved, cast, 0), self.frame(bank, moved, cast, 1)
-        found, contacts, lights = measure(bank, moved, now, previous, before.contacts, before.lights)
+        found, contacts, lights = measure(
+            bank, moved, now, previous, before.contacts, before.lights, self.task.reads
+        )
         terminated, truncated = self.task.ended(bank, found.scene, found.facts)
         terms = self.task.reward(before.facts, found.facts, found.surroundings)
-        after = SimState(found.scene, found.facts, contacts, lights, before.episode, before.start)
-        final = found.scene.step >= bank.steps - 1
-        episode = self.task.episode_add(before.episode, after, terminated | truncated | final)
-        after = replace(after, episode=episode)
+        final = terminated | truncated | (found.scene.step >= bank.steps - 1)
+        episode = self.task.episode_add(before.episode, found, before.start, final)
+        after = SimState(found.scene, found.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)

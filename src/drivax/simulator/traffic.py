@@ -1,4 +1,7 @@
-"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded."""
+"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded.
+
+Others: ``simulator.reactive`` (``idm``) and ``simulator.override``; ``simulator.catalogue`` knows them by name.
+"""
 
 from __future__ import annotations
 
@@ -63,8 +66,8 @@ def frame_of(
         index: Row of the bank.
         step: The present step; the frame is that of ``step - back``.
         agents: Rows of the moving slots, from the traffic model.
-        cast: Scenes of all driven agents of the scenario, stacked ``[K]``.
-        back: How many steps ago, 0 to 15.
+        cast: Scenes of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are nobody's.
+        back: How many steps ago, 0 to 15; reactive traffic remembers 9.
     """
     driven = cast.history[:, HISTORY - 1 - back]
     cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
@@ -72,7 +75,7 @@ def frame_of(
     rows = [driven[:, 0], driven[:, 1], cast.z, cos, sin, driven[:, 3] * cos, driven[:, 3] * sin, one]
     # Before the recording nobody else was seen.
     agents = agents.at[:, AGENT_VALID].mul(step >= back)
-    agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1))
+    agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
     box, parked = bank.agent_box[index], bank.parked[index]
     there = bank.parked_valid[index, jnp.clip(step - back, 0, bank.steps - 1)] & (step >= back)
     return Frame(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from drivax.scenario.queries import route_ahead
 from drivax.scenario.record import record
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, LightState
 from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.tasks.own import own_name, refuse_taken
 
 POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Reach of the road group ahead, behind and to each side, m.
@@ -26,6 +28,62 @@ ROAD_AHEAD_M, ROAD_BEHIND_M, ROAD_SIDE_M = 70.0, 10.0, 25.0
 #: A stop line so far behind the ego is passed, m.
 _PASSED_M = 5.0
 Observation = dict[str, Array]
+#: Names of the groups of this module.
+GROUPS = ("ego", "ego_static", "agents", "road", "lights", "route")
+
+
+@record
+class View:
+    """The ego frame: x ahead, y to the left."""
+
+    xy: Float[Array, " 2"]
+    cos: Float[Array, ""]
+    sin: Float[Array, ""]
+
+    @classmethod
+    def of(cls, scene: Scene) -> View:
+        """The frame of the driven agent now."""
+        now = scene.history[-1]
+        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
+
+    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """A place of the world, m."""
+        return rotate(xy - self.xy, self.cos, -self.sin)
+
+    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """A direction or velocity of the world."""
+        return rotate(xy, self.cos, -self.sin)
+
+
+#: Everyone's frame so many steps ago, 0 to 15; the number is a plain one, known when the program is compiled.
+Frames = Callable[[int], Frame]
+#: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
+Feature = Callable[[ScenarioBank, Scene, Frames], Any]
+
+
+@dataclass(frozen=True)
+class OwnGroup:
+    """A group of features of the user's own.
+
+    Attributes:
+        feature: From bank, scene and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
+            boolean mask ``[...]`` of the rows that are there; ``testing.check_feature`` tells whether it keeps to the
+            rules.
+        name: Of the group; by default the function's own.
+    """
+
+    feature: Feature
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", own_name(self.feature, self.name))
+        if self.name.endswith("_mask"):
+            raise ValueError(f"a group cannot be called {self.name!r}; masks are named so")
+
+    def observe(self, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
+        """The group, and its mask where it has one."""
+        found = self.feature(bank, scene, frames)
+        return _masked(self.name, *found) if isinstance(found, tuple) else {self.name: found}
 
 
 @dataclass(frozen=True)
@@ -39,6 +97,7 @@ class ObservationConfig:
         edges: Whether the road group shows road edges beside lanes and crosswalks.
         lights: How many of the nearest lights on or near the route.
         route: Points of the route, ``route_step_m`` apart.
+        own: Groups beside those of this module.
     """
 
     agents: int = 16
@@ -48,8 +107,10 @@ class ObservationConfig:
     lights: int = 5
     route: int = 10
     route_step_m: float = 5.0
+    own: tuple[OwnGroup, ...] = ()
 
     def __post_init__(self) -> None:
+        refuse_taken("observation.own", [group.name for group in self.own], GROUPS)
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
 
@@ -62,9 +123,7 @@ PRESETS = {
 }
 
 
-def observe(
-    config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Callable[[int], Frame]
-) -> Observation:
+def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
     """The observation of a scene.
 
     Args:
@@ -75,41 +134,24 @@ def observe(
 
     Returns:
         ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last action.
-        ``agents [agents, steps, 12]`` with ``agents_mask [agents,
-        steps]``, ``road [road, 10]``, ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``.
+        ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
+        ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's own groups.
     """
-    view = _View.of(scene)
+    view = View.of(scene)
     result = _ego(config, bank, scene, view) | _agents(config, scene, view, frames)
     if config.road:
         result |= _road(config, bank, scene, view)
-    return result | _lights(config, bank, scene, view) | _route(config, bank, scene, view)
-
-
-@record
-class _View:
-    """The ego frame."""
-
-    xy: Float[Array, " 2"]
-    cos: Float[Array, ""]
-    sin: Float[Array, ""]
-
-    @classmethod
-    def of(cls, scene: Scene) -> _View:
-        now = scene.history[-1]
-        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
-
-    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        return rotate(xy - self.xy, self.cos, -self.sin)
-
-    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        return rotate(xy, self.cos, -self.sin)
+    result |= _lights(config, bank, scene, view) | _route(config, bank, scene, view)
+    for group in config.own:
+        result |= group.observe(bank, scene, frames)
+    return result
 
 
 def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
-def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     past = scene.history[HISTORY - config.steps :]
     direction = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
     turned = view.vector(direction)
@@ -127,9 +169,7 @@ def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
     return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
 
 
-def _agents(
-    config: ObservationConfig, scene: Scene, view: _View, frames: Callable[[int], Frame]
-) -> Observation:
+def _agents(config: ObservationConfig, scene: Scene, view: View, frames: Frames) -> Observation:
     now = frames(0)
     slots = now.valid.shape[0]
     seen = now.valid & (jnp.arange(slots) != scene.slot)
@@ -157,7 +197,7 @@ def _agents(
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
-def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     rows = bank.road[scene.index]
     count = rows.shape[0]
     kind = rows[:, 5]
@@ -183,7 +223,7 @@ def _is_one_of(kind: Float[Array, " R"], kinds: tuple[int, ...]) -> Bool[Array, 
     return (kind >= min(kinds)) & (kind <= max(kinds))
 
 
-def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     line = bank.light_line[scene.index]
     state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
     middle = (line[:, 0:2] + line[:, 2:4]) / 2
@@ -208,7 +248,7 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
 
 
-def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
     # Without a route on lanes the bank holds the log's own path, which nobody may see.

@@ -1,0 +1,189 @@
+"""Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
+
+All R vehicles of a scenario at once. Of all S things, comparing boxes in the vehicle's own frame leaves those near the
+stretch of path ahead; the 8 closest of them are found by eight minima over whole numbers (a sort costs several times
+as much), and only these are measured against the path.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
+from drivax.scenario.agent_paths import PATH_POINTS, PATH_SPEED, AgentPaths
+from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.record import record
+from drivax.simulator.types import Frame
+
+#: How many things are measured against a path.
+CLOSEST = 8
+#: Free space that a corridor has beside the vehicle, m.
+SIDE_M = 0.1
+#: Straight pieces that stand for the path ahead.
+PIECES = 12
+#: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
+BEHIND_M = 1.0
+#: How far a vehicle looks: this, what it drives in so many seconds, what it needs to stop with 3 m/s2; at most so far.
+_LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
+#: Gap of a free road, m; a number, so that gradients stay finite.
+FREE_M = 1e4
+#: The low bits of a key hold the thing, the others its squared distance, to within 0.03 %.
+_SLOT_BITS = 10
+_NONE = 2**31 - 1
+
+
+@record
+class Movers:
+    """R vehicles on their paths.
+
+    Attributes:
+        box: x, y, cos, sin, length, width.
+        z: Height of the box centre, m.
+        arc: Place along the path, m.
+        speed: m/s.
+        slot: Slot of the frame.
+        ignored: Slots of things that do not count, -1 for none.
+    """
+
+    box: Float[Array, "R 6"]
+    z: Float[Array, " R"]
+    arc: Float[Array, " R"]
+    speed: Float[Array, " R"]
+    slot: Int[Array, " R"]
+    ignored: Int[Array, "R 2"]
+
+
+@record
+class Leaders:
+    """What R vehicles have ahead of them.
+
+    Attributes:
+        gap: Free path up to the nearest thing in the corridor, bumper to bumper, m; 10 km where there is none.
+        speed: Speed of that thing along the path, m/s.
+        things: Slots of the closest things around the corridor.
+        real: Whether there is one.
+    """
+
+    gap: Float[Array, " R"]
+    speed: Float[Array, " R"]
+    things: Int[Array, "R 8"]
+    real: Bool[Array, "R 8"]
+
+
+def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]) -> Float[Array, "R 6"]:
+    """Pose (x, y, z, cos, sin) and highest speed at arc lengths of a scenario's paths."""
+    at = arc / paths.spacing[index]
+    low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
+    row = jnp.arange(arc.shape[0])
+    part = jnp.clip(at - low, 0.0, 1.0)[:, None]
+    here = paths.points[index, row, low] * (1 - part) + paths.points[index, row, low + 1] * part
+    unit = jax.lax.rsqrt(jnp.maximum(here[:, 3] ** 2 + here[:, 4] ** 2, 1e-9))
+    return jnp.stack(
+        [here[:, 0], here[:, 1], here[:, 2], here[:, 3] * unit, here[:, 4] * unit, here[:, PATH_SPEED]],
+        axis=-1,
+    )
+
+
+def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
+    """The nearest thing in the corridor of each vehicle.
+
+    The corridor is as wide as the vehicle and 0.1 m more on either side. A thing is in it when its box, as wide as it
+    is across the path, reaches into it and its centre is ahead of the vehicle's; things on another level are not.
+
+    Args:
+        paths: Paths of the bank.
+        index: Row of the bank.
+        movers: The vehicles.
+        frame: Everyone now.
+    """
+    look = _look(movers.speed)
+    nodes, arcs = _path_ahead(paths, index, movers, look)
+    things, real = _closest(movers, frame, nodes)
+    box, velocity = frame.box[things], frame.velocity[things]
+    a, b = nodes[:, None, :-1], nodes[:, None, 1:]
+    u, w = b - a, box[:, :, None, :2] - a
+    square = jnp.maximum(jnp.sum(u * u, axis=-1), 1e-6)
+    part = jnp.clip(jnp.sum(u * w, axis=-1) / square, 0.0, 1.0)
+    apart = w - part[..., None] * u
+    distance = jnp.sum(apart * apart, axis=-1)
+    best = jnp.argmin(distance, axis=-1)[..., None]
+    part, distance, square = (
+        jnp.take_along_axis(one, best, axis=-1)[..., 0]
+        for one in (part, distance, jnp.broadcast_to(square, distance.shape))
+    )
+    row = jnp.arange(things.shape[0])[:, None]
+    best = best[..., 0]
+    way = (nodes[row, best + 1] - nodes[row, best]) * jax.lax.rsqrt(square)[..., None]
+    along = arcs[row, best] + part * (arcs[row, best + 1] - arcs[row, best]) - movers.arc[:, None]
+    cos = jnp.abs(box[..., COS] * way[..., 0] + box[..., SIN] * way[..., 1])
+    sin = jnp.abs(box[..., SIN] * way[..., 0] - box[..., COS] * way[..., 1])
+    half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
+    half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
+    room = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
+    beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
+    inside = real & (distance < room * room) & (along > 0.0) & ~beyond
+    gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
+    first = jnp.argmin(gap, axis=1)[:, None]
+    speed = jnp.sum(velocity * way, axis=-1)
+    gap, speed = (jnp.take_along_axis(one, first, axis=1)[:, 0] for one in (gap, speed))
+    return Leaders(gap=gap, speed=speed, things=things, real=real)
+
+
+def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
+    """How far a vehicle looks along its path, m."""
+    return jnp.minimum(_LOOK_M + _LOOK_S * speed + speed * speed / (2 * _LOOK_MPS2), _LOOK_MOST_M)
+
+
+def _path_ahead(
+    paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
+) -> tuple[Float[Array, "R 13 2"], Float[Array, "R 13"]]:
+    """Points of the path from the one behind the vehicle to as far as it looks, and their arc lengths."""
+    spacing = paths.spacing[index]
+    # One point more than it takes, since the first one lies behind.
+    stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
+    first = (movers.arc / spacing).astype(jnp.int32)
+    place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
+    nodes = paths.points[index, jnp.arange(place.shape[0])[:, None], place, :2]
+    return nodes, place * spacing[:, None]
+
+
+def _closest(
+    movers: Movers, frame: Frame, nodes: Float[Array, "R 13 2"]
+) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
+    """The 8 closest things whose box comes near the stretch ahead, compared in each vehicle's own frame."""
+    me, box = movers.box[:, None], frame.box[None]
+    cos, sin = me[..., COS], me[..., SIN]
+    rest = nodes - me[..., :2]
+    ahead, left = (
+        rest[..., 0] * cos + rest[..., 1] * sin,
+        rest[..., 1] * cos - rest[..., 0] * sin,
+    )
+    half = me[..., WIDTH] / 2 + SIDE_M
+    far, near = ahead.max(axis=1, keepdims=True), ahead.min(axis=1, keepdims=True)
+    near -= me[..., LENGTH] / 2 + BEHIND_M
+    low, high = left.min(axis=1, keepdims=True) - half, left.max(axis=1, keepdims=True) + half
+    dx, dy = box[..., X] - me[..., X], box[..., Y] - me[..., Y]
+    ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+    turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
+    turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
+    long, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
+    reach_ahead, reach_left = turn_cos * long + turn_sin * wide, turn_sin * long + turn_cos * wide
+    slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
+    counts = frame.valid & (slot != movers.slot[:, None])
+    counts &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
+    counts &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
+    counts &= (ahead > near - reach_ahead) & (ahead < far + reach_ahead)
+    counts &= (left > low - reach_left) & (left < high + reach_left)
+    # Floats that are not negative are ordered like their bits; the low ones give way to the slot.
+    bits = jax.lax.bitcast_convert_type(
+        jax.lax.stop_gradient(dx * dx + dy * dy).astype(jnp.float32), jnp.int32
+    )
+    key = jnp.where(counts, (bits & ~((1 << _SLOT_BITS) - 1)) | slot, _NONE)
+    found = [jnp.min(key, axis=1, keepdims=True)]
+    for _ in range(CLOSEST - 1):
+        found.append(jnp.min(jnp.where(key > found[-1], key, _NONE), axis=1, keepdims=True))
+    chosen = jnp.concatenate(found, axis=1)
+    real = chosen < _NONE
+    return jnp.where(real, chosen & ((1 << _SLOT_BITS) - 1), 0), real
