@@ -1,7 +1,8 @@
 """The same seed gives the same bits; batch size, neighbours and automatic resets change no episode.
 
 Bits are equal where one compiled program runs. Programs of other batch sizes round differently (vectorised and scalar
-tails), so between them truths and counts are equal and numbers agree to rounding.
+tails), so between them truths and counts are equal and numbers agree to rounding. The quick run compares single steps
+(``tests/simulator/test_simulator.py``).
 """
 
 import jax
@@ -57,6 +58,7 @@ def check_batches(simulator, bank):
     same_but_rounding(whole, jax.tree.map(lambda *leaf: np.concatenate(leaf), *pairs))
 
 
+@pytest.mark.slow
 def test_neither_batch_size_nor_neighbours_matter(world):
     check_batches(Simulator(Task(metrics=METRICS, to_the_end=True)), world)
 
@@ -66,6 +68,7 @@ def test_neither_batch_size_nor_neighbours_matter_to_any_metric(world):
     check_batches(Simulator(judging(Task())), world)
 
 
+@pytest.mark.slow
 def test_automatic_resets_change_no_episode(world):
     """Three environments drive six scenarios one after the other; each episode is what it is by itself."""
     simulator = Simulator(Task(metrics=METRICS))

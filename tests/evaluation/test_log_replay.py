@@ -1,4 +1,7 @@
-"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays beside it."""
+"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays beside it.
+
+Six generated logs do so in every quick run (``tests/simulator/test_simulator.py``).
+"""
 
 from functools import cache
 
@@ -41,12 +44,6 @@ def real_windows(folder):
         for recording in detect(file).read(file):
             scenarios += [assemble(window) for window in windows(recording)]
     return scenarios, audit(scenarios)
-
-
-def test_generated_logs_replay_exactly_and_can_be_driven():
-    scenarios = generated(11, 8)
-    check_exact(scenarios)
-    assert (driven_by(DRIVEN, scenarios)["fde"] <= 0.2).all()
 
 
 @pytest.mark.slow

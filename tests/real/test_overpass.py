@@ -11,7 +11,7 @@ from drivax.datasets.formats import detect
 from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
 from drivax.scenario.assemble import assemble, windows, with_ego
-from drivax.scenario.bank import AGENT_Z, ScenarioBank
+from drivax.scenario.bank import AGENT_VALID, AGENT_Z, ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
@@ -31,35 +31,33 @@ def flattened(recording):
 
 
 def moving(recording):
-    """Rows of vehicles that are seen from now to the end and drive at least 5 m."""
+    """Rows of vehicles that are seen for the next 2 s and drive at least 2 m meanwhile."""
     now, tracks = recording.current_step, recording.tracks
-    way = np.hypot(*(tracks.xy[:, -1] - tracks.xy[:, now]).T)
-    seen = tracks.valid[:, now:].all(axis=1)
-    return np.flatnonzero(seen & (tracks.kind == AgentKind.VEHICLE) & (way > 5.0))
+    way = np.hypot(*(tracks.xy[:, now + 20] - tracks.xy[:, now]).T)
+    seen = tracks.valid[:, now : now + 21].all(axis=1)
+    return np.flatnonzero(seen & (tracks.kind == AgentKind.VEHICLE) & (way > 2.0))
 
 
 @pytest.fixture(scope="module")
-def window(real_data):
+def driven(real_data):
+    """Windows of the recording, each with a vehicle of it that moves."""
     (recording,) = detect(real_data / FILE).read(real_data / FILE)
-    return next(iter(windows(recording)))
+    return [(window, int(row)) for window in windows(recording) for row in moving(window)]
 
 
 @pytest.mark.slow
-def test_only_heights_keep_the_levels_apart(window):
-    rows = moving(window)
-    assert len(rows) >= 10
-    real = audit([assemble(with_ego(window, int(row))) for row in rows])
-    flat = audit([assemble(with_ego(flattened(window), int(row))) for row in rows])
-    assert not any(finding["log_collides"] for finding in real)
+def test_only_heights_keep_the_levels_apart(driven):
+    real = audit([assemble(with_ego(window, row)) for window, row in driven])
+    flat = audit([assemble(with_ego(flattened(window), row)) for window, row in driven])
+    assert len(real) >= 20 and not any(finding["log_collides"] for finding in real)
     off_real, off_flat = (sum(f["log_offroad_fraction"] for f in found) for found in (real, flat))
-    assert off_real < 0.05 and off_flat > off_real + 0.1, (off_real, off_flat)
+    assert off_real < 0.01 * len(real) and off_flat > off_real, (off_real, off_flat)
 
 
 @pytest.mark.slow
-def test_the_height_of_a_car_is_that_of_its_road(window):
+def test_the_height_of_a_car_is_that_of_its_road(driven):
     """Looked up in the map step by step, the height of every replayed car stays with the logged one."""
-    rows = moving(window)[:12]
-    bank = ScenarioBank.from_scenarios([assemble(with_ego(window, int(row))) for row in rows])
+    bank = ScenarioBank.from_scenarios([assemble(with_ego(window, row)) for window, row in driven])
     simulator = Simulator(Task(metrics="none", ends=()))
 
     def one(state, _):
@@ -72,7 +70,8 @@ def test_the_height_of_a_car_is_that_of_its_road(window):
     def heights(index):
         return jax.lax.scan(one, simulator.reset(bank, index), None, 80)[1]
 
-    found, logged = np.asarray(heights(jnp.arange(len(rows)))), np.asarray(bank.agents[:, 11:, 0, AGENT_Z])
-    # Recorded boxes float by some decimetres over the road that was recorded with them.
-    assert np.abs(found - logged).max() < 1.5 and np.median(np.abs(found - logged)) < 0.5
-    assert np.ptp(logged) > 4.0, "both levels are driven on"
+    found, logged = np.asarray(heights(jnp.arange(len(driven)))), np.asarray(bank.agents[:, 11:, 0, AGENT_Z])
+    there = np.asarray(bank.agents[:, 11:, 0, AGENT_VALID]) > 0
+    apart = np.abs(found - logged)[there]
+    # Recorded boxes float by centimetres over the road that was recorded with them.
+    assert np.quantile(apart, 0.99) < 0.5 and np.median(apart) < 0.1

@@ -33,9 +33,9 @@ class Wrong(own_terms.Drift):
     def start(self, bank, index, step):
         rows = super().start(bank, index, step)
         if self.fault == "order":
-            return rows.at[:, 5:7].multiply(1.0 + jnp.arange(len(rows))[:, None] / len(rows))
+            return rows.at[:, 5:7].multiply(1.0 + jnp.arange(len(rows))[:, None] / 100.0)
         if self.fault == "padding":
-            return rows.at[:, 5:7].multiply(len(rows) / 24.0)
+            return rows.at[:, 5:7].multiply(len(rows) / 40.0)
         if self.fault == "litter":
             return rows.at[:, 5:7].multiply(1.0 + jnp.abs(rows[:, 0]).max() / 2000.0)
         return jnp.zeros((9000,)).at[: rows.size].set(rows.ravel()) if self.fault == "size" else rows
@@ -68,7 +68,7 @@ class Wrong(own_terms.Drift):
     ("fault", "words"),
     {
         "form": "changes the form of its state", "size": "carries 36000 bytes", "random": "another result every time",
-        "shape": r"float32\[24, 7\]", "nan": "is not finite", "half": "half valid", "unit": "directions of length 1.1",
+        "shape": r"float32\[40, 7\]", "nan": "is not finite", "half": "half valid", "unit": "directions of length 1.1",
         "past": "says another thing of the past", "leap": "moves an agent by", "order": "in another order",
         "padding": "more empty slots", "litter": "rows hold something else", "turn": "turned and shifted",
     }.items(),

@@ -39,21 +39,21 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
     Raises:
         BrokenContract: It does not; the message says which rule and what to do.
     """
-    config = find_named(config) if isinstance(config, str) else config
-    config = config() if isinstance(config, type) else config
-    what = f"algorithm {type(config).__name__}"
+    found: Any = find_named(config) if isinstance(config, str) else config
+    found = found() if isinstance(found, type) else found
+    what = f"algorithm {type(found).__name__}"
     expect(
-        isinstance(config, AlgorithmConfig),
+        isinstance(found, AlgorithmConfig),
         f"{what} lacks build or steps_per_iteration",
         "see AlgorithmConfig",
     )
     expect(
-        isinstance(config.steps_per_iteration, int) and config.steps_per_iteration > 0,
-        f"{what} counts {config.steps_per_iteration!r} steps per iteration",
+        isinstance(found.steps_per_iteration, int) and found.steps_per_iteration > 0,
+        f"{what} counts {found.steps_per_iteration!r} steps per iteration",
         "count environment steps as a whole number",
     )
     bank, simulator = worlds.worlds(), Simulator(_TASK)
-    learner = config.build(simulator, bank, _ITERATIONS)
+    learner = found.build(simulator, bank, _ITERATIONS)
     expect(isinstance(learner, Learner), f"{what} builds no Learner", "give it init, iterate and planner")
     state = _check_iterations(what, learner, bank)
     _check_planner(what, learner, bank, simulator, state.parameters)

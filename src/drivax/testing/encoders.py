@@ -38,12 +38,12 @@ def check_encoder(config: EncoderConfig | str) -> None:
     Raises:
         BrokenContract: It does not; the message says which rule and what to do.
     """
-    config = find_named(config) if isinstance(config, str) else config
-    config = config() if isinstance(config, type) else config
-    what = f"encoder {type(config).__name__}"
-    expect(isinstance(config, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
+    found: Any = find_named(config) if isinstance(config, str) else config
+    found = found() if isinstance(found, type) else found
+    what = f"encoder {type(found).__name__}"
+    expect(isinstance(found, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
     for number, spec in enumerate(_SPECS):
-        encoder: Any = config.build(spec, nnx.Rngs(0))
+        encoder: Any = found.build(spec, nnx.Rngs(0))
         batch = _observations(spec, number)
         embedding = compiled(what, encoder, batch)
         width = getattr(encoder, "width", None)
@@ -53,7 +53,7 @@ def check_encoder(config: EncoderConfig | str) -> None:
             "give [*batch, width] float32, and say width",
         )
         check_numbers(what, embedding)
-        _check_state(what, config, spec, encoder)
+        _check_state(what, found, spec, encoder)
         _check_rows(what, encoder, batch, embedding)
         _check_masks(what, encoder, spec, batch, embedding)
         _check_gradients(what, encoder, batch)

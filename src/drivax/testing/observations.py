@@ -45,8 +45,8 @@ def check_feature(feature: Feature | str) -> None:
     Raises:
         BrokenContract: It does not; the message says which rule and what to do.
     """
-    feature = find_named(feature) if isinstance(feature, str) else feature
-    group = OwnGroup(feature)
+    found: Any = find_named(feature) if isinstance(feature, str) else feature
+    group = OwnGroup(found)
     what = f"observation feature {group.name!r}"
     simulator = Simulator(Task())
 
@@ -54,7 +54,7 @@ def check_feature(feature: Feature | str) -> None:
         def frames(back: int) -> Frame:
             return simulator.frame(bank, scene, alone(scene), back)
 
-        _check_form(what, feature(bank, scene, frames))
+        _check_form(what, found(bank, scene, frames))
         return group.observe(bank, scene, frames)
 
     program = Program(what, seen, (None, 0))

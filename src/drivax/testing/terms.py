@@ -45,11 +45,12 @@ def check_reward(term: Term | str) -> None:
     Raises:
         BrokenContract: It does not; the message says which rule and what to do.
     """
-    term = find_named(term) if isinstance(term, str) else term
-    what = f"reward term {own_name(term)!r}"
+    found: Any = find_named(term) if isinstance(term, str) else term
+    found = found() if isinstance(found, type) else found
+    what = f"reward term {own_name(found)!r}"
 
     def value(moment: Moments) -> Any:
-        return term(moment.before, moment.found.facts, moment.found.surroundings)
+        return found(moment.before, moment.found.facts, moment.found.surroundings)
 
     _check_moments(what, value, check_scalar)
 
@@ -68,14 +69,15 @@ def check_metric(metric: Metric | str) -> None:
         BrokenContract: It does not; the message says which rule and what to do.
     """
     what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.text!r}"
-    metric = find_named(metric) if isinstance(metric, str) else metric
+    found: Any = find_named(metric) if isinstance(metric, str) else metric
+    expect(isinstance(found, Metric), f"{what} is no Metric", "see metrics.catalogue.Metric")
     expect(
-        metric.unit and metric.text,
+        found.unit and found.text,
         f"{what} has no unit or text",
         "tables and reports print them; '-' is the unit of shares",
     )
-    if metric.of is not None:
-        step = metric.of
+    if found.of is not None:
+        step = found.of
 
         def value(moment: Moments) -> tuple[Any, Any]:
             now = Moment(moment.found, moment.start, jnp.ones((), bool))
@@ -86,8 +88,8 @@ def check_metric(metric: Metric | str) -> None:
 
         _check_moments(what, value, check_scalar if not step.late else _check_rows)
         _check_reads(what, value, step.reads)
-    if metric.compute is not None:
-        _check_computed(what, metric)
+    if found.compute is not None:
+        _check_computed(what, found)
 
 
 def _check_moments(

@@ -38,7 +38,7 @@ _LOOKS = (30, 45, 60, 75)
 _PLACES = ((0.0, 0.0, 1.0), (1.7, 0.2, 1.5), (-4.0, -0.3, 0.0), (3.6, 3.0, 1.0), (-9.0, 0.1, 2.5))
 #: What padding is filled with where it must not matter.
 GARBAGE = 777.0
-_CAPACITY = replace(CAPACITIES["default"], name="testing", agents=24, parked=24)
+_CAPACITY = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
 
 
 @record
