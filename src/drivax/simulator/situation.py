@@ -64,22 +64,19 @@ def measure(
         previous: Everyone one step ago.
         contacts: Contact codes of the step before.
         lights: What is remembered about stop lines.
-        reads: Names of the facts that are wanted. The others are None, and what only they need is not computed: contact
-            codes and light memory then stay as they are.
+        reads: Names of the facts that are wanted; the others are None, and what only they need is not computed.
 
     Returns:
         The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
     """
     me, z = frame.box[scene.slot], frame.z[scene.slot]
-    height = bank.agent_box[scene.index, scene.slot, 2]
-    ground = z - height / 2
+    ground = z - (height := bank.agent_box[scene.index, scene.slot, 2]) / 2
     lanes, beyond, left_map, offroad = _on_the_map(bank, scene.index, me, ground)
     moved = norm(scene.history[-1, :2] - scene.history[-2, :2])
     route = project_on_route(bank, scene.index, me[:2], scene.route_m, 1.5 * moved + 2.0)
     z = jnp.where(lanes.near, lanes.z + height / 2, z)
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
-    unlawful = lanes.leaving_lane | offroad
-    codes, at_fault, collision_type, ttc = _touch(scene, frame, previous, contacts, unlawful, reads)
+    codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
@@ -88,8 +85,8 @@ def measure(
     acceleration, jerk, lateral = _rates(scene.history)
     facts = Facts(
         collision=((codes == Contact.HIT) | (codes == Contact.AT_FAULT)).any(),
-        at_fault=at_fault,
-        collision_type=collision_type,
+        at_fault=fault,
+        collision_type=kind,
         offroad=offroad,
         offroad_m=beyond,
         left_map=left_map,
