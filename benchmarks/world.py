@@ -65,7 +65,12 @@ def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldC
     if not note.is_file():
         made = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
         families = {
-            name: {"kept": c.kept, "rejection_rate": c.rejection_rate, "causes": c.rejected}
+            name: {
+                "kept": c.kept,
+                "rejection_rate": c.rejection_rate,
+                "causes": c.rejected,
+                "unsuited": c.unsuited,
+            }
             for name, c in made.families.items()
         }
         note.write_text(json.dumps({"families": families}))
@@ -99,6 +104,7 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
         {
             "family": scenario.tags["family"],
             "event": scenario.tags.get("event"),
+            "critical": "critical" in scenario.tags,
             "segment": name["segment"],
             "broken_limits": uncomfortable(scenario),
             "noise_m": largest_noise_m(scenario, NOISE),
@@ -202,6 +208,7 @@ def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: World
             name: share(sum(name not in row["broken_limits"] for row in common), len(common))
             for name in LIMITS
         },
+        "critical": share(sum(row["critical"] for row in common), len(common)),
         "background_overlap": share(sum(row["overlaps"] > 0 for row in both), len(both)),
         "largest_noise_m": max(row["noise_m"] for row in both),
         "difficulty": {name: difficulty(rows, rare, name) for name in planners},
