@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,11 @@ NOISE = WorldConfig().noise
 def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldConfig) -> dict[str, Any]:
     """Generates a set if it is not there, and tells how that went."""
     note = folder.with_suffix(".json")
-    if not note.is_file():
+    if note.is_file():
+        source = json.loads((folder / "manifest.json").read_text())["source"]
+        if (source["world"], source["config"]) != (WORLD_VERSION, json.loads(json.dumps(asdict(world)))):
+            raise SystemExit(f"{folder} is of another world; remove it")
+    else:
         made = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
         families = {
             name: {
@@ -88,12 +92,12 @@ def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
     return {"scenarios": scenarios, "workers": workers, "scenarios_per_second": scenarios / seconds}
 
 
-def measured(folder: Path, planners: tuple[str, ...]) -> list[dict[str, Any]]:
-    """One row per scenario: tags, what its arrays show, and how every planner drove it."""
+def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
+    """One row per scenario: tags, what its arrays show, how the expert drove it, and the planners the first ones."""
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
-        rows += _chunk(scenarios, planners)
+        rows += _chunk(scenarios, planners if driven is None or first < driven else ())
         print(f"  {folder.name}: {len(rows)} of {len(data)} scenarios", flush=True)
     return rows
 
@@ -123,8 +127,8 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
 
 
 def rate_of(rows: list[dict[str, Any]], column: str) -> dict[str, float | int]:
-    """Share of rows in which a metric is 1, where it is defined."""
-    values = [row[column] for row in rows if np.isfinite(row[column])]
+    """Share of rows in which a metric is 1, where it was measured and is defined."""
+    values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
     return share(int(sum(value > 0.5 for value in values)), len(values))
 
 
@@ -230,9 +234,9 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }
     planners = tuple(planner for planner in DRIVERS if planner in PLANNERS)
     made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
-    rows = {key: measured(path, planners) for key, (path, *_) in sets.items()}
+    rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
     return {
-        "command": f"python benchmarks/world.py --scenarios {args.scenarios} --domain {args.domain}",
+        "command": " ".join(["python", "benchmarks/world.py", *sys.argv[1:]]),
         "scenarios": all_count,
         "rare_scenarios": rare_count,
         "seed": args.seed,
@@ -266,6 +270,12 @@ def main() -> None:
         type=int,
         default=1000,
         help="scenarios of the set that is only timed; nothing else may run",
+    )
+    parser.add_argument(
+        "--driven",
+        type=int,
+        default=None,
+        help="scenarios that planners other than the expert drive (of each set)",
     )
     parser.add_argument("--rare-rate", type=float, default=0.05)
     parser.add_argument("--domain", choices=sorted(DOMAINS), default="grid")

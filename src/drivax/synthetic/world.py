@@ -82,7 +82,7 @@ class WorldConfig:
 
     domain: str = "grid"
     rare_rate: float = 0.05
-    critical_share: float = 0.65
+    critical_share: float = 0.8
     lane_change_share: float = 0.35
     signal_timing: SignalTiming = (0.34, 0.33, 0.33)
     scenarios_per_map: int = 2
