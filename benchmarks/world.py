@@ -6,6 +6,7 @@ recorded, with their perception noise: the generator judged its expert on the tr
 spare. The comparison with real recordings is ``benchmarks/world_resemblance.py``.
 
 Run: python benchmarks/world.py --scenarios 256 --workers 2 [--domain ring] [--keep FOLDER] [--write]
+     python benchmarks/world.py --timed 1000   (scenarios per second, on a machine that does nothing else)
      python benchmarks/world.py --table        (results of both domains into the guide)
 """
 
@@ -243,17 +244,29 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "domain": args.domain,
         **summary(rows["all"], rows["rare"], world),
         "generation": made,
-        "speed": speed(args.domain, args.timed, args.workers),
-        "versions": {
-            "drivax": metadata.version("drivax"),
-            "world": WORLD_VERSION,
-            "numpy": np.__version__,
-            "jax": metadata.version("jax"),
-            "python": platform.python_version(),
-            "processor": platform.processor() or platform.machine(),
-            "cores": os.cpu_count(),
-        },
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, Any]:
+    """What a result was made with."""
+    return {
+        "drivax": metadata.version("drivax"),
+        "world": WORLD_VERSION,
+        "numpy": np.__version__,
+        "jax": metadata.version("jax"),
+        "python": platform.python_version(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def stored(name: str, result: dict[str, Any]) -> None:
+    """Writes a result."""
+    target = RESULTS / name
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(json.dumps(result, indent=1) + "\n")
+    partial.replace(target)
 
 
 def main() -> None:
@@ -268,8 +281,8 @@ def main() -> None:
     parser.add_argument(
         "--timed",
         type=int,
-        default=1000,
-        help="scenarios of the set that is only timed; nothing else may run",
+        default=None,
+        help="only time sets of so many scenarios of both domains, and store that; nothing else may run",
     )
     parser.add_argument(
         "--driven",
@@ -288,9 +301,14 @@ def main() -> None:
     )
     args = parser.parse_args()
     if args.table:
-        print(
-            into_guide({name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS})
-        )
+        rates = json.loads((RESULTS / "world_speed.json").read_text())
+        results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
+        print(into_guide({name: result | {"speed": rates[name]} for name, result in results.items()}))
+        return
+    if args.timed is not None:
+        rates = {name: speed(name, args.timed, args.workers) for name in DOMAINS}
+        print("\n".join(f"{name}: {made['scenarios_per_second']:.1f}/s" for name, made in rates.items()))
+        stored("world_speed.json", rates | {"versions": versions()})
         return
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)
@@ -302,10 +320,7 @@ def main() -> None:
     width = max(len(name) for name, _ in table)
     print("\n".join(f"{name:<{width}}  {value}" for name, value in table))
     if args.write:
-        target = RESULTS / f"world_{args.domain}.json"
-        partial = target.with_name(f".{target.name}.partial")
-        partial.write_text(json.dumps(result, indent=1) + "\n")
-        partial.replace(target)
+        stored(f"world_{args.domain}.json", result)
 
 
 if __name__ == "__main__":

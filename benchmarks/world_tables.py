@@ -149,9 +149,6 @@ def _coverage(result: Result) -> list[tuple[str, str]]:
 
 def _generation(result: Result) -> list[tuple[str, str]]:
     found = []
-    timed = result["speed"]
-    rate = f"{timed['scenarios_per_second']:.1f} of {timed['scenarios']} with {timed['workers']} workers"
-    found.append(("scenarios per second, the whole command", rate))
     for name, made in result["generation"].items():
         for family, one in made["families"].items():
             causes = ", ".join(f"{k} {v}" for k, v in sorted(one["causes"].items()))
