@@ -18,7 +18,7 @@ from drivax.synthetic.signals import Colour
 #: noise, must not touch either.
 EGO_SKIN_M = 0.1
 #: An ego that moves less than this shows nothing, m.
-_LEAST_M = 5.0
+_LEAST_M = 10.0
 #: A car stands below this, within so many metres before a stop line, in the last seconds before it passes.
 _STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
 #: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.

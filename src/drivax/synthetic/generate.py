@@ -26,6 +26,8 @@ from drivax.tracking.workers import worker_pool
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
+#: Chunks per worker that may wait to be written: so many keep workers busy while the audit is compiled.
+_AHEAD = 12
 _EVENT = "event"
 
 #: Seeds from here on belong to the fixed splits of ``synthetic.benchmark``.
@@ -225,8 +227,7 @@ def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, 
     try:
         for first, last in spans:
             waiting.append(pool.submit(_draw, first, last, seed, options))
-            # A few chunks ahead keep everyone busy; more would only fill memory.
-            if len(waiting) > 3 * options.workers:
+            if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
         while waiting:
             yield from waiting.popleft().result()
