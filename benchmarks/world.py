@@ -6,6 +6,7 @@ recorded, with their perception noise: the generator judged its expert on the tr
 spare. The comparison with real recordings is ``benchmarks/world_resemblance.py``.
 
 Run: python benchmarks/world.py --scenarios 256 --workers 2 [--domain ring] [--keep FOLDER] [--write]
+     python benchmarks/world.py --timed 1000   (scenarios per second, on a machine that does nothing else)
      python benchmarks/world.py --table        (results of both domains into the guide)
 """
 
@@ -20,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -62,10 +63,19 @@ NOISE = WorldConfig().noise
 def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldConfig) -> dict[str, Any]:
     """Generates a set if it is not there, and tells how that went."""
     note = folder.with_suffix(".json")
-    if not note.is_file():
+    if note.is_file():
+        source = json.loads((folder / "manifest.json").read_text())["source"]
+        if (source["world"], source["config"]) != (WORLD_VERSION, json.loads(json.dumps(asdict(world)))):
+            raise SystemExit(f"{folder} is of another world; remove it")
+    else:
         made = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
         families = {
-            name: {"kept": c.kept, "rejection_rate": c.rejection_rate, "causes": c.rejected}
+            name: {
+                "kept": c.kept,
+                "rejection_rate": c.rejection_rate,
+                "causes": c.rejected,
+                "unsuited": c.unsuited,
+            }
             for name, c in made.families.items()
         }
         note.write_text(json.dumps({"families": families}))
@@ -83,12 +93,12 @@ def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
     return {"scenarios": scenarios, "workers": workers, "scenarios_per_second": scenarios / seconds}
 
 
-def measured(folder: Path, planners: tuple[str, ...]) -> list[dict[str, Any]]:
-    """One row per scenario: tags, what its arrays show, and how every planner drove it."""
+def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
+    """One row per scenario: tags, what its arrays show, how the expert drove it, and the planners the first ones."""
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
-        rows += _chunk(scenarios, planners)
+        rows += _chunk(scenarios, planners if driven is None or first < driven else ())
         print(f"  {folder.name}: {len(rows)} of {len(data)} scenarios", flush=True)
     return rows
 
@@ -99,6 +109,7 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
         {
             "family": scenario.tags["family"],
             "event": scenario.tags.get("event"),
+            "critical": "critical" in scenario.tags,
             "segment": name["segment"],
             "broken_limits": uncomfortable(scenario),
             "noise_m": largest_noise_m(scenario, NOISE),
@@ -117,8 +128,8 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
 
 
 def rate_of(rows: list[dict[str, Any]], column: str) -> dict[str, float | int]:
-    """Share of rows in which a metric is 1, where it is defined."""
-    values = [row[column] for row in rows if np.isfinite(row[column])]
+    """Share of rows in which a metric is 1, where it was measured and is defined."""
+    values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
     return share(int(sum(value > 0.5 for value in values)), len(values))
 
 
@@ -202,6 +213,7 @@ def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: World
             name: share(sum(name not in row["broken_limits"] for row in common), len(common))
             for name in LIMITS
         },
+        "critical": share(sum(row["critical"] for row in common), len(common)),
         "background_overlap": share(sum(row["overlaps"] > 0 for row in both), len(both)),
         "largest_noise_m": max(row["noise_m"] for row in both),
         "difficulty": {name: difficulty(rows, rare, name) for name in planners},
@@ -223,26 +235,38 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     }
     planners = tuple(planner for planner in DRIVERS if planner in PLANNERS)
     made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
-    rows = {key: measured(path, planners) for key, (path, *_) in sets.items()}
+    rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
     return {
-        "command": f"python benchmarks/world.py --scenarios {args.scenarios} --domain {args.domain}",
+        "command": " ".join(["python", "benchmarks/world.py", *sys.argv[1:]]),
         "scenarios": all_count,
         "rare_scenarios": rare_count,
         "seed": args.seed,
         "domain": args.domain,
         **summary(rows["all"], rows["rare"], world),
         "generation": made,
-        "speed": speed(args.domain, args.timed, args.workers),
-        "versions": {
-            "drivax": metadata.version("drivax"),
-            "world": WORLD_VERSION,
-            "numpy": np.__version__,
-            "jax": metadata.version("jax"),
-            "python": platform.python_version(),
-            "processor": platform.processor() or platform.machine(),
-            "cores": os.cpu_count(),
-        },
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, Any]:
+    """What a result was made with."""
+    return {
+        "drivax": metadata.version("drivax"),
+        "world": WORLD_VERSION,
+        "numpy": np.__version__,
+        "jax": metadata.version("jax"),
+        "python": platform.python_version(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def stored(name: str, result: dict[str, Any]) -> None:
+    """Writes a result."""
+    target = RESULTS / name
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(json.dumps(result, indent=1) + "\n")
+    partial.replace(target)
 
 
 def main() -> None:
@@ -257,8 +281,14 @@ def main() -> None:
     parser.add_argument(
         "--timed",
         type=int,
-        default=1000,
-        help="scenarios of the set that is only timed; nothing else may run",
+        default=None,
+        help="only time sets of so many scenarios of both domains, and store that; nothing else may run",
+    )
+    parser.add_argument(
+        "--driven",
+        type=int,
+        default=None,
+        help="scenarios that planners other than the expert drive (of each set)",
     )
     parser.add_argument("--rare-rate", type=float, default=0.05)
     parser.add_argument("--domain", choices=sorted(DOMAINS), default="grid")
@@ -271,9 +301,14 @@ def main() -> None:
     )
     args = parser.parse_args()
     if args.table:
-        print(
-            into_guide({name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS})
-        )
+        rates = json.loads((RESULTS / "world_speed.json").read_text())
+        results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
+        print(into_guide({name: result | {"speed": rates[name]} for name, result in results.items()}))
+        return
+    if args.timed is not None:
+        rates = {name: speed(name, args.timed, args.workers) for name in DOMAINS}
+        print("\n".join(f"{name}: {made['scenarios_per_second']:.1f}/s" for name, made in rates.items()))
+        stored("world_speed.json", rates | {"versions": versions()})
         return
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)
@@ -285,10 +320,7 @@ def main() -> None:
     width = max(len(name) for name, _ in table)
     print("\n".join(f"{name:<{width}}  {value}" for name, value in table))
     if args.write:
-        target = RESULTS / f"world_{args.domain}.json"
-        partial = target.with_name(f".{target.name}.partial")
-        partial.write_text(json.dumps(result, indent=1) + "\n")
-        partial.replace(target)
+        stored(f"world_{args.domain}.json", result)
 
 
 if __name__ == "__main__":

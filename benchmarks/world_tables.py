@@ -116,6 +116,7 @@ def lines(result: Result) -> list[tuple[str, str]]:
     found.append(("expert comfortable, common (0.95)", text(result["expert_comfortable_common"])))
     found += [(f"  within {name}", text(one)) for name, one in result["within_limits_common"].items()]
     found.append(("background overlaps (0.005)", text(result["background_overlap"])))
+    found.append(("critical, of the common", text(result["critical"])))
     room = (
         f"{result['largest_noise_m']:.3f} m; ego was judged with {EGO_SKIN_M:.2f} m to spare, without noise"
     )
@@ -148,13 +149,11 @@ def _coverage(result: Result) -> list[tuple[str, str]]:
 
 def _generation(result: Result) -> list[tuple[str, str]]:
     found = []
-    timed = result["speed"]
-    rate = f"{timed['scenarios_per_second']:.1f} of {timed['scenarios']} with {timed['workers']} workers"
-    found.append(("scenarios per second, the whole command", rate))
     for name, made in result["generation"].items():
         for family, one in made["families"].items():
             causes = ", ".join(f"{k} {v}" for k, v in sorted(one["causes"].items()))
-            found.append((f"{name}: {family} rejected", f"{one['rejection_rate']:.3f} ({causes})"))
+            rejected = f"{one['rejection_rate']:.3f} ({causes}); {one['unsuited']} without occasion"
+            found.append((f"{name}: {family} rejected", rejected))
     return found
 
 

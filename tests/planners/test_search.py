@@ -12,6 +12,7 @@ import pytest
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
+from drivax.planners.prediction import rolled_out
 from drivax.planners.search import SearchPlanner, advanced
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
@@ -123,6 +124,53 @@ def test_it_lets_in_who_changes_into_its_lane():
     assert throttle < -0.2
     throttle, _ = action(straight_road([car(0, 0, 0, 11), car(8, 3.7, 0.0, 8), beside]))
     assert throttle > 0.0
+
+
+def test_it_does_not_cross_just_before_somebody_who_may_come_a_little_early():
+    """Ego's rear leaves the other's way after 2.9 s; at 8 m/s its front is then 3.3 - 2.4 = 0.9 m before ego's."""
+    crossing = partial(car, 30, heading=np.pi / 2, speed=8)
+    throttle, _ = action(straight_road([car(0, 0, 0, 10), crossing(-2.9 * 8 - 3.3)]))
+    assert throttle < -0.1
+    # 2.5 s later there is no hurry.
+    throttle, _ = action(straight_road([car(0, 0, 0, 10), crossing(-5.4 * 8 - 3.3)]))
+    assert throttle * 6.0 == pytest.approx(2.0 * (1 - (10 / 13.4) ** 4), rel=1e-2)
+
+
+def test_it_hurries_out_of_the_way_of_who_would_hit_its_tail():
+    """Braking from 13.3 m/s takes 14.7 m, the other crosses 6 m ahead; at the limit IDM adds nothing."""
+    throttle, steering = action(straight_road([car(0, 0, 0, 13.3), car(6, -12, np.pi / 2, 10)]))
+    assert throttle * 6.0 > 1.0 and abs(steering) < 0.01
+
+
+def test_it_does_not_leave_its_lane_to_overtake_who_drives():
+    for ahead in (car(25, 0, 0, 8), car(15, 0, 0, 6)):
+        throttle, steering = action(straight_road([car(0, 0, 0, 10), ahead]))
+        assert throttle < 0.05 and abs(steering) < 0.01
+
+
+def test_who_accelerates_is_expected_to_go_on_for_a_while():
+    boxes = jnp.asarray([[0.0, 0.0, 1.0, 0.0, 4.8, 2.0]] * 3)
+    velocity = jnp.asarray([[5.0, 0.0], [12.0, 0.0], [5.0, 0.0]])
+    box, speed = rolled_out(boxes, velocity, jnp.zeros(3), jnp.asarray([1.5, 1.5, -1.5]))
+    # After 2 s 5 + 2 x 1.5 m/s; up to 13.4 m/s; who brakes does so for 1 s.
+    assert np.asarray(speed)[-1] == pytest.approx([8.0, 13.4, 3.5])
+    # 2 s of acceleration and 3 s at 8 m/s; the sum over steps of 0.25 s is a little larger.
+    assert float(box[-1, 0, 0]) == pytest.approx(5.0 * 2 + 1.5 * 2.0**2 / 2 + 3 * 8.0, abs=0.5)
+
+
+def test_it_brakes_for_a_person_who_starts_to_walk_onto_the_road():
+    """At 0.6 m/s it would still be beside the lane after the 2.5 s that ego needs; it may also run."""
+    starts, away = PERSON(25, -3.7, np.pi / 2, 0.6), PERSON(25, -3.7, -np.pi / 2, 0.6)
+    beside = car(2.0, 3.7, 0, 10)
+    assert action(straight_road([car(0, 0, 0, 10), starts, beside]))[0] < -0.1
+    assert action(straight_road([car(0, 0, 0, 10), away, beside]))[0] > 0.1
+
+
+def test_it_makes_room_for_a_cyclist_who_swerves_towards_it():
+    """20 degrees towards ego's lane from 1.7 m beside its middle; at a constant velocity it would end up left of it."""
+    rider = partial(car, length=1.8, width=0.6, kind=AgentKind.CYCLIST)
+    _, steering = action(straight_road([car(0, 0, 0, 12), rider(30, -1.7, np.pi - 0.35, 5.5)]))
+    assert steering > 0.01
 
 
 def test_what_is_driven_in_thought_is_what_happens():

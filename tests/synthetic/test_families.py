@@ -212,7 +212,12 @@ def test_bays_lie_inside_the_road_beside_their_lane(family, seed):
 
 
 @pytest.mark.parametrize(
-    ("family", "seed"), [pytest.param(f, s, id=f"{f.name}-{s}") for f in FAMILIES for s in (1, 2)]
+    ("family", "seed"),
+    [
+        pytest.param(f, s, id=f"{f.name}-{s}", marks=[pytest.mark.slow] if s > 2 else [])
+        for f in FAMILIES
+        for s in range(1, 13)
+    ],
 )
 def test_every_route_can_be_driven_by_pure_pursuit(family, seed):
     network, inside = built(family, seed), ground(family, seed)

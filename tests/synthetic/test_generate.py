@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,9 @@ from drivax.errors import UsageError
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import dump
+from drivax.synthetic import generate as generation
 from drivax.synthetic.generate import RESERVED_SEED, FamilyCount, GeneratedSet, Generation, generate
-from drivax.synthetic.world import WORLD_VERSION, WorldConfig
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 
 SCENARIOS = 7
 
@@ -36,7 +39,28 @@ def test_counts_and_progress(one_worker):
     _, result, progress = one_worker
     assert progress == [(done, SCENARIOS) for done in range(1, SCENARIOS + 1)]
     assert result.scenarios == SCENARIOS == sum(count.kept for count in result.families.values())
-    assert FamilyCount(3, {"a": 1, "b": 2}).rejection_rate == 0.5
+    assert FamilyCount(3, {"a": 1, "b": 2}, unsuited=7).rejection_rate == 0.5
+    assert FamilyCount(0, {}, unsuited=7).rejection_rate == 0.0
+
+
+def test_a_rejected_draw_counts_for_its_own_family(tmp_path, monkeypatch):
+    drawn = []
+
+    def one(seed, index, config):
+        made = generate_one(seed, index, config)
+        causes = {
+            ("nowhere", "ego_collides"): 2,
+            ("nowhere", "no_threat"): 3,
+            (made.family, "no_occasion"): 1,
+        }
+        drawn.append(made.family)
+        return dataclasses.replace(made, rejected=causes)
+
+    monkeypatch.setattr(generation, "generate_one", one)
+    made = generate(tmp_path / "set", 2, 5, Generation())
+    assert made.families["nowhere"] == FamilyCount(0, {"ego_collides": 4}, 6)
+    assert sum(count.unsuited for name, count in made.families.items() if name != "nowhere") == 2
+    assert [made.families[name].rejection_rate for name in drawn] == [0.0, 0.0]
 
 
 def test_the_set_is_what_was_asked_for(one_worker):
@@ -54,7 +78,8 @@ def test_the_set_is_what_was_asked_for(one_worker):
         wanted = Flag.LANE_GRAPH | Flag.SPEED_LIMITS | Flag.ROUTE
         assert wanted in scenario.has and Flag.NO_FUTURE not in scenario.has
         assert Flag.LIGHTS in scenario.has
-        assert (scenario.light_state >= 0).any() == (families[index] == "signalised_junction")
+        lit = bool(generate_one(5, index, WorldConfig()).recording.lights)
+        assert (scenario.light_state >= 0).any() == lit
         # The route leads along the way that the expert drives, and on.
         n = int(scenario.route_points[0])
         route = scenario.route_xy[0, :n]
@@ -125,19 +150,19 @@ def test_the_command_prints_rate_and_rejections(tmp_path, capsys):
 
 
 def test_the_summary_by_hand(tmp_path):
-    counts = {"curved_road": FamilyCount(30, {"ego_collides": 2}), "x": FamilyCount(10, {})}
+    counts = {"curved_road": FamilyCount(30, {"ego_collides": 2}), "x": FamilyCount(10, {}, 1200)}
     text = summary(GeneratedSet(tmp_path, 40, 4.0, counts))
     assert text.splitlines() == [
         f"{tmp_path}: 40 scenarios in 4.0 s (10.0/s)",
         "  curved_road      30 kept,  6.25% of draws rejected (ego_collides 2)",
-        "  x                10 kept,  0.00% of draws rejected",
+        "  x                10 kept,  0.00% of draws rejected; 1,200 without occasion",
     ]
 
 
 def test_the_summary_tells_which_event_came_up_where(tmp_path):
     counts = {
-        "curved_road": FamilyCount(30, {}, {"cut_in": 2, "lead_brakes": 1}),
-        "x": FamilyCount(10, {}, {"cut_in": 4}),
+        "curved_road": FamilyCount(30, {}, 0, {"cut_in": 2, "lead_brakes": 1}),
+        "x": FamilyCount(10, {}, 0, {"cut_in": 4}),
     }
     text = summary(GeneratedSet(tmp_path, 40, 4.0, counts))
     assert text.splitlines()[3:] == [

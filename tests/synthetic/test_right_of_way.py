@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.cast import EgoPlan, Heedless, Staging
+from drivax.synthetic.cast import EgoPlan
 from drivax.synthetic.right_of_way import conflict_zones, time_to_cover
 from drivax.synthetic.roads import CLEARANCE_M, Control
 
@@ -109,16 +109,6 @@ def test_nobody_enters_a_junction_that_cannot_be_cleared():
     )
     assert (motion.distance_m[1] + table.size_m[1, 0] / 2).max() < 100.0
     assert motion.distance_m[2, -1] > 120.0
-
-
-def test_the_heedless_neither_stop_nor_give_way_but_are_seen():
-    network = crossroads(2, control=[Control.STOP, Control.NONE], yields_to=[(4,), ()])
-    table = drivers(2, speed_factor=0.7, slowing_mps2=1.5)
-    staging = Staging(heedless=(Heedless(0, 0, 200),))
-    motion = run(network, WAYS[:2], table, [50.0, 40.0], [10.0, 8.0], 14.0, staging)
-    assert motion.speed[0].min() > 8.0
-    first = entered(motion, 0, 100.0, table.size_m[0, 0])
-    assert entered(motion, 1, 100.0, table.size_m[1, 0]) > first
 
 
 def test_ways_from_one_lane_do_not_conflict_and_oncoming_traffic_goes_together():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.cast import Cast, EgoPlan, Override, Reroute, Scripted, Staging, Walker
+from drivax.synthetic.cast import Cast, EgoPlan, Override, Scripted, Staging, Walker
 from drivax.synthetic.curves import Pose, straight
 from drivax.synthetic.drafting import Draft
 from drivax.synthetic.families import FAMILIES, CurvedRoad
@@ -213,16 +213,6 @@ def test_a_planned_ego_is_where_its_plan_says_and_others_react():
     assert motion.distance_m[0, first:] == pytest.approx(x, abs=1e-6)
     gap = motion.xy[0, :, 0] - motion.xy[1, :, 0] - table.size_m[:, 0].mean()
     assert gap.min() > 0.5 and motion.speed[1, -1] < 0.5
-
-
-def test_a_told_vehicle_goes_over_to_another_path():
-    network, columns = road(600.0, lanes=2)
-    table = drivers(1, speed_factor=0.8)
-    other = lane_path(network, (columns[1][0],), Sway())
-    staging = Staging(reroutes=(Reroute(0, 10, other, 150.0),))
-    motion = traffic_scenes.run(network, [(columns[0][0],)], table, [50.0], [10.0], 3.0, staging)
-    assert motion.xy[0, 9, 1] == pytest.approx(0.0) and motion.xy[0, 10] == pytest.approx([150.0, -3.5])
-    assert motion.paths[0] is other
 
 
 def test_walkers_on_a_crossing_stop_the_cars():

@@ -12,9 +12,11 @@ import pytest
 from drivax.errors import UsageError
 from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, AgentKind, Flag, LightState
 from drivax.synthetic import world
+from drivax.synthetic.critical import critical_steps
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import SEVERITY_MPS2, EventKind
-from drivax.synthetic.sensing import NoiseConfig
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig
+from drivax.synthetic.signals import Colour
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one, generate_recording
 
 from .oracles import box_corners, shared_area, winding_number
@@ -125,11 +127,11 @@ def test_the_expert_drives_gently_and_makes_way():
     assert min(hardest) > -4.05
     assert max(turning) < 4.89
     assert min(moved) > 5.0
-    assert np.median(moved) > 40.0
+    assert np.median(moved) > 25.0
 
 
 def test_driving_on_as_before_is_not_enough():
-    """Constant speed and heading leaves the road or meets somebody in three of ten scenarios, red lights not counted."""
+    """Constant speed and heading leaves the road or meets somebody in three of ten scenarios, lights left out."""
     failed = 0
     for index in range(COUNT):
         recording = drawn(index).recording
@@ -237,6 +239,18 @@ def test_the_others_are_recorded_with_errors_and_ego_and_the_mask_are_exact():
     [
         ({"critical_share": -0.1}, "critical_share is -0.1; use a share from 0 to 1"),
         ({"lane_change_share": 2.0}, "lane_change_share is 2.0; use a share from 0 to 1"),
+        (
+            {"signal_timing": (0.5, 0.5, 0.5)},
+            "signal_timing is [0.5, 0.5, 0.5]; use three shares that add up to 1",
+        ),
+        ({"signal_timing": (-0.5, 0.5, 1.0)}, "signal_timing is [-0.5, 0.5, 1.0]"),
+        ({"sensor": SensorConfig(range_m=-1.0)}, "sensor.range_m is -1.0; use a finite number that is not"),
+        (
+            {"noise": NoiseConfig(speed_correlation=1.5)},
+            "noise.speed_correlation is 1.5; use a number from 0 to",
+        ),
+        ({"noise": NoiseConfig(level=float("nan"))}, "noise.level is nan; use a finite number"),
+        ({"noise": NoiseConfig(level=-3.0)}, "noise.level is -3.0; use a finite number that is not negative"),
         ({"noise": NoiseConfig(level=2.0)}, "noise.level 2.0 could make a recorded vehicle touch ego"),
     ],
 )
@@ -259,3 +273,42 @@ def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
     with pytest.raises(UsageError, match="no clean expert in 12 attempts"):
         world.generate_one(0, 0, WorldConfig(rare_rate=1.0))
     assert len(tried) == len(set(tried)) == 12
+
+
+def test_a_recording_that_begins_at_a_critical_moment_is_that_part_of_the_traffic(monkeypatch):
+    """Lights, poses and the begin are those of the traffic from the step on that was found critical."""
+    kept = {}
+
+    def run(traffic, *args, **more):
+        kept.setdefault("traffic", traffic)
+        kept.setdefault("motion", result := original(traffic, *args, **more))
+        return result
+
+    def chosen(network, motion, colour, steps):
+        kept["found"] = steps[critical_steps(network, motion, colour, steps)].tolist()
+        return critical_steps(network, motion, colour, steps)
+
+    original = world.Traffic.run
+    monkeypatch.setattr(world.Traffic, "run", run)
+    monkeypatch.setattr(world, "critical_steps", chosen)
+    config = dataclasses.replace(EXACT, rare_rate=0.0, critical_share=1.0)
+    begins, lit = set(), 0
+    for index in range(0, 60, 2):
+        kept.clear()
+        made = generate_one(6, index, config)
+        if "critical" not in made.recording.tags or made.rejected:
+            continue
+        lights, traffic = made.recording.lights, kept["traffic"]
+        # Before the recording nobody knows of ego's plan: the first poses tell where it begins.
+        apart = np.hypot(*(kept["motion"].xy[0] - made.recording.tracks.xy[0, 0]).T)
+        first = int(apart.argmin())
+        assert apart[first] < 1e-9 and first in kept["found"]
+        begins.add(first)
+        for light in lights:
+            shown = traffic.colour[first : first + STEPS, light.lane_id - 1]
+            red = np.isin(light.states, [int(state) for state in RED])
+            assert np.array_equal(red, shown == Colour.RED)
+            lit += len(set(shown.tolist())) > 1
+        if len(begins) > 2 and lit > 2:
+            return
+    raise AssertionError(f"begins {begins}, {lit} lights that change")

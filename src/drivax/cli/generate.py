@@ -62,6 +62,8 @@ def run(args: Generate) -> int:
     """Generate, then print the rate, what was rejected per family, and how often which event came up."""
     if args.benchmark and (args.seed is not None or args.split is not None):
         raise UsageError("the benchmark has seeds and splits of its own", cure="leave out --seed and --split")
+    if args.benchmark and (args.rare_rate is not None or args.config is not None):
+        raise UsageError("the benchmark is the same for everybody", cure="leave out --rare-rate and --config")
     shares = None if args.split is None else parse_shares(args.split)
     options = Generation(
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
@@ -105,7 +107,8 @@ def summary(result: GeneratedSet) -> str:
     for name, count in result.families.items():
         causes = ", ".join(f"{cause} {times}" for cause, times in sorted(count.rejected.items()))
         line = f"  {name:<{width}}  {count.kept:>6,} kept, {count.rejection_rate:6.2%} of draws rejected"
-        lines.append(line + (f" ({causes})" if causes else ""))
+        line += f" ({causes})" if causes else ""
+        lines.append(line + (f"; {count.unsuited:,} without occasion" if count.unsuited else ""))
     return "\n".join((*lines, *coverage(result.families)))
 
 

@@ -29,6 +29,10 @@ _PAST, _ACCELERATES_S, _TURNS_S = 5, 1.0, 3.0
 _SPEEDS_UP_S, _USUAL_MPS = 2.0, 13.4
 #: Who moves sideways towards ego's way this fast, m/s, and gets there this soon, s, may stay in it.
 _ENTERS_MPS, _ENTERS_S = 0.4, 2.5
+#: People who walk towards ego's way faster than this may run, at this speed, m/s.
+_STARTS_MPS, _RUNS_MPS = 0.3, 2.0
+#: For how long who comes the other way may swerve into ego's, s.
+_SWERVES_S = 0.3
 #: Who crosses faster than this is expected to cross, m/s.
 _CROSSES_MPS = 4.5
 
@@ -109,6 +113,7 @@ class Others:
         behind: Who follows ego.
         stood_s: For how long each has stood, s.
         vehicle: Who is a vehicle.
+        vulnerable: Who walks or rides.
     """
 
     box: Float[Array, "H K 6"]
@@ -119,6 +124,7 @@ class Others:
     behind: Bool[Array, " K"]
     stood_s: Float[Array, " K"]
     vehicle: Bool[Array, " K"]
+    vulnerable: Bool[Array, " K"]
 
     @classmethod
     def near(
@@ -151,25 +157,29 @@ class Others:
         drives = ~people & (_length(velocity) > 2.0 * SLOW_MPS)
         turning = jnp.where(drives, jnp.clip(trend.turning[rows], -0.8, 0.8), 0.0)
         faster = jnp.where(people, 0.0, jnp.clip(trend.acceleration[rows], -8.0, 3.0))
-        free, speed = _rolled_out(box, velocity, turning, faster)
+        free, speed = rolled_out(box, velocity, turning, faster)
         vehicle = kind == AgentKind.VEHICLE
         lane, on_lane = _along_lanes(bank, scene, box, speed, turning)
         on_lane &= vehicle & drives
-        entering, may, sure = _entering(box, velocity, speed, route, me)
+        entering, may, sure = _entering(box, velocity, speed, route, me, people)
         may &= ~vehicle | (_length(velocity) < _CROSSES_MPS) | follows
-        sure &= may & vehicle & follows & drives
+        rider = kind == AgentKind.CYCLIST
+        comes = box[:, COS] * me[COS] + box[:, SIN] * me[SIN] < -SAME_WAY
+        sure &= may & drives & ((vehicle & follows) | (rider & comes))
         expected = _chosen(sure, entering, _chosen(on_lane, lane, free))
         behind = follows & (ahead < -me[LENGTH] / 2) & (jnp.abs(aside) < me[WIDTH])
+        vulnerable = people | rider
         return cls(
-            expected, entering, may & valid[rows], speed, valid[rows], behind, trend.stood_s[rows], vehicle
-        )
+            expected, entering, may & valid[rows], speed, valid[rows], behind, trend.stood_s[rows], vehicle,
+            vulnerable,
+        )  # fmt: skip
 
 
 def _chosen(one: Bool[Array, " K"], then: Array, otherwise: Array) -> Array:
     return jnp.where(one[:, None], then, otherwise)
 
 
-def _rolled_out(
+def rolled_out(
     box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], turning: Float[Array, " K"],
     faster: Float[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Float[Array, "H K"]]:  # fmt: skip
@@ -228,12 +238,13 @@ def _along_lanes(
 
 def _entering(
     box: Float[Array, "K 6"], velocity: Float[Array, "K 2"], speed: Float[Array, "H K"],
-    route: tuple[Array, Array, Array], me: Float[Array, " 6"],
+    route: tuple[Array, Array, Array], me: Float[Array, " 6"], people: Bool[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Bool[Array, " K"], Bool[Array, " K"]]:  # fmt: skip
     """Boxes of those who move sideways into ego's way and stay in it; who may do so, and who surely does."""
     path, there, offsets = route
     along, lateral, cos, sin = project(path, there, offsets, box[:, :2], velocity)
     toward = -jnp.sign(lateral) * sin
+    toward = jnp.where(people & (toward > _STARTS_MPS), jnp.maximum(toward, _RUNS_MPS), toward)
     _, _, straight, across = project(path, there, offsets, box[:, :2], box[:, COS : SIN + 1])
     half = (jnp.abs(across) * box[:, LENGTH] + jnp.abs(straight) * box[:, WIDTH]) / 2
     gap = jnp.abs(lateral) - half - me[WIDTH] / 2
@@ -242,7 +253,9 @@ def _entering(
     times = prediction_times()[:, None]
     share = speed / jnp.maximum(_length(velocity), 0.1)
     forward = jnp.cumsum(cos * share, axis=0) * STEP_S
-    left = jnp.sign(lateral) * jnp.maximum(jnp.abs(lateral) - toward * times, 0.0)
+    # Who comes the other way swerves for a short time, and then goes on along the way.
+    swerves = jnp.where(cos < -SAME_WAY * _length(velocity), jnp.minimum(times, _SWERVES_S), times)
+    left = jnp.sign(lateral) * jnp.maximum(jnp.abs(lateral) - toward * swerves, 0.0)
     left = jnp.where(may, left, 0.0)
     row = at(path, offsets, along + forward)
     xy = row[..., :2] + left[..., None] * jnp.stack([-row[..., 3], row[..., 2]], axis=-1)

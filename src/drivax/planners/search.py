@@ -37,30 +37,35 @@ _HASTE = (1.0, 1.0, 1.0, 1.0, 1.0, 1.4)
 _POINTS, _STEP_M = 46, 2.0
 #: Lateral acceleration with which the car goes aside, m/s2.
 _ASIDE_MPS2 = 3.5
-#: Free space before and beside the car that is as good as none, and that is enough, m.
-_TIGHT_M, _FREE_M = (0.1, 0.1), (0.6, 0.5)
+#: Free space before and beside the car that is as good as none, that is enough, and to what may come, m.
+_TIGHT_M, _FREE_M, _MAYBE_M = (0.1, 0.1), (0.6, 0.5), (0.6, 0.3)
 #: Who shifts by more leaves the lane, m.
 _LANE_M = 2.0
 #: What has stood this long is no queue, s, unless something stands this near before it, or a red light, m.
 _STUCK_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
 #: Who crosses may come sooner or later than expected by this, s, and m per squared s of foresight, at most by m.
 _EARLY_S, _EARLY_MPS2, _EARLY_M = 0.25, 0.2, 6.0
-#: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road,
-#: of driving outside the lanes that go one's way, of passing closely, per metre of way lost, per metre aside, per
-#: metre of shifting, of leaving the lane because of a queue, per squared m/s2 of braking.
+#: Who walks or rides is passed with this much more space beside them, m.
+_BESIDE_M = 0.6
+#: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road
+#: and of being off it all the time, of driving outside the lanes that go one's way, of passing closely.
 _HIT, _SOONER, _REAR, _MAYBE, _OFF, _ASTRAY, _CLOSE = 60.0, 100.0, 0.3, 40.0, 50.0, 30.0, 4.0
-_WAY, _ASIDE, _SHIFTING, _LEAVES, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
+#: Of crossing the way of who may come early or late, and of doing so all the time; of hurrying.
 _CUTS, _CUTS_LONG, _HURRY = 10.0, 30.0, 4.0
+#: Per metre of way lost, per metre aside, per metre of shifting, of leaving the lane other than to get past what
+#: stands there, per squared m/s2 of braking.
+_WAY, _ASIDE, _SHIFTING, _LEAVES, _BRAKING = 0.2, 0.8, 0.2, 6.0, 0.05
 
 
 @record
 class SearchPlanner:
-    """Chooses among 35 manoeuvres along the route; knows the present truth, and nothing of the future.
+    """Chooses among 42 manoeuvres along the route; knows the present truth, and nothing of the future.
 
     A manoeuvre is a lateral offset to go to and an acceleration that is not exceeded; below that, the car follows
-    what is ahead of it by IDM. Each is driven for 5 s with the dynamics and the steering law that the car really
-    has. It loses by hitting others, the sooner the more, by leaving the road and its lanes, by passing closely,
-    by losing way and by braking.
+    what is ahead of it by IDM; one more goes faster than usual, to get out of somebody's way. Each is driven for
+    5 s with the dynamics and the steering law that the car really has. It loses by hitting others, the sooner the
+    more, by crossing the way of who may come a little sooner or later than expected, by leaving the road and its
+    lanes, by passing closely, by losing way and by braking.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -234,14 +239,15 @@ def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
 
     early = sooner(meets(others.box, _TIGHT_M))
     price = jnp.where(early > 0.0, _HIT + _SOONER * early, 0.0)
-    price = jnp.maximum(price, _MAYBE * sooner(meets(others.maybe, _FREE_M) & others.enters))
+    price = jnp.maximum(price, _MAYBE * sooner(meets(others.maybe, _MAYBE_M) & others.enters))
     worst = jnp.max(price * jnp.where(others.behind, _REAR, 1.0))
-    # Who crosses ego's way may be there a little sooner or later.
+    # Who crosses ego's way, or comes into it, may be there a little sooner or later.
     cos = jnp.einsum("hi,hki->hk", pose[:, 2:4], others.box[..., COS : SIN + 1])
-    crosses = (cos < SAME_WAY) & (others.speed > SLOW_MPS) & others.vehicle
+    crosses = ((cos < SAME_WAY) | others.enters) & (others.speed > SLOW_MPS) & others.vehicle
     times = prediction_times()[:, None]
     early = jnp.minimum(_EARLY_S * others.speed + _EARLY_MPS2 * times * times, _EARLY_M)
     wide = others.box.at[..., LENGTH].add(jnp.where(crosses, 2.0 * early, 0.0))
+    wide = wide.at[..., WIDTH].add(jnp.where(others.vulnerable, 2.0 * _BESIDE_M, 0.0))
     near = meets(wide, _FREE_M) & ~others.behind
     cut = (near & crosses).any(axis=1)
     worst += jnp.where(cut.any(), _CUTS, 0.0) + _CUTS_LONG * jnp.mean(cut)

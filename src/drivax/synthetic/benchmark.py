@@ -22,6 +22,7 @@ from drivax.synthetic.generate import (
     Progress,
     written,
 )
+from drivax.synthetic.world import WorldConfig
 
 #: Raised whenever a split becomes another one though the world's version stays.
 BENCHMARK_VERSION = 1
@@ -77,7 +78,7 @@ def generate_benchmark(
 
     Args:
         out: A folder.
-        options: How; its world's ``rare_rate`` holds for all splits but the last.
+        options: How; of its world only the domain may be chosen.
         train: Scenarios of the training set, for tests and trials; the others are scaled with it. Smaller sets are
             the beginnings of the full ones.
         progress: Called after every scenario, with counts over all splits.
@@ -88,6 +89,10 @@ def generate_benchmark(
     """
     options = options or Generation()
     options.check()
+    if options.world != WorldConfig(domain=options.world.domain):
+        raise UsageError(
+            "the benchmark's world is fixed but for its domain", cure="use generate for other settings"
+        )
     counts, done = sizes(train), 0
     total = sum(counts.values())
     made: dict[str, GeneratedSet] = {}

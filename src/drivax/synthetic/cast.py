@@ -93,25 +93,6 @@ class Override:
 
 
 @dataclass(frozen=True)
-class Reroute:
-    """At a step a vehicle goes over to another path whether there is room or not; its position on it is given."""
-
-    vehicle: int
-    step: int
-    path: Path
-    distance_m: float
-
-
-@dataclass(frozen=True)
-class Heedless:
-    """From one step to another a vehicle sees no stop line, no right of way and no light (leaders it does see)."""
-
-    vehicle: int
-    first_step: int
-    last_step: int
-
-
-@dataclass(frozen=True)
 class Tailgate:
     """A vehicle keeps only this time gap to whoever is ahead, all the time."""
 
@@ -124,8 +105,6 @@ class Staging:
     """What an event changes in how traffic goes; vehicles in the way of its making (``removed``) do not take part."""
 
     overrides: tuple[Override, ...] = ()
-    reroutes: tuple[Reroute, ...] = ()
-    heedless: tuple[Heedless, ...] = ()
     extras: tuple[Scripted, ...] = ()
     tailgates: tuple[Tailgate, ...] = ()
     removed: tuple[int, ...] = ()

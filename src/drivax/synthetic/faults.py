@@ -18,7 +18,7 @@ from drivax.synthetic.signals import Colour
 #: noise, must not touch either.
 EGO_SKIN_M = 0.1
 #: An ego that moves less than this shows nothing, m.
-_LEAST_M = 5.0
+_LEAST_M = 10.0
 #: A car stands below this, within so many metres before a stop line, in the last seconds before it passes.
 _STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
 #: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.
@@ -82,7 +82,7 @@ def fault(
         return Fault("ego_brakes_hard")
     if leaves_road(cast.network, box[0]):
         return Fault("ego_leaves_road")
-    cause = _rules_broken(cast, motion, times_s, first_step, staging)
+    cause = _rules_broken(cast, motion, times_s, first_step)
     if cause:
         return Fault(cause)
     excused = bool(cast.parked) or eventful(staging)
@@ -185,18 +185,14 @@ def _rules_broken(
     motion: Motion,
     times_s: Float64[np.ndarray, " time"],
     first_step: int,
-    staging: Staging,
 ) -> str:
     """Whether somebody runs a red light, or ego passes a stop sign without standing."""
     network, now = cast.network, slice(first_step, None)
-    excused = {heedless.vehicle for heedless in staging.heedless}
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
     if network.signals is not None:
         red = network.signals.colours(times_s[now], len(network.lanes))[0] == Colour.RED
     dark = red[:-1] & red[1:]
     for i, path in enumerate(motion.paths or cast.paths):
-        if i in excused:
-            continue
         heading, valid = motion.heading[i, now], motion.valid[i, now]
         ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[i, 0] / 2
         front = motion.xy[i, now] + ahead

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -21,11 +21,13 @@ from drivax.errors import DrivaxError, UsageError
 from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
-from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
+from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import worker_pool
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
+#: Chunks per worker that may wait to be written: so many keep workers busy while the audit is compiled.
+_AHEAD = 12
 _EVENT = "event"
 
 #: Seeds from here on belong to the fixed splits of ``synthetic.benchmark``.
@@ -74,19 +76,21 @@ class FamilyCount:
 
     Attributes:
         kept: Scenarios.
-        rejected: Attempts that were thrown away, by cause.
+        rejected: Draws that were thrown away because of what ego or others did, by cause.
+        unsuited: Draws that gave no occasion for the event that was wanted.
         events: How many of the scenarios have which labelled event.
     """
 
     kept: int
     rejected: dict[str, int]
+    unsuited: int = 0
     events: dict[str, int] = field(default_factory=dict)
 
     @property
     def rejection_rate(self) -> float:
-        """Share of attempts that were thrown away."""
+        """Share of the draws that were driven to the end and thrown away."""
         thrown = sum(self.rejected.values())
-        return thrown / (thrown + self.kept)
+        return thrown / max(thrown + self.kept, 1)
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class GeneratedSet:
 class _Drawn:
     scenario: Scenario
     family: str
-    rejected: dict[str, int]
+    rejected: dict[tuple[str, str], int]
 
 
 class _Counts:
@@ -111,20 +115,27 @@ class _Counts:
 
     def __init__(self) -> None:
         self._kept: Counter[str] = Counter()
-        self._rejected: dict[str, Counter[str]] = {}
-        self._events: dict[str, Counter[str]] = {}
+        self._unsuited: Counter[str] = Counter()
+        self._rejected: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._events: defaultdict[str, Counter[str]] = defaultdict(Counter)
 
     def add(self, one: _Drawn) -> None:
         self._kept[one.family] += 1
-        self._rejected.setdefault(one.family, Counter()).update(one.rejected)
-        events = self._events.setdefault(one.family, Counter())
-        events.update({one.scenario.tags[_EVENT]: 1} if _EVENT in one.scenario.tags else {})
+        for (family, cause), times in one.rejected.items():
+            if cause in UNSUITED:
+                self._unsuited[family] += times
+            else:
+                self._rejected[family][cause] += times
+        if _EVENT in one.scenario.tags:
+            self._events[one.family][one.scenario.tags[_EVENT]] += 1
 
     def families(self) -> dict[str, FamilyCount]:
-        """Sorted by name."""
+        """Sorted by name; also those of which no draw was kept."""
         return {
-            name: FamilyCount(self._kept[name], dict(self._rejected[name]), dict(self._events[name]))
-            for name in sorted(self._kept)
+            name: FamilyCount(
+                self._kept[name], dict(self._rejected[name]), self._unsuited[name], dict(self._events[name])
+            )
+            for name in sorted({*self._kept, *self._rejected, *self._unsuited})
         }
 
 
@@ -216,8 +227,7 @@ def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, 
     try:
         for first, last in spans:
             waiting.append(pool.submit(_draw, first, last, seed, options))
-            # A few chunks ahead keep everyone busy; more would only fill memory.
-            if len(waiting) > 3 * options.workers:
+            if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
         while waiting:
             yield from waiting.popleft().result()

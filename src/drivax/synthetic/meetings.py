@@ -13,7 +13,7 @@ from drivax.synthetic.roads import Control, RoadNetwork
 #: Lanes that lead to a meeting are followed back for this long, m.
 _BACK_M = 160.0
 #: When ego would come to where it gives way if nothing held it up, s after the recording's beginning.
-_WHEN_S = (-1.0, 4.0)
+_WHEN_S = (0.4, 4.0)
 
 
 def giving_way(network: RoadNetwork) -> tuple[Aim, ...]:

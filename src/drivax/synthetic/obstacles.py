@@ -164,10 +164,6 @@ class Standing:
             setattr(result, name, value.copy() if isinstance(value, np.ndarray | list) else value)
         return result
 
-    def beside(self, row: int) -> Extents:
-        """Everything near a vehicle's path."""
-        return self._seen[row][0]
-
     def meets(self, row: int, front_m: float, half_m: float, within_m: float) -> bool:
         """Whether something stands so near ahead of a vehicle's front in a band of this half width."""
         seen = self._seen[row][0]

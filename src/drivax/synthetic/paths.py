@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -36,6 +36,13 @@ class LaneSpan:
     from_m: float = -math.inf
     until_m: float = math.inf
     end_m: float = math.inf
+
+    def stretched(self, by: float) -> LaneSpan:
+        """The same on a path that is longer by a factor."""
+        begin_m, from_m, until_m, end_m = (
+            m * by for m in (self.begin_m, self.from_m, self.until_m, self.end_m)
+        )
+        return LaneSpan(self.lane, begin_m, self.scale * by, from_m, until_m, end_m)
 
 
 @dataclass(frozen=True)
@@ -164,17 +171,7 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
     """Adds curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
-    spans = [
-        replace(
-            span,
-            begin_m=span.begin_m * stretch,
-            scale=span.scale * stretch,
-            from_m=span.from_m * stretch,
-            until_m=span.until_m * stretch,
-            end_m=span.end_m * stretch,
-        )
-        for span in spans
-    ]
+    spans = [span.stretched(stretch) for span in spans]
     at = step * np.arange(len(curve.xy))
     lane = np.full((len(at), SLOTS), _NOWHERE)
     lane_m = np.zeros((len(at), SLOTS))
@@ -202,7 +199,8 @@ def smoothed_curvature(curve: Curve, step_m: float) -> Float64[np.ndarray, " poi
     """Curvature of an equally sampled curve, 1/m, averaged over 3 m."""
     window = max(1, round(_CURVATURE_WINDOW_M / step_m))
     rate = np.gradient(curve.heading, step_m)
-    padded = np.pad(rate, (window // 2, window - 1 - window // 2), mode="edge")
+    before, after = window // 2, window - 1 - window // 2
+    padded = np.concatenate([np.full(before, rate[0]), rate, np.full(after, rate[-1])])
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 

@@ -49,9 +49,8 @@ class Moment:
         step, colour, to_red: The step, and what each lane's light shows and how long until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
-        heedless: Who sees no line, light or right of way.
         promised: Number of connectors on the path that a vehicle will enter whatever others do (-1: it asks).
-        told: Whether anybody is heedless or has promised.
+        told: Whether anybody has promised.
     """
 
     step: int
@@ -64,7 +63,6 @@ class Moment:
     room_m: Float64[np.ndarray, " v"]
     leader: Int64[np.ndarray, " v"]
     leader_speed: Float64[np.ndarray, " v"]
-    heedless: Bool[np.ndarray, " v"]
     promised: Int64[np.ndarray, " v"]
     told: bool
 
@@ -157,8 +155,6 @@ class RightOfWay:
         self._granted = np.maximum(np.minimum(self._granted, halts), entered)
         ask = now.speed**2 / (2 * _ASK_MPS2) + _ASK_S * now.speed + _ASK_M
         if now.told:
-            sure = _number(tables.way_begin < (now.front_m + ask)[:, None])
-            self._granted = np.where(now.heedless, np.maximum(sure, entered), self._granted)
             self._granted = np.where(now.promised >= 0, np.maximum(now.promised, entered), self._granted)
         place = np.minimum(self._granted, ways - 1)
         flat = place + ways * self._rows
@@ -166,7 +162,7 @@ class RightOfWay:
         # Where there is no connector ahead, it is infinitely far away.
         asks = (distance >= 0) & (distance <= ask) & now.active & (halts > place)
         if now.told:
-            told = now.heedless | (now.promised >= 0)
+            told = now.promised >= 0
             asks &= ~told
             stop[told] = np.inf
         self._denied &= asks

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.signal import lfilter
 
+from drivax.errors import UsageError
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, corners
 from drivax.scenario.recording import Tracks
@@ -21,6 +24,12 @@ _MOST_SIGMA = 3.0
 _LOOKS = 512
 
 
+def _refuse_negative(room: str, settings: Any) -> None:
+    for name, value in vars(settings).items():
+        if not 0.0 <= value < math.inf:
+            raise UsageError(f"{room}.{name} is {value}", cure="use a finite number that is not negative")
+
+
 @dataclass(frozen=True)
 class SensorConfig:
     """A sensor on the middle of ego's roof that looks in all directions.
@@ -32,6 +41,14 @@ class SensorConfig:
 
     range_m: float = 80.0
     above_roof_m: float = 0.2
+
+    def check(self) -> None:
+        """Refuses what cannot be meant.
+
+        Raises:
+            UsageError: The first wrong setting.
+        """
+        _refuse_negative("sensor", self)
 
 
 @dataclass(frozen=True)
@@ -57,6 +74,17 @@ class NoiseConfig:
     position_correlation: float = 0.4
     heading_correlation: float = 0.2
     speed_correlation: float = 0.0
+
+    def check(self) -> None:
+        """Refuses what cannot be meant.
+
+        Raises:
+            UsageError: The first wrong setting.
+        """
+        _refuse_negative("noise", self)
+        for name, value in vars(self).items():
+            if name.endswith("_correlation") and value >= 1.0:
+                raise UsageError(f"noise.{name} is {value}", cure="use a number from 0 to below 1")
 
 
 def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:

@@ -125,7 +125,7 @@ class _Run:
         self._leaders = Leaders(self._network, self._drivers)
         # Of leaders, lines and things: the gaps to them, and how fast they are.
         self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
-        self._heedless, self._promised = np.zeros(count, bool), np.full(count, -1)
+        self._promised = np.full(count, -1)
         self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
         self._people = self._vehicles = _NOBODY
 
@@ -136,7 +136,6 @@ class _Run:
         speed, at, acceleration = (np.zeros((count, steps)) for _ in range(3))
         valid = np.zeros((count, steps), bool)
         for t in range(steps):
-            self._reroute(t)
             planned = self._put_ego(t)
             active = self._at + self._half_m < self._tables.last * self._tables.step_m
             active[0] |= planned
@@ -158,13 +157,6 @@ class _Run:
             acceleration[0, k] = np.diff(speed[0, self._ego.first_step :]) / DT_S
         vehicles = (pose, speed, valid, at, acceleration)
         return everybody(self._fixed.cast, self._staging, vehicles, walked, self._tables.paths)
-
-    def _reroute(self, t: int) -> None:
-        for reroute in self._staging.reroutes:
-            if reroute.step == t:
-                who = reroute.vehicle
-                self._swap(who, reroute.path, reroute.distance_m)
-                self._rest[who] = np.iinfo(int).max
 
     def _swap(self, row: int, path: Path, at: float) -> None:
         self._tables.replace(row, path)
@@ -247,10 +239,7 @@ class _Run:
     ) -> Float64[np.ndarray, " v"]:
         """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
         p, front = self._tables, self._at + self._half_m
-        heedless, promised = self._heedless, self._promised
-        heedless[:] = False
-        for told in self._staging.heedless:
-            heedless[told.vehicle] |= told.first_step <= t <= told.last_step
+        promised = self._promised
         if self._ego is not None and t >= self._ego.first_step:
             then = min(t - self._ego.first_step + _FORESEEN, len(self._plan_at) - 1)
             promised[0] = np.sum(p.way_begin[0] < self._plan_at[then] + self._half_m[0])
@@ -265,27 +254,23 @@ class _Run:
             room_m=self._gaps[0],
             leader=leader,
             leader_speed=self._leads[0],
-            heedless=heedless,
             promised=promised,
-            told=bool(promised[0] >= 0 or self._staging.heedless),
+            told=bool(promised[0] >= 0),
         )
         # Drivers stop closer to a line than to a bumper.
         room = self._right_of_way.lines(now, p) + 2.0 - _STOP_SHORT_M
         if np.count_nonzero(self._claims):
-            room = np.minimum(room, self._crossings(front, heedless) + 2.0 - _STOP_SHORT_M)
+            room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
         room = np.minimum(room, p.stop_m - front - _END_M)
         if len(self._standing.boxes):
             room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
         return room
 
-    def _crossings(
-        self, front: Float64[np.ndarray, " v"], heedless: Bool[np.ndarray, " v"]
-    ) -> Float64[np.ndarray, " v"]:
+    def _crossings(self, front: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
         """Distance to the next crossing that people claim; who cannot stop with ease when they come goes on."""
         away = self._tables.crossing_m - front[:, None]
         needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._claims[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
-        halt &= ~heedless[:, None]
         if self._halting.shape != halt.shape:
             self._halting = np.zeros_like(halt)
         self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
@@ -345,7 +330,7 @@ class _Run:
     def _staged(self, t: int) -> Bool[np.ndarray, " v"]:
         """Who does not decide because an event has decided for it."""
         result = np.zeros(len(self._rows), bool)
-        for told in (*self._staging.overrides, *self._staging.heedless):
+        for told in self._staging.overrides:
             result[told.vehicle] |= t >= told.first_step
         return result
 

@@ -7,6 +7,7 @@ of the map), so a recording depends on nothing else: not on the number of worker
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -55,6 +56,8 @@ _FORESEEN = 8
 _LIGHTS_M = 95.0
 #: Draws before a scenario is given up, draws on one map, and draws before a kind of event is given up.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
+#: Causes that say nothing against anybody's driving: the event that was wanted cannot happen, or comes to nothing.
+UNSUITED = ("no_occasion", "no_threat")
 #: Events that are tried with the same cast.
 _STAGINGS = 3
 #: Of the others, so many that come nearest to ego are recorded.
@@ -79,7 +82,7 @@ class WorldConfig:
 
     domain: str = "grid"
     rare_rate: float = 0.05
-    critical_share: float = 0.65
+    critical_share: float = 0.8
     lane_change_share: float = 0.35
     signal_timing: SignalTiming = (0.34, 0.33, 0.33)
     scenarios_per_map: int = 2
@@ -97,6 +100,12 @@ class WorldConfig:
         for name in ("rare_rate", "critical_share", "lane_change_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise UsageError(f"{name} is {getattr(self, name)}", cure="use a share from 0 to 1")
+        if min(self.signal_timing) < 0.0 or abs(sum(self.signal_timing) - 1.0) > 1e-6:
+            raise UsageError(
+                f"signal_timing is {list(self.signal_timing)}", cure="use three shares that add up to 1"
+            )
+        self.noise.check()
+        self.sensor.check()
         if self.scenarios_per_map < 1:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
         if farthest_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
@@ -115,13 +124,13 @@ class Generated:
         recording: The log.
         family: Its family of roads.
         domain: Its domain.
-        rejected: How many attempts were thrown away before this one, by cause.
+        rejected: How many attempts were thrown away before this one, by their family and cause.
     """
 
     recording: Recording
     family: str
     domain: str
-    rejected: dict[str, int]
+    rejected: dict[tuple[str, str], int]
 
 
 def generate_recording(seed: int, index: int, config: WorldConfig | None = None) -> Recording:
@@ -148,16 +157,16 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
         raise UsageError(f"seed {seed} and index {index} must not be negative", cure="choose 0 or more")
     domain = config.check()
     events, severity = _drawn_events(config, np.random.default_rng([seed, 0, index]))
-    rejected: Counter[str] = Counter()
+    rejected: Counter[tuple[str, str]] = Counter()
     for attempt in range(_ATTEMPTS):
         event = events[attempt // _PER_KIND % len(events)]
         place = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
         family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *place))
         rng = np.random.default_rng([seed, 2, index, attempt])
         places = aims(event, network, attempt > 0) if event else ()
-        result = _attempt((network, places), domain, config, (event, severity), rng)
+        result = _attempt(_Draw(network, places, event, severity), domain, config, rng)
         if isinstance(result, str):
-            rejected[result] += 1
+            rejected[family.name, result] += 1
             continue
         name = f"w{WORLD_VERSION}-{config.domain}-s{seed}"
         recording = replace(
@@ -168,9 +177,13 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
         )
         return Generated(recording, family.name, config.domain, dict(rejected))
     raise UsageError(
-        f"no clean expert in {_ATTEMPTS} attempts for seed {seed}, index {index}: {dict(rejected)}",
+        f"no clean expert in {_ATTEMPTS} attempts for seed {seed}, index {index}: {_causes(rejected)}",
         cure="choose another seed",
     )
+
+
+def _causes(rejected: Mapping[tuple[str, str], int]) -> str:
+    return ", ".join(f"{cause} in {family} {times}" for (family, cause), times in sorted(rejected.items()))
 
 
 def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[EventKind], float]:
@@ -195,31 +208,35 @@ def _drawn_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Ro
     )
 
 
-def _attempt(
-    roads: tuple[RoadNetwork, tuple[Aim, ...]],
-    domain: Domain,
-    config: WorldConfig,
-    event: tuple[EventKind, float],
-    rng: np.random.Generator,
-) -> Recording | str:
-    """One draw on roads, some with places that ego should pass: the recording, or why it was thrown away."""
-    (network, places), (kind, severity) = roads, event
-    critical = not kind and rng.random() < config.critical_share
+@dataclass(frozen=True)
+class _Draw:
+    """Roads, places of which ego should pass one, and the event (or none) with what it should require of ego, m/s2."""
+
+    network: RoadNetwork
+    aims: tuple[Aim, ...]
+    event: EventKind
+    severity_mps2: float
+
+
+def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
+    """One draw: the recording, or why it was thrown away."""
+    critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
     cast = draw_cast(
-        network, domain, times, config.lane_change_share, config.signal_timing, rng, places, critical
+        draw.network, domain, times, config.lane_change_share, config.signal_timing, rng, draw.aims, critical
     )
     traffic = Traffic(cast, times)
-    if not kind:
-        motion, first = traffic.run(), _WARM_UP
+    if not draw.event:
+        motion, first = traffic.run(), None
         if critical:
             first = _critical_step(traffic, motion, rng)
-            traffic, motion = traffic.until(first + STEPS), motion.until(first + STEPS)
-        motion, cause = expert.drive(cast, traffic.times_s, Staging(), first, traffic.run, begun=motion)
-        return cause or _perceived(_recorded(cast, motion, first, None), config, rng)
-    scene, cause = Scene(cast, traffic.run(), _WARM_UP), "no_occasion"
+        begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
+        traffic, motion = traffic.until(begin + STEPS), motion.until(begin + STEPS)
+        motion, cause = expert.drive(cast, traffic.times_s, Staging(), begin, traffic.run, begun=motion)
+        return cause or _perceived(replace(_recorded(cast, motion, begin, None), tags=tags), config, rng)
+    scene, cause = Scene(cast, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
-        staged = stage(kind, scene, severity, rng)
+        staged = stage(draw.event, scene, draw.severity_mps2, rng)
         if staged is None:
             break
         # Ego may foresee an event a little: an attentive driver sees it coming.
@@ -227,7 +244,7 @@ def _attempt(
         motion, cause = expert.drive(cast, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and threatens(scene, motion, staged):
             return _perceived(_recorded(cast, motion, _WARM_UP, staged), config, rng)
-        cause = cause or "no_threat"
+        cause = cause or UNSUITED[1]
     return cause
 
 
@@ -238,14 +255,14 @@ def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generat
     return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
 
 
-def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int:
-    """Where a recording begins in which ego has to give way or to go around somebody, if there is such a step."""
+def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
+    """Where a recording begins in which ego has to give way, if there is such a step."""
     network = traffic.cast.network
     if not met_on(network, motion.paths[0]):
-        return _WARM_UP
+        return None
     steps = np.arange(_EARLIEST, _WARM_UP + _LATER + 1, _EVERY)
     found = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
-    return int(steps[rng.choice(found)]) if len(found) else _WARM_UP
+    return int(steps[rng.choice(found)]) if len(found) else None
 
 
 def _recorded(cast: Cast, motion: Motion, first: int, staged: Staged | None) -> Recording:
