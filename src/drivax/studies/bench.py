@@ -1,23 +1,25 @@
-"""How fast the simulator steps on this machine, as a whole and by part."""
+"""How fast the simulator steps on this machine: as a whole, by part, and by what is measured."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from drivax.geometry.boxes import corners
 from drivax.metrics.episode import episode_add, episode_metrics
+from drivax.metrics.selection import Wanted
+from drivax.planners.idm import IdmPlanner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.exhaustive import without_grid
 from drivax.scenario.queries import around_lanes, left_of_edges, project_on_route
+from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
@@ -26,8 +28,10 @@ from drivax.simulator.types import SimState
 from drivax.tasks.task import Task
 from drivax.tracking.runs import versions
 
-#: Standard deviation of the random actions that drive the benchmark.
-_NOISE = 0.1
+#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; the best of the last counts.
+METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
+#: Environments of which the compiler counts operations and bytes.
+_COUNTED = 16384
 
 
 @dataclass(frozen=True)
@@ -38,78 +42,168 @@ class BenchConfig:
         batch: Environments side by side.
         steps: Steps per timed call.
         repeats: Timed calls; the median counts.
-        task: Observation and reward.
+        task: Observation, reward, metrics.
+        traffic: How the others move.
     """
 
     batch: int = 256
     steps: int = 80
     repeats: int = 7
     task: Task = field(default_factory=Task)
+    traffic: str = "log"
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What a timing found.
+
+    Attributes:
+        steps_per_second: Environment steps that count; those that only begin an episode do not.
+        compile_seconds: From the traced function to the program.
+        state_bytes: State of one environment.
+        temporary_bytes: What the program needs beside bank and states, per environment.
+    """
+
+    steps_per_second: float
+    compile_seconds: float
+    state_bytes: int
+    temporary_bytes: int
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
-    """Times stepping with resets, observation, reward and all metrics, and each part alone.
+    """Times stepping with resets, observation, reward and metrics, driven by IDM, and each part alone.
 
     Args:
         bank: Distinct scenarios; every episode that ends begins another at random.
         config: Sizes.
 
     Returns:
-        The contract of ``drivax bench --json``: ``by_part`` in microseconds per environment and step.
+        The contract of ``drivax bench --json``: ``by_part`` in microseconds per environment and step, ``cost_by_part``
+        in operations and bytes, by the compiler's own count of the part compiled alone.
     """
     config = config or BenchConfig()
-    simulator = Simulator(config.task)
-    index = jax.random.randint(jax.random.key(1), (config.batch,), 0, len(bank))
-    states = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
-    whole = jax.jit(partial(_run, simulator, config))
-    began = time.perf_counter()
-    compiled = whole.lower(bank, states, jax.random.key(0)).compile()
-    compile_seconds = time.perf_counter() - began
-    seconds = _median(lambda: compiled(bank, states, jax.random.key(2)), config.repeats)
-    parts = {name: _time_part(config, part, bank, states) for name, part in _parts(simulator).items()}
+    simulator, bank = _simulator(bank, config)
+    whole = speed(bank, config)
+    states = _states(simulator, bank, config.batch)
+    parts = _parts(simulator)
+    seconds = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
     whole_bank = without_grid(bank)
-    brute = sum(
-        _time_part(config, _parts(simulator)[name], whole_bank, states) for name in ("edges", "lanes")
-    )
+    brute = sum(_time_part(config, parts[name], whole_bank, states) for name in ("edges", "lanes"))
     return {
-        "environment_steps_per_second": round(config.batch * config.steps / seconds),
+        "environment_steps_per_second": round(whole.steps_per_second),
         "batch": config.batch,
         "scenarios": len(bank),
-        "state_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
+        "traffic": simulator.traffic.name,
+        "state_bytes": whole.state_bytes,
         "bank_bytes_per_scenario": bank.nbytes // len(bank),
-        "compile_seconds": round(compile_seconds, 2),
-        "brute_force_ratio": round(brute / (parts["edges"] + parts["lanes"]), 2),
-        "by_part": {name: round(value, 3) for name, value in parts.items()},
+        "compile_seconds": round(whole.compile_seconds, 2),
+        "brute_force_ratio": round(brute / (seconds["edges"] + seconds["lanes"]), 2),
+        "by_part": {name: round(value, 3) for name, value in seconds.items()},
+        "cost_by_part": {name: _cost(part, bank, states) for name, part in parts.items()},
         "versions": versions(),
     }
 
 
+def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
+    """Steps per second by set of metrics and batch size, relative to the full set at batch 32 (as the published table).
+
+    Returns:
+        The contract of ``drivax bench --metrics --json``: ``rows`` of ``metrics``, ``batch``, ``best`` (it is the
+        fastest of the larger sizes), ``steps_per_second`` and ``relative``.
+    """
+    config = config or BenchConfig()
+
+    def timed(metrics: Wanted, batch: int) -> float:
+        task = replace(config.task, metrics=metrics)
+        return speed(bank, replace(config, batch=batch, task=task)).steps_per_second
+
+    rows = []
+    for metrics in METRIC_SETS:
+        found = [(batch, timed(metrics, batch)) for batch in BATCHES]
+        best = max(((batch, timed(metrics, batch)) for batch in LARGER), key=lambda one: one[1])
+        for batch, value in (*found, best):
+            rows.append(
+                {"metrics": metrics, "batch": batch, "best": batch not in BATCHES, "steps_per_second": value}
+            )
+    base = next(r["steps_per_second"] for r in rows if (r["metrics"], r["batch"]) == ("full", BATCHES[0]))
+    rows = [
+        row
+        | {
+            "steps_per_second": round(row["steps_per_second"]),
+            "relative": round(row["steps_per_second"] / base, 2),
+        }
+        for row in rows
+    ]
+    return {"scenarios": len(bank), "rows": rows, "versions": versions()}
+
+
+def speed(bank: ScenarioBank, config: BenchConfig) -> Speed:
+    """Times one program that steps, resets, observes, rewards and judges a batch."""
+    simulator, bank = _simulator(bank, config)
+    states = _states(simulator, bank, config.batch)
+    began = time.perf_counter()
+    traced = jax.jit(lambda *args: _run(simulator, config, *args)).lower(bank, states, jax.random.key(0))
+    program = traced.compile()
+    compiled = time.perf_counter() - began
+    alive = int(program(bank, states, jax.random.key(2))[1])
+    seconds = _median(lambda: program(bank, states, jax.random.key(2)), config.repeats)
+    memory = program.memory_analysis()
+    return Speed(
+        steps_per_second=alive / seconds,
+        compile_seconds=compiled,
+        state_bytes=sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
+        temporary_bytes=0 if memory is None else memory.temp_size_in_bytes // config.batch,
+    )
+
+
+def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
+    traffic = make_traffic(config.traffic)
+    return Simulator(config.task, traffic), prepared(traffic, bank)
+
+
+def _states(simulator: Simulator, bank: ScenarioBank, batch: int) -> SimState:
+    index = jax.random.randint(jax.random.key(1), (batch,), 0, len(bank))
+    return jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
+
+
 def _run(
     simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState, key: Array
-) -> Array:
-    """Steps a batch; the sum of everything that was computed, so that nothing is optimised away."""
+) -> tuple[Array, Array]:
+    """Steps a batch; the sum of all that was computed, so that nothing is optimised away, and how many were steps."""
+    driver = IdmPlanner(config.task.actions)
+
+    def act(state: SimState, key: Array) -> Float[Array, " D"]:
+        return driver.act((), bank, state, simulator.situation(bank, state), None, key)[0]
+
     step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
     observe = jax.vmap(simulator.observe, in_axes=(None, 0))
 
-    def one(carry: tuple[SimState, Array, Array, Array], _: None) -> tuple[Any, None]:
+    def judged(states: SimState) -> Array:
+        values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
+        return sum((value.value.sum() for value in values.values()), start=jnp.zeros(()))
+
+    def one(carry: tuple[SimState, Array, Array, Array], _: None) -> tuple[Any, Array]:
         states, over, key, total = carry
         key, action_key, index_key = jax.random.split(key, 3)
-        action = _NOISE * jax.random.normal(action_key, (config.batch, 2))
+        action = jax.vmap(act)(states, jax.random.split(action_key, config.batch))
         index = jax.random.randint(index_key, (config.batch,), 0, len(bank))
         states, transition = step(bank, states, action, over, index)
         seen = [jnp.sum(value, dtype=jnp.float32) for value in jax.tree.leaves(observe(bank, states.scene))]
-        metrics = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
-        total += sum(seen) + transition.reward.sum() + sum(v.value.sum() for v in metrics.values())
-        return (states, transition.terminated | transition.truncated, key, total), None
+        done = transition.terminated | transition.truncated
+        # As in training: metrics are computed when some episode of the batch ends.
+        total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
+        total += sum(seen) + transition.reward.sum()
+        return (states, done, key, total), (~over).sum()
 
     start = (states, jnp.zeros(config.batch, bool), key, jnp.zeros(()))
-    return jax.lax.scan(one, start, None, config.steps)[0][3]
+    (_, _, _, total), alive = jax.lax.scan(one, start, None, config.steps)
+    return total, alive.sum()
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
 
 
-def _parts(simulator: Simulator) -> dict[str, Part]:
+def _parts(simulator: Simulator) -> Mapping[str, Part]:
     """Parts of a step, unbatched; each alone, so what they share is counted in each."""
 
     def frame(bank: ScenarioBank, state: SimState) -> Any:
@@ -135,7 +229,9 @@ def _parts(simulator: Simulator) -> dict[str, Part]:
         return time_to_collision(frame(bank, state), state.scene.slot, state.contacts == Contact.IGNORED)
 
     def metrics(bank: ScenarioBank, state: SimState) -> Any:
-        found = simulator.situation(bank, state)  # no metric here looks at its surroundings, so they cost nothing
+        found = simulator.situation(
+            bank, state
+        )  # no metric here looks at its surroundings, so they cost nothing
         return episode_add(state.episode, found, state.start, jnp.zeros((), bool))
 
     return {
@@ -153,29 +249,51 @@ def _parts(simulator: Simulator) -> dict[str, Part]:
     }
 
 
+def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
+    leaves = jax.tree.leaves(part(bank, state))
+    return sum((jnp.sum(leaf, dtype=jnp.float32) for leaf in leaves), start=jnp.zeros(()))
+
+
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
     """Microseconds per environment and step of one part."""
 
-    def total(bank: ScenarioBank, state: SimState) -> Array:
-        leaves = jax.tree.leaves(part(bank, state))
-        return sum((jnp.sum(leaf, dtype=jnp.float32) for leaf in leaves), start=jnp.zeros(()))
-
     @jax.jit
     def many(bank: ScenarioBank, states: SimState) -> Array:
-        def one(history: Array, _: None) -> tuple[Array, None]:
-            moved = jax.vmap(lambda s, h: _with_history(s, h))(states, history)
-            seen = jax.vmap(total, in_axes=(None, 0))(bank, moved)
-            # The next round depends on this one, so that nothing is hoisted out of the loop.
-            return history + 1e-9 * seen[:, None, None], None
+        def one(shift: Array, _: None) -> tuple[Array, None]:
+            seen = jax.vmap(lambda state, by: _total(part, bank, _shifted(state, by)))(states, shift)
+            # The next round depends on this one, so that nothing is taken out of the loop.
+            return shift + 1e-20 * seen, None
 
-        return jax.lax.scan(one, states.scene.history, None, config.steps)[0]
+        return jax.lax.scan(one, jnp.zeros(config.batch), None, config.steps)[0]
 
     seconds = _median(lambda: many(bank, states), config.repeats)
     return seconds / config.steps / config.batch * 1e6
 
 
-def _with_history(state: SimState, history: Array) -> SimState:
-    return replace(state, scene=replace(state.scene, history=history))
+def _shifted(state: SimState, by: Array) -> SimState:
+    """The same state, which the compiler cannot know: ``by`` is far too small to move anything."""
+    scene = state.scene
+    moved = replace(scene, history=scene.history + by, index=scene.index + by.astype(jnp.int32))
+    return replace(state, scene=moved)
+
+
+def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
+    """Operations and bytes read and written of one part, per environment, as the compiler counts them.
+
+    It counts an indexed array as read whole, so it is asked about very many environments in one scenario: what is left
+    per environment are the rows that are taken from the bank, and everything that is made of them.
+    """
+
+    def like(leaf: Array, rows: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((rows, *leaf.shape[1:]), leaf.dtype)
+
+    one = jax.tree.map(lambda leaf: like(leaf, 1), bank)
+    many = jax.tree.map(lambda leaf: like(leaf, _COUNTED), states)
+    counted = jax.jit(jax.vmap(part, in_axes=(None, 0))).lower(one, many).compile().cost_analysis() or {}
+    return {
+        "operations": round(counted.get("flops", 0.0) / _COUNTED),
+        "bytes": round(counted.get("bytes accessed", 0.0) / _COUNTED),
+    }
 
 
 def _median(call: Callable[[], Any], repeats: int) -> float:

@@ -1,0 +1,189 @@
+"""The simulator's speed: how it grows with maps, banks and agents, what reactive traffic costs, and each part alone.
+
+Every ratio is of two timings of one run; every timing is a median. Nothing else may run on the machine.
+
+Run: python benchmarks/simulator.py --data SET [--write]      SET: at least 4,096 scenarios of the built-in world
+     python benchmarks/simulator.py --table                   (the stored result into docs/results/speed.md)
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.catalogue import prepared
+from drivax.simulator.override import OverrideTraffic, with_given
+from drivax.simulator.reactive import IdmTraffic
+from drivax.simulator.simulator import Simulator
+from drivax.studies.bench import BenchConfig, bench, bench_metrics, speed
+from drivax.tasks.observations import PRESETS
+from drivax.tasks.task import Task
+from drivax.tracking.runs import versions
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULT = ROOT / "benchmarks" / "results" / "simulator.json"
+PAGE = ROOT / "docs" / "results" / "speed.md"
+#: What is simulated: the fullest task, and the leanest that still learns.
+TASKS = {
+    "full": Task(observation=PRESETS["optimal"], metrics="full"),
+    "lean": Task(observation=PRESETS["minimal"], metrics="training"),
+}
+BATCHES = (256, 1024)
+SCENARIOS, MANY = 1024, 4096
+
+
+def fastest(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
+    """The best of the batch sizes."""
+    found = {batch: speed(bank, replace(config, batch=batch)) for batch in BATCHES}
+    batch = max(found, key=lambda size: found[size].steps_per_second)
+    return {
+        "batch": batch,
+        "steps_per_second": round(found[batch].steps_per_second),
+        "by_batch": {size: round(one.steps_per_second) for size, one in found.items()},
+        "compile_seconds": round(found[batch].compile_seconds, 2),
+        "state_bytes": found[batch].state_bytes,
+        "temporary_bytes": found[batch].temporary_bytes,
+    }
+
+
+def more_segments(bank: ScenarioBank) -> ScenarioBank:
+    """As many segments again that are nowhere near: what a larger capacity costs."""
+    pad = ((0, 0), (0, 0), (0, 4096))
+    return replace(
+        bank,
+        edges=jnp.pad(bank.edges, pad, constant_values=1e6),
+        lanes=jnp.pad(bank.lanes, pad, constant_values=1e6),
+    )
+
+
+def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
+    """The bank with so many agent slots; those that it lacks are empty."""
+    more = count - bank.agents.shape[2]
+    return replace(
+        bank,
+        agents=jnp.pad(bank.agents, ((0, 0), (0, 0), (0, more), (0, 0))),
+        agent_box=jnp.pad(bank.agent_box, ((0, 0), (0, more), (0, 0))),
+        extension=jnp.pad(bank.extension, ((0, 0), (0, more), (0, 0), (0, 0))),
+    )
+
+
+def growth(small: ScenarioBank, large: ScenarioBank, config: BenchConfig) -> dict[str, float]:
+    """Time per step of the large bank over that of the small one, timed by turns."""
+    ratios = []
+    for _ in range(3):
+        one, other = speed(small, config), speed(large, config)
+        ratios.append(one.steps_per_second / other.steps_per_second)
+    return {"ratio": round(sorted(ratios)[1], 3), "of": [round(ratio, 3) for ratio in ratios]}
+
+
+def state_bytes(bank: ScenarioBank) -> dict[str, int]:
+    """Bytes of one environment's state in each kind of traffic, full task."""
+    some = jax.tree.map(lambda leaf: leaf[:1], bank)
+    slots = jnp.arange(1, 5)[None]
+    motion = jnp.zeros((1, bank.steps, 4, 4))
+    banks = {
+        "log": (some, None),
+        "idm": (some, IdmTraffic()),
+        "override": (with_given(some, slots, motion), OverrideTraffic()),
+        "override+idm": (with_given(some, slots, motion), OverrideTraffic(IdmTraffic())),
+    }
+    sizes = {}
+    for name, (one, traffic) in banks.items():
+        simulator = Simulator(TASKS["full"]) if traffic is None else Simulator(TASKS["full"], traffic)
+        ready = prepared(simulator.traffic, one)
+        state = jax.eval_shape(simulator.reset, ready, jnp.zeros((), jnp.int32))
+        sizes[name] = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+    return sizes
+
+
+def measure(folder: Path, repeats: int) -> dict[str, Any]:
+    """Everything, one after the other."""
+    stored = ScenarioSet.open(folder)
+    if len(stored) < MANY:
+        raise SystemExit(f"{folder} has {len(stored)} scenarios; generate at least {MANY}")
+    scenarios = [stored[i] for i in range(MANY)]
+    bank = ScenarioBank.from_scenarios(scenarios[:SCENARIOS])
+    config = BenchConfig(repeats=repeats)
+    result: dict[str, Any] = {"scenarios": SCENARIOS, "speed": {}, "state_bytes": state_bytes(bank)}
+    for name, task in TASKS.items():
+        for traffic in ("log", "idm"):
+            result["speed"][f"{name}, {traffic}"] = found = fastest(
+                bank, replace(config, task=task, traffic=traffic)
+            )
+            print(f"{name}, {traffic}: {found}", flush=True)
+    result |= {"metrics": bench_metrics(bank, config)["rows"], "parts": bench(bank, config)}
+    full = BenchConfig(batch=SCENARIOS, repeats=repeats)
+    untrimmed = ScenarioBank.from_scenarios(scenarios[:SCENARIOS], trim=False)
+    result["growth"] = {
+        "segments 4,096 to 8,192": growth(untrimmed, more_segments(untrimmed), full),
+        "agents 64 to 128": growth(agents(bank, 64), agents(bank, 128), full),
+        "scenarios 1,024 to 4,096": growth(bank, ScenarioBank.from_scenarios(scenarios), full),
+    }
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    """The page's tables."""
+    rows = ["| task | traffic | steps/s | batch | state (B) | compiled in (s) |", "|---|---|---|---|---|---|"]
+    for name, one in result["speed"].items():
+        task, traffic = name.split(", ")
+        rows.append(
+            f"| {task} | `{traffic}` | {one['steps_per_second']:,} | {one['batch']} | {one['state_bytes']:,} "
+            f"| {one['compile_seconds']:.1f} |"
+        )
+    rows += ["", "| metrics | batch | steps/s | relative |", "|---|---|---|---|"]
+    for row in result["metrics"]:
+        batch = f"{row['batch']}{' (best)' if row['best'] else ''}"
+        rows.append(f"| `{row['metrics']}` | {batch} | {row['steps_per_second']:,} | {row['relative']:.2f} |")
+    rows += ["", "| part, alone | us | operations | bytes |", "|---|---|---|---|"]
+    parts = result["parts"]
+    for name, value in sorted(parts["by_part"].items(), key=lambda pair: -pair[1]):
+        cost = parts["cost_by_part"][name]
+        rows.append(f"| {name} | {value:.2f} | {cost['operations']:,} | {cost['bytes']:,} |")
+    rows += ["", "| growth | time per step |", "|---|---|"]
+    rows += [f"| {name} | x {one['ratio']:.2f} |" for name, one in result["growth"].items()]
+    rows += ["", "| traffic | state (B) |", "|---|---|"]
+    rows += [f"| `{name}` | {size:,} |" for name, size in result["state_bytes"].items()]
+    return "\n".join(rows)
+
+
+BEGIN, END = "<!-- simulator.py: begin -->", "<!-- simulator.py: end -->"
+
+
+def main() -> None:
+    """Measures and stores, or puts what is stored into the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, help="scenario set of at least 4,096 scenarios")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--write", action="store_true", help="store benchmarks/results/simulator.json")
+    parser.add_argument(
+        "--table", action="store_true", help="put the stored result into docs/results/speed.md"
+    )
+    args = parser.parse_args()
+    if args.table:
+        before, rest = PAGE.read_text().split(BEGIN)
+        text = table(json.loads(RESULT.read_text()))
+        PAGE.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{rest.split(END)[1]}")
+        return
+    if args.data is None:
+        parser.error("--data is needed")
+    command = " ".join(["python", "benchmarks/simulator.py", *sys.argv[1:]])
+    result = {"command": command, **measure(args.data, args.repeats), "versions": versions()}
+    print(table(result))
+    if args.write:
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
