@@ -93,8 +93,9 @@ class _Worlds:
             row, column = np.divmod(chosen, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
         commands = np.asarray(actions, np.float32)
-        if commands.shape != (*lead, *self.actions.shape) or not np.isfinite(commands).all():
-            numbers = " x ".join(map(str, (*lead, *self.actions.shape)))
+        wanted = (*lead, space.size)
+        if commands.shape != wanted or not np.isfinite(commands).all():
+            numbers = " x ".join(map(str, wanted))
             raise UsageError(f"{actions!r} is no action", cure=f"give {numbers} finite numbers in [-1, 1]")
         return commands
 
@@ -144,8 +145,9 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         chosen = _option(options, "scenario")
         worlds = self._worlds
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
-        self._state, observation = begin(worlds.simulator, worlds.bank, self._row)
-        self._path = path_of(self._state.scene)
+        state, observation = begin(worlds.simulator, worlds.bank, self._row)
+        self._state = state
+        self._path = path_of(state.scene)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -159,13 +161,14 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
             raise gymnasium.error.ResetNeeded("no episode is under way; call reset() first")
         worlds = self._worlds
         command = worlds.commands(action, ())
-        self._state, observation, ending = advance(worlds.simulator, worlds.bank, self._state, command)
+        state, observation, ending = advance(worlds.simulator, worlds.bank, self._state, command)
+        self._state = state
         if self.render_mode is not None:
-            self._path = path_of(self._state.scene, self._path)
+            self._path = path_of(state.scene, self._path)
         reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
         info: dict[str, Any] = {"scenario_id": worlds.ids[self._row]}
         if terminated or truncated:
-            metrics = jax.device_get(judged(worlds.bank, self._state))
+            metrics = jax.device_get(judged(worlds.bank, state))
             info["metrics"] = {name: float(v.value) for name, v in metrics.items() if v.defined}
             self._state = None
         return _plain(observation), reward, terminated, truncated, info
@@ -277,7 +280,9 @@ class VectorDrivingEnv(VectorEnv):
         if not self._paths:
             raise gymnasium.error.ResetNeeded("there is nothing to draw yet; call reset() first")
         scenarios = self._worlds.scenarios
-        return tuple(picture(scenarios[row], path) for row, path in zip(self._rows, self._paths, strict=True))
+        return tuple(
+            picture(scenarios[int(row)], path) for row, path in zip(self._rows, self._paths, strict=True)
+        )
 
     def _drawn(self) -> Any:
         return self.np_random.integers(len(self._worlds.ids), size=self.num_envs, dtype=np.int32)
