@@ -120,7 +120,7 @@ def compare(bank, index, frames, traffic, every=7):
             arc, speed = float(traffic.arc[t, -1, row]), float(traffic.speed[t, -1, row])
             ignored = set(traffic.ignored[t + 1, row].tolist())
             acceleration, close = wanted(bank, index, row, arc, speed, ignored, frame, 10 + t)
-            if close < 0.3:
+            if close < 0.1:
                 continue  # on the border of the corridor, either answer is right
             after = max(speed + acceleration * 0.1, 0.0)
             moved = (speed + after) * 0.05 if after > 0 else speed**2 / max(-2 * acceleration, 1e-9)

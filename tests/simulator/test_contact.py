@@ -189,7 +189,11 @@ def test_contact_memory():
         (c.PARTED, False, True, False, c.PARTED),
         (c.IGNORED, True, True, True, c.IGNORED),
         (c.IGNORED, False, True, False, c.APART),
-        (c.AT_FAULT, True, False, False, c.ABSENT),
+        (c.APART, False, False, False, c.ABSENT),
+        (c.AT_FAULT, True, False, False, c.GONE),
+        (c.GONE, False, False, False, c.GONE),
+        (c.GONE, False, True, False, c.PARTED),  # its fault stays decided
+        (c.GONE, True, True, False, c.IGNORED),
     ]
     before, touching, valid, fault, expected = (np.array(column) for column in zip(*rows, strict=True))
     before = jnp.asarray(before, jnp.int8)

@@ -172,3 +172,8 @@ def test_without_a_map_nothing_is_off_the_road():
     bank = bank_of(replace(straight_road([car(0, 0, 0, 5)]), features=(), route_lanes=()))
     value, slope, _ = offroad(bank, jnp.full((400, 3), -9.0))
     assert not np.asarray(value).any() and not np.asarray(slope).any()
+
+
+def test_a_margin_beyond_what_queries_see_is_refused():
+    with pytest.raises(UsageError, match="margin_m is 3.5"):
+        offroad_potential(None, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=3.5)

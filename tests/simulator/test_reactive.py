@@ -332,6 +332,15 @@ def test_a_bank_without_paths_is_refused_and_one_with_paths_is_kept():
     assert TRAFFIC.prepare(ready) is ready
 
 
+def test_paths_that_were_made_for_other_classes_are_made_anew():
+    bank = bank_of(straight_road([EGO, car(0, 0, 0, 8), car(-30, 0, 0, 5, kind=AgentKind.CYCLIST)]))
+    both = IdmTraffic(drivers=((1, IdmParameters()), (int(AgentKind.CYCLIST), IdmParameters())))
+    few = TRAFFIC.prepare(bank)
+    more = both.prepare(few)
+    assert [int((b.paths.slot[0] >= 0).sum()) for b in (few, more)] == [1, 2]
+    assert both.prepare(more) is more
+
+
 def test_nobody_reacts_where_nobody_can():
     bank = TRAFFIC.prepare(bank_of(straight_road([car(0, 0, 0, 8)])))
     assert int((np.asarray(bank.paths.slot) >= 0).sum()) == 1  # ego, when it is not driven

@@ -15,6 +15,7 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN
 from drivax.settings import dump, load, parse_yaml
 from drivax.simulator.dynamics import GRIP_MPS2, command_between
+from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.task import Task
@@ -98,6 +99,20 @@ def test_where_every_draw_fails_the_episode_begins_as_logged():
     drawn = jax.jit(jax.vmap(lambda key: strong.scene(bank, 0, 10, 0, key)))(keys(16))
     np.testing.assert_array_equal(drawn.history, np.broadcast_to(logged.history, drawn.history.shape))
     np.testing.assert_array_equal(drawn.route_m, np.full(16, logged.route_m))
+
+
+def test_a_start_is_free_of_those_who_are_told_where_to_be():
+    # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
+    bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
+    told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
+    given = with_given(bank, jnp.asarray([[1]]), told)
+    simulator = Simulator(Task(), OverrideTraffic(), NoisyStart(tries=16))
+    state = jax.jit(jax.vmap(lambda key: simulator.reset(given, 0, 10, 0, key)))(keys(256))
+    assert not np.asarray(state.facts.ignored).any()
+    alone = jax.jit(jax.vmap(lambda key: Simulator(Task(), start=NoisyStart()).scene(bank, 0, 10, 0, key)))
+    beside = np.asarray(alone(keys(256)).history)[:, -1]
+    near = (np.abs(beside[:, 0] - 5.3) < 4.8) & (np.abs(beside[:, 1] - 2.4) < 2.0)
+    assert near.any(), "some draws would have touched"
 
 
 def test_fewer_steps_where_the_log_does_not_reach_back(open_road):

@@ -116,3 +116,27 @@ def test_a_stack_of_one_is_a_single_agent(bank):
     pairs = (states.scene.history[:, 0], wanted.scene.history), (done.reward[:, 0], wanted_done.reward)
     for got, expected in (*pairs, *((seen[name][0], observation[name]) for name in observation)):
         np.testing.assert_allclose(np.asarray(got, np.float32), np.asarray(expected, np.float32), atol=1e-5)
+
+
+def test_whose_episode_is_over_is_neither_rewarded_nor_judged_any_more(bank):
+    simulator = Simulator(Task(metrics=("training", "comfort")))
+    crash = bank_of(straight_road([car(0, 0, 0, 10), car(22, 0, 0, 0)]))
+
+    @jax.jit
+    def run(bank):
+        states = simulator.reset_together(bank, 0, jnp.asarray([0, 16]))
+
+        def one(carry, _):
+            states, over = carry
+            after, done = simulator.step_together(bank, states, jnp.zeros((2, 2)), over)
+            over |= done.terminated | done.truncated
+            return (after, over), (done.reward[0], done.terminated[0], after.episode.total[0])
+
+        return jax.lax.scan(one, (states, jnp.zeros(2, bool)), None, length=40)[1]
+
+    reward, terminated, total = (np.asarray(part) for part in run(crash))
+    # Bumpers are 22 - 4.8 m apart: the eighteenth step closes the gap.
+    assert np.flatnonzero(terminated).tolist() == [17]
+    assert reward[17] == pytest.approx(-1.0, abs=0.3) and not reward[18:].any()
+    np.testing.assert_array_equal(total[17:], np.broadcast_to(total[17], (23, *total[17].shape)))
+    assert (total[17] != total[16]).any()

@@ -19,7 +19,7 @@ from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
 from drivax.scenario.agent_lights import light_arcs
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_VX, AGENT_VY, AGENT_Z, ScenarioBank
 from drivax.scenario.queries import LANE_CUTOFF_M, LEVEL_M
-from drivax.scenario.record import record
+from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
 
 #: Points of a path, equally far apart along it.
@@ -56,7 +56,8 @@ class AgentPaths:
         appears: The first step at or after each one at which the log has the agent; T where there is none.
         stop_arc: Arc lengths of the stop lines that the path crosses, m; very large for none.
         stop_light: Slot of the light of each of them.
-        overlaps: Slots of the frame whose boxes the agent's overlaps in the log, -1 for none.
+        overlaps: Slots of the frame whose boxes the agent's overlaps in the log, -1 for none; two at most are kept.
+        kinds: Classes of agents for which these paths were made.
     """
 
     slot: Int[Array, "N R"]
@@ -68,6 +69,7 @@ class AgentPaths:
     stop_arc: Float[Array, "N R 4"]
     stop_light: Int[Array, "N R 4"]
     overlaps: Int[Array, "N T R 2"]
+    kinds: tuple[int, ...] = static()
 
 
 @dataclass(frozen=True)
@@ -103,15 +105,16 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     1.5 m/s2 of braking towards a curve.
 
     Args:
-        bank: The scenarios; one that has paths already is returned as it is.
+        bank: The scenarios; one that has such paths already is returned as it is.
         kinds: Classes of agents (``scenario.schema.AgentKind``) that may react.
     """
-    if bank.paths is not None:
+    if bank.paths is not None and bank.paths.kinds == kinds:
         return bank
     logs = _candidates(bank, kinds)
     courses = _courses(bank, logs)
     count = np.bincount(logs.scenario, minlength=len(bank))
-    rows = max(8, -(-int(count.max(initial=0)) // 8) * 8)
+    # A bank that keeps its padding shares programs with others of its capacity.
+    rows = max(8, -(-int(count.max(initial=0)) // 8) * 8) if bank.trimmed else bank.agents.shape[2]
     row = np.arange(len(logs.slot)) - np.concatenate(([0], np.cumsum(count)))[logs.scenario]
     shape, at = (len(bank), rows), (logs.scenario, row)
 
@@ -136,6 +139,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
             stop_arc=placed(stop_arc, 1e6, np.float32),
             stop_light=placed(stop_light, 0, np.int16),
             overlaps=jnp.asarray(_logged_overlaps(bank, logs, row, rows)),
+            kinds=kinds,
         ),
     )
 

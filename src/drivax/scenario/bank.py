@@ -54,6 +54,7 @@ class ScenarioBank:
         given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
+        trimmed: Whether padding that no scenario uses was cut (static).
     """
 
     agents: Float[Array, "N T A 8"]
@@ -82,6 +83,7 @@ class ScenarioBank:
     edge_run: int = static()
     lane_run: int = static()
     long_ego: bool = static()
+    trimmed: bool = static()
     paths: Any = None
     given: Any = None
 
@@ -153,6 +155,7 @@ def _stack(
     capacity = scenarios[0].capacity
     # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
     static |= {"cell_m": capacity.cell_m, "long_ego": bool((reach + 3.0 > capacity.cell_m - 2.0).any())}
+    static["trimmed"] = trim
     return arrays | maps, static
 
 

@@ -1,18 +1,20 @@
 """Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
 
-All R vehicles of a scenario at once. Of all S things, comparing boxes in the vehicle's own frame leaves those near the
-stretch of path ahead; the 8 closest of them are found by eight minima over whole numbers (a sort costs several times
-as much), and only these are measured against the path.
+All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
+leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima over whole
+numbers (a sort costs several times as much), and only these are measured against the path.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
-from drivax.scenario.agent_paths import PATH_POINTS, PATH_SPEED, AgentPaths
+from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_SPEED, AgentPaths
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.simulator.types import Frame
@@ -21,8 +23,10 @@ from drivax.simulator.types import Frame
 CLOSEST = 8
 #: Free space that a corridor has beside the vehicle, m.
 SIDE_M = 0.1
-#: Straight pieces that stand for the path ahead.
-PIECES = 12
+#: Pieces that stand for the path ahead, and rectangles around as many of them each.
+PIECES, RECTANGLES = 12, 3
+#: How far the path may run beside its pieces, m: rectangles are so much wider.
+_BULGE_M = 0.5
 #: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
 BEHIND_M = 1.0
 #: How far a vehicle looks: this, what it drives in so many seconds, what it needs to stop with 3 m/s2; at most so far.
@@ -99,7 +103,7 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
         frame: Everyone now.
     """
     look = _look(movers.speed)
-    nodes, arcs = _path_ahead(paths, index, movers, look)
+    nodes, tangents, arcs = _path_ahead(paths, index, movers, look)
     things, real = _closest(movers, frame, nodes)
     box, velocity = frame.box[things], frame.velocity[things]
     a, b = nodes[:, None, :-1], nodes[:, None, 1:]
@@ -116,6 +120,9 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     row = jnp.arange(things.shape[0])[:, None]
     best = best[..., 0]
     way = (nodes[row, best + 1] - nodes[row, best]) * jax.lax.rsqrt(square)[..., None]
+    beside = _cross(way, box[..., :2] - nodes[row, best])
+    beside -= _bulge(part, way, tangents[row, best], tangents[row, best + 1]) * jnp.sqrt(square)
+    distance = jnp.where((part > 0.0) & (part < 1.0), beside * beside, distance)
     along = arcs[row, best] + part * (arcs[row, best + 1] - arcs[row, best]) - movers.arc[:, None]
     cos = jnp.abs(box[..., COS] * way[..., 0] + box[..., SIN] * way[..., 1])
     sin = jnp.abs(box[..., SIN] * way[..., 0] - box[..., COS] * way[..., 1])
@@ -131,6 +138,24 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     return Leaders(gap=gap, speed=speed, things=things, real=real)
 
 
+def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, ...]:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _bulge(
+    part: Float[Array, ...],
+    way: Float[Array, "... 2"],
+    begin: Float[Array, "... 2"],
+    end: Float[Array, "... 2"],
+) -> Float[Array, ...]:
+    """How far to the left of a straight piece the path runs, as a share of its length: the cubic with both tangents."""
+    slopes = [
+        jnp.clip(_cross(way, tangent) / jnp.maximum(jnp.sum(way * tangent, axis=-1), 0.1), -1.0, 1.0)
+        for tangent in (begin, end)
+    ]
+    return part * (1 - part) * ((1 - part) * slopes[0] - part * slopes[1])
+
+
 def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
     """How far a vehicle looks along its path, m."""
     return jnp.minimum(_LOOK_M + _LOOK_S * speed + speed * speed / (2 * _LOOK_MPS2), _LOOK_MOST_M)
@@ -138,44 +163,32 @@ def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
 
 def _path_ahead(
     paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
-) -> tuple[Float[Array, "R 13 2"], Float[Array, "R 13"]]:
-    """Points of the path from the one behind the vehicle to as far as it looks, and their arc lengths."""
+) -> tuple[Float[Array, "R 13 2"], Float[Array, "R 13 2"], Float[Array, "R 13"]]:
+    """Points of the path from the one behind the vehicle to as far as it looks, directions and arc lengths."""
     spacing = paths.spacing[index]
     # One point more than it takes, since the first one lies behind.
     stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
     first = (movers.arc / spacing).astype(jnp.int32)
     place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
-    nodes = paths.points[index, jnp.arange(place.shape[0])[:, None], place, :2]
-    return nodes, place * spacing[:, None]
+    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place]
+    return rows[..., :2], rows[..., PATH_COS : PATH_SIN + 1], place * spacing[:, None]
 
 
 def _closest(
     movers: Movers, frame: Frame, nodes: Float[Array, "R 13 2"]
 ) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
-    """The 8 closest things whose box comes near the stretch ahead, compared in each vehicle's own frame."""
+    """The 8 closest things whose box reaches into one of the rectangles around the corridor."""
     me, box = movers.box[:, None], frame.box[None]
-    cos, sin = me[..., COS], me[..., SIN]
-    rest = nodes - me[..., :2]
-    ahead, left = (
-        rest[..., 0] * cos + rest[..., 1] * sin,
-        rest[..., 1] * cos - rest[..., 0] * sin,
-    )
-    half = me[..., WIDTH] / 2 + SIDE_M
-    far, near = ahead.max(axis=1, keepdims=True), ahead.min(axis=1, keepdims=True)
-    near -= me[..., LENGTH] / 2 + BEHIND_M
-    low, high = left.min(axis=1, keepdims=True) - half, left.max(axis=1, keepdims=True) + half
+    near = jnp.zeros((me.shape[0], box.shape[1]), bool)
+    count = PIECES // RECTANGLES
+    for first in range(0, PIECES, count):
+        behind = me[..., LENGTH] / 2 + BEHIND_M if first == 0 else 0.0
+        near |= _in_rectangle(me, box, nodes[:, first : first + count + 1], behind)
     dx, dy = box[..., X] - me[..., X], box[..., Y] - me[..., Y]
-    ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
-    turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
-    turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
-    long, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
-    reach_ahead, reach_left = turn_cos * long + turn_sin * wide, turn_sin * long + turn_cos * wide
     slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
-    counts = frame.valid & (slot != movers.slot[:, None])
+    counts = near & frame.valid & (slot != movers.slot[:, None])
     counts &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
     counts &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
-    counts &= (ahead > near - reach_ahead) & (ahead < far + reach_ahead)
-    counts &= (left > low - reach_left) & (left < high + reach_left)
     # Floats that are not negative are ordered like their bits; the low ones give way to the slot.
     bits = jax.lax.bitcast_convert_type(
         jax.lax.stop_gradient(dx * dx + dy * dy).astype(jnp.float32), jnp.int32
@@ -187,3 +200,30 @@ def _closest(
     chosen = jnp.concatenate(found, axis=1)
     real = chosen < _NONE
     return jnp.where(real, chosen & ((1 << _SLOT_BITS) - 1), 0), real
+
+
+def _in_rectangle(
+    me: Float[Array, "R 1 6"], box: Float[Array, "1 S 6"], nodes: Float[Array, "R K 2"], behind: Any
+) -> Bool[Array, "R S"]:
+    """Which boxes reach into the rectangle, along its chord, around the corridor of a stretch of path.
+
+    ``behind`` is how much further back than the stretch it begins, m.
+    """
+    chord = nodes[:, -1] - nodes[:, 0]
+    long = jnp.sqrt(jnp.maximum(jnp.sum(chord * chord, axis=-1, keepdims=True), 1e-6))
+    # Beyond its end a path is one point; there any direction will do.
+    chord = jnp.where(long > 1e-2, chord / long, me[:, 0, COS : SIN + 1])
+    cos, sin = chord[:, :1], chord[:, 1:]
+    rest = nodes - nodes[:, :1]
+    ahead, left = rest[..., 0] * cos + rest[..., 1] * sin, rest[..., 1] * cos - rest[..., 0] * sin
+    half = me[..., WIDTH] / 2 + SIDE_M + _BULGE_M
+    far, near = ahead.max(axis=1, keepdims=True) + half, ahead.min(axis=1, keepdims=True) - half - behind
+    low, high = left.min(axis=1, keepdims=True) - half, left.max(axis=1, keepdims=True) + half
+    dx, dy = box[..., X] - nodes[:, :1, 0], box[..., Y] - nodes[:, :1, 1]
+    ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+    turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
+    turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
+    deep, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
+    reach_ahead, reach_left = turn_cos * deep + turn_sin * wide, turn_sin * deep + turn_cos * wide
+    inside = (ahead > near - reach_ahead) & (ahead < far + reach_ahead)
+    return inside & (left > low - reach_left) & (left < high + reach_left)

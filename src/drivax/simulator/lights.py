@@ -37,6 +37,11 @@ def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 
 
+def nothing_crossed(memory: LightMemory) -> LightMemory:
+    """As an episode begins: lines that were crossed before it are not charged to it."""
+    return LightMemory(memory.pause, jnp.zeros_like(memory.crossed))
+
+
 def judge_lights(
     bank: ScenarioBank, scene: Scene, me: Float[Array, " 6"], ground: Float[Array, ""], on_route: Bool[Array, ""],
     memory: LightMemory,

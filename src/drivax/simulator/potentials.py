@@ -1,7 +1,8 @@
 """Smooth stand-ins for collision and off-road, for optimisation: how close a pose comes to either.
 
-A potential is positive wherever the metric of the same name holds, zero beyond a margin, and has a continuous gradient
-in between: ``max(0, 1 - d / margin)^2`` of a distance d that grows away from the fault. The metrics themselves stay
+A potential is positive wherever the metric of the same name holds, zero beyond a margin, and in between
+``max(0, 1 - d / margin)^2`` of a distance d that grows away from the fault. Its gradient is continuous, but for places
+that are equally far from two edges of the road. The metrics themselves stay
 what they are; a trajectory that was optimised with potentials is judged by them.
 """
 
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, corners
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import (
@@ -24,6 +26,8 @@ from drivax.simulator.types import Frame, Scene
 
 #: Width of the transition where two faces of a box, or two signs of an angle, take over from each other (m, 1).
 _BLEND_M, _BLEND_TURN = 0.03, 0.01
+#: Edges further away do not exist for queries, m.
+_EDGES_M = 3.0
 
 
 def separation(box: Float[Array, " 6"], others: Float[Array, "S 6"]) -> Float[Array, " S"]:
@@ -78,12 +82,18 @@ def offroad_potential(
         index: Row of the bank.
         box: x, y, cos, sin, length, width.
         ground: Height of the road under the box, m.
-        margin_m: Distance before the tolerance of the metric (0.3 m beyond an edge) at which the potential begins.
+        margin_m: Distance before the tolerance of the metric (0.3 m beyond an edge) at which the potential begins; at most
+            3, since edges further away are not seen.
 
     Returns:
         Positive where a corner is off the road, zero where every corner is further than the margin from being so and
         where nothing is mapped. Further than 3 m beyond every edge it is constant: nobody knows the way back.
+
+    Raises:
+        UsageError: A wider margin.
     """
+    if margin_m > _EDGES_M:
+        raise UsageError(f"margin_m is {margin_m:g}", cure=f"use at most {_EDGES_M:g}")
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
     beyond = offroad_distance(bank, index, box[:2], points, near, ground)

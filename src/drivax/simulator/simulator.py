@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.scenario.bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
-from drivax.simulator.lights import remember_lights
+from drivax.simulator.lights import nothing_crossed, remember_lights
 from drivax.simulator.situation import measure
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.together import is_driven
@@ -48,15 +48,14 @@ class Simulator:
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
         lights = remember_lights(bank, scene)
         found, contacts, lights = measure(bank, scene, now, before, contacts, lights, self.task.reads)
-        return SimState(
-            found.scene, found.facts, contacts, lights, self.task.episode_start(), found.scene.step
-        )
+        episode, step = self.task.episode_start(), found.scene.step
+        return SimState(found.scene, found.facts, contacts, nothing_crossed(lights), episode, step)
 
     def scene(self, bank: ScenarioBank, index: Any, step: Any, slot: Any = 0, key: Any = None) -> Scene:
         """A moment as a scene: what offline sampling and resets start from; logged unless ``start`` says otherwise."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
-        history, route_m = self.start.begin(bank, index, step, slot, key)
-        return Scene(
+        history, route_m = LogStart().begin(bank, index, step, slot)
+        scene = Scene(
             index=index,
             step=step,
             slot=slot,
@@ -66,6 +65,12 @@ class Simulator:
             z=bank.agents[index, step, slot, AGENT_Z],
             traffic=self.traffic.start(bank, index, step),
         )
+        if isinstance(self.start, LogStart):
+            return scene
+        agents = self.traffic.agents(bank, scene, 0)
+        history, route_m = self.start.begin(bank, index, step, slot, agents, key)
+        action = self.task.first_action(history, bank.agent_box[index, slot, 0])
+        return replace(scene, history=history, route_m=route_m, action=action)
 
     def frame(self, bank: ScenarioBank, scene: Scene, cast: Scene, back: int) -> Frame:
         """Everyone ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
@@ -84,32 +89,39 @@ class Simulator:
         return self._drive(bank, state, action, motion)
 
     def reset_together(
-        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP, key: Any = None
-    ) -> SimState:  # fmt: skip
-        """The stack of the states of several agents of one scenario (``simulator.together.slots_of`` chooses them)."""
-        keys = None if key is None else jax.random.split(key, slots.shape[0])
-        scenes = jax.vmap(lambda slot, k: self.scene(bank, index, step, slot, k))(slots, keys)
+        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
+    ) -> SimState:
+        """The stack of the states of several agents of one scenario (``simulator.together.slots_of`` chooses them).
+
+        They begin as logged: a noisy start knows of one driven agent only.
+        """
+        scenes = jax.vmap(lambda slot: self.scene(bank, index, step, slot))(slots)
         return jax.vmap(lambda scene: self._begin(bank, scene, scenes))(scenes)
 
     def step_together(
-        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"]
+        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
     ) -> tuple[SimState, Transition]:
         """Drives K agents of one scenario at once; they see each other, and traffic sees them.
 
         Args:
             bank: The scenarios.
             states: The stack of their states. One whose slot is beyond the moving agents fills up the stack: it is on
-                no road, and is never rewarded nor over.
+                no road, and is never rewarded nor over; its facts mean nothing.
             actions: An action each.
+            over: ``[K]`` whose episode has ended at an earlier step: they drive on as they are told, and are neither
+                rewarded nor judged any more. Nobody's by default, which is right for tasks that drive to the end.
         """
         first = jax.tree.map(lambda leaf: leaf[0], states.scene)
         traffic = self.traffic.advance(bank, first, self.frame(bank, first, states.scene, 0))
         moved = jax.vmap(lambda s, a: self._drive_on(bank, s.scene, a, None, traffic))(states, actions)
         after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, a))(states, moved, actions)
-        real = is_driven(bank, states)
-        terms = {name: jnp.where(real, term, 0.0) for name, term in done.reward_terms.items()}
-        ends = {name: getattr(done, name) & real for name in ("terminated", "truncated")}
-        return after, replace(done, reward=jnp.where(real, done.reward, 0.0), reward_terms=terms, **ends)
+        counts = is_driven(bank, states) & (True if over is None else ~over)
+        choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
+        after = replace(after, episode=choose(counts, after.episode, states.episode))
+        terms = {name: jnp.where(counts, term, 0.0) for name, term in done.reward_terms.items()}
+        ends = {name: getattr(done, name) & counts for name in ("terminated", "truncated")}
+        reward = jnp.where(counts, done.reward, 0.0)
+        return after, replace(done, after=after, reward=reward, reward_terms=terms, **ends)
 
     def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
         """The observation of each of K agents of one scenario, stacked."""
@@ -166,7 +178,8 @@ class Simulator:
         after, transition = self._settle(bank, before, scene, alone(scene), action)
         first = self.task.episode_start()
         episode = jax.tree.map(lambda new, old: jnp.where(over, new, old), first, after.episode)
-        after = replace(after, episode=episode)
+        lights = jax.tree.map(partial(jnp.where, over), nothing_crossed(after.lights), after.lights)
+        after = replace(after, episode=episode, lights=lights)
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 

@@ -44,9 +44,13 @@ class Start(Protocol):
     """How the driven agent came to the first step of an episode."""
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""], key: Any
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:
-        """Motions of the last 16 steps up to ``step``, and the arc length along the route at ``step``."""
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        agents: Float[Array, "A 8"], key: Any,
+    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+        """Motions of the last 16 steps up to ``step``, and the arc length along the route at ``step``.
+
+        ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
+        """
         ...
 
 
@@ -55,9 +59,10 @@ class LogStart:
     """As logged."""
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""], key: Any
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:
-        """The log's own; needs no key."""
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        agents: Any = None, key: Any = None,
+    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+        """The log's own, whatever the others do; needs no key."""
         return logged_history(bank, index, step, slot), bank.log_progress[index, step]
 
 
@@ -90,8 +95,9 @@ class NoisyStart:
             raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""], key: Any
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        agents: Float[Array, "A 8"], key: Any,
+    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
         """The first acceptable draw of ``tries``.
 
         Raises:
@@ -107,10 +113,10 @@ class NoisyStart:
 
         def one(key: Array) -> tuple[Float[Array, "16 4"], Bool[Array, ""]]:
             history = self._driven(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
-            return history, _acceptable(bank, index, step, slot, history)
+            return history, _acceptable(bank, index, step, slot, agents, history)
 
         histories, good = jax.vmap(one)(jax.random.split(key, self.tries))
-        logged, logged_m = LogStart().begin(bank, index, step, slot, None)
+        logged, logged_m = LogStart().begin(bank, index, step, slot)
         history = jnp.where(good.any(), histories[jnp.argmax(good)], logged)
         near_m = bank.log_progress[index, step - count]
         along_m = project_on_route(bank, index, history[-1, :2], near_m).along_m
@@ -149,12 +155,13 @@ def _acceptable(
     index: Int[Array, ""],
     step: Int[Array, ""],
     slot: Int[Array, ""],
+    agents: Float[Array, "A 8"],
     history: Float[Array, "16 4"],
 ) -> Bool[Array, ""]:
-    """Whether an agent with this history touches nobody and is on the road at ``step``."""
+    """Whether an agent with this history touches none of the others and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AGENT_Z]
     scene = Scene(index, step, slot, history, jnp.zeros(2), zero, z, ())
-    frame = frame_of(bank, index, step, bank.agents[index, step], alone(scene), 0)
+    frame = frame_of(bank, index, step, agents, alone(scene), 0)
     box, ground = frame.box[slot], z - bank.agent_box[index, slot, 2] / 2
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
