@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import corners, overlap
 from drivax.scenario.queries import OFFROAD_TOLERANCE_M, around_lanes, offroad_distance
 from drivax.simulator.potentials import collision_potential, offroad_potential, separation
