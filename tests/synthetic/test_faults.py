@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivax.evaluation.audit import audit
+from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.cast import Staging
 from drivax.synthetic.families import CurvedRoad, SignalisedJunction
@@ -23,6 +25,7 @@ from drivax.synthetic.paths import Sway, lane_path
 from drivax.synthetic.roads import Control
 from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.style import GRID
+from drivax.synthetic.world import WorldConfig, generate_recording
 
 from .oracles import box_corners, shared_area, winding_number
 from .staged_scenes import CAR, TIMES, WIDTH, crossed, road, scene, user
@@ -112,7 +115,7 @@ def test_running_red_means_red_before_and_after():
     line = path.spans[1].begin_m
     times = np.arange(0.0, network.signals.cycle_s, 0.1)
     colour = network.signals.colours(times, len(network.lanes))[0][:, way]
-    cast, motion = scene(network, 1.0, lanes=(first, way, *network.lanes[way].successors))
+    cast, motion = scene(network, 1.2, lanes=(first, way, *network.lanes[way].successors))
     seen = set()
     for step in range(0, len(times) - 92, 7):
         window = times[step : step + 91]
@@ -203,3 +206,44 @@ def test_lights_of_one_lane_do_not_hold_for_another():
     red = network.signals.colours(TIMES, 3)[0][:, 1] == Colour.RED
     step = int((100.0 - 32.3) / 1.0)
     assert (cause(cast, motion) == "ego_runs_red") == bool(red[step] and red[step + 1])
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "counts"), [(0.0, False), (1.8, False), (2.5, True), (WIDTH, True), (6.0, False)]
+)
+def test_beside_its_way_the_light_of_another_lane_counts(aside_m, counts):
+    # Two lanes side by side, lights only for the left one; ego goes along the right one, or aside of it.
+    one = crossed(100.0, Control.SIGNAL).lanes
+    beside = [
+        replace(
+            lane,
+            curve=lane.curve.shifted(WIDTH),
+            successors=tuple(k + 3 for k in lane.successors),
+            predecessors=tuple(k + 3 for k in lane.predecessors),
+        )
+        for lane in one
+    ]
+    network = replace(
+        road((1, 1, 1)),
+        lanes=(*one, *beside),
+        signals=SignalPlan((LightGroup((4,), False),), ((0,),), (5.0,), offset_s=-40.0),
+    )
+    cast, motion = scene(network, 10.0, lanes=(0, 1, 2))
+    step = int((100.0 - 32.3) / 1.0)
+    seen = set()
+    for offset_s in np.arange(0.0, 40.0, 4.0):
+        plan = replace(network.signals, offset_s=float(-offset_s))
+        red = plan.colours(TIMES, 6)[0][:, 4] == Colour.RED
+        moved = replace(motion, xy=motion.xy + np.array([0.0, aside_m]))
+        cast = replace(cast, network=replace(network, signals=plan))
+        seen.add(bool(red[step] and red[step + 1]))
+        found = cause(cast, moved) == "ego_runs_red"
+        assert found == (counts and bool(red[step] and red[step + 1])), (offset_s, cause(cast, moved))
+    assert seen == {True, False}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("domain", "index"), [("grid", 657), ("ring", 154)])
+def test_nobody_goes_around_a_broken_car_over_the_line_of_a_red_light(domain, index):
+    made = assemble(generate_recording(1, index, WorldConfig(domain=domain, rare_rate=1.0)))
+    assert audit([made])[0]["log_runs_red"] is False

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from drivax.geometry.boxes import corners, overlap
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.cast import Cast, Motion, Staging
+from drivax.synthetic.paths import Path
 from drivax.synthetic.roads import Control, Lane, RoadNetwork
 from drivax.synthetic.signals import Colour
 
@@ -23,6 +24,8 @@ _LEAST_M = 10.0
 _STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
 #: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.
 _WRONG_WAY_M = 2.0
+#: Further than this from the lanes of its way ego is beside it, m; the metric says 2.
+_BESIDE_M = 1.9
 #: Lanes of both directions that are as near as this, to each other, tell nothing, m.
 _DOUBT_M = 0.5
 
@@ -206,7 +209,31 @@ def _rules_broken(
                 return "ego_runs_red" if i == 0 else "other_runs_red"
             if stop and not _stood(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
+        if i == 0 and _passes_beside(network, path, motion.xy[0, now], front, heading, dark):
+            return "ego_runs_red"
     return ""
+
+
+def _passes_beside(
+    network: RoadNetwork,
+    path: Path,
+    xy: Float64[np.ndarray, "time 2"],
+    front: Float64[np.ndarray, "time 2"],
+    heading: Float64[np.ndarray, " time"],
+    dark: Bool[np.ndarray, "step lane"],
+) -> bool:
+    """Whether ego goes around something over the line of a lane that is not its own and has red.
+
+    As the metric has it: beside the way the lights of other lanes count, too.
+    """
+    own = {span.lane for span in path.spans}
+    others = [k for k in np.flatnonzero(dark.any(axis=0)) if network.lanes[k].connector and k not in own]
+    passed = [passes(network.lanes[k], front, heading) & dark[:, k] for k in others]
+    if not np.any(passed):
+        return False
+    way = np.concatenate([network.lanes[k].curve.xy for k in own])
+    off = np.hypot(*(xy[:, None] - way).transpose(2, 0, 1)).min(axis=1) > _BESIDE_M
+    return bool((np.any(passed, axis=0) & off[1:]).any())
 
 
 def last_stop(cast: Cast, motion: Motion, first_step: int) -> int:
