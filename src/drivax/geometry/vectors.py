@@ -21,3 +21,10 @@ def root(squared: Any) -> Any:
 def norm(vector: Any) -> Any:
     """Length of vectors ``[..., 2]``; its gradient at the zero vector is zero."""
     return root((vector * vector).sum(axis=-1))
+
+
+def first_smallest(values: Any) -> Any:
+    """``argmin`` over the last axis as two reductions: XLA's own compares pairs one by one on a CPU."""
+    xp = values.__array_namespace__()
+    smallest, last = xp.min(values, axis=-1, keepdims=True), values.shape[-1] - 1
+    return xp.min(xp.where(values <= smallest, xp.arange(last + 1), last), axis=-1)

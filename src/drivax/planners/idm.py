@@ -8,11 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import first_smallest
 from drivax.planners.planner import Memoryless
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import LEVEL_M, route_ahead
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import LightState
+from drivax.simulator.corridor import closest, reaching
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical
@@ -22,6 +24,8 @@ _STEP_M, _POINTS = 2.0, 46
 _FALLBACK_LIMIT_MPS = 13.4
 #: Free space kept beside the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
+#: Things further beside the route than this, and ego's half width, are not looked at, m.
+_NEAR_M = 0.4
 #: A yellow light is a red one for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
 #: Where to stand before a stop line, m.
@@ -73,15 +77,22 @@ class IdmPlanner(Memoryless):
         """Gap to, and speed along the route of, the nearest thing in the corridor: an agent or a red light."""
         scene, frame = situation.scene, situation.surroundings.frame
         me = frame.box[scene.slot]
-        along, lateral, cos, sin = project(path, there, offsets, frame.box[:, :2], frame.box[:, 2:4])
-        half_length = jnp.abs(cos) * frame.box[:, 4] / 2 + jnp.abs(sin) * frame.box[:, 5] / 2
-        half_width = jnp.abs(sin) * frame.box[:, 4] / 2 + jnp.abs(cos) * frame.box[:, 5] / 2
         others = frame.valid & (jnp.arange(frame.valid.shape[0]) != scene.slot)
         others &= jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
-        blocks = others & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
+        # Only the closest of those that come near the route are measured against all of its points.
+        nodes = jnp.where(there[:, None], path[:, :2], path[0, :2])[None]
+        near = reaching(
+            frame.box[None], nodes, (me[5:6] / 2 + _NEAR_M)[None], 2.0 * _STEP_M, 2.0 * _STEP_M, 9
+        )
+        slots, real = closest(near & others, me[None], frame.box)
+        box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
+        along, lateral, cos, sin = project(path, there, offsets, box[:, :2], box[:, 2:4])
+        half_length = jnp.abs(cos) * box[:, 4] / 2 + jnp.abs(sin) * box[:, 5] / 2
+        half_width = jnp.abs(sin) * box[:, 4] / 2 + jnp.abs(cos) * box[:, 5] / 2
+        blocks = real[0] & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
         gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
-        speed = jnp.sqrt(jnp.sum(frame.velocity**2, axis=-1)) * cos
-        nearest = jnp.argmin(gaps)
+        speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
+        nearest = first_smallest(gaps)
         stop = stop_line_m(bank, situation, path, there, offsets) + self.parameters.min_gap_m - STOP_SHORT_M
         gap = jnp.minimum(gaps[nearest], stop)
         gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
@@ -134,7 +145,7 @@ def project(
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Arc length ahead and lateral offset of points on a path, and cosine and sine of headings relative to it."""
     dx, dy = xy[:, None, 0] - path[:, 0], xy[:, None, 1] - path[:, 1]
-    nearest = jnp.argmin(jnp.where(there, dx * dx + dy * dy, jnp.inf), axis=1)
+    nearest = first_smallest(jnp.where(there, dx * dx + dy * dy, jnp.inf))
     row = path[nearest]
     x, y = xy[:, 0] - row[:, 0], xy[:, 1] - row[:, 1]
     cos, sin = row[:, 3], row[:, 4]

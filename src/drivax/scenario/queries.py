@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import wrap
-from drivax.geometry.vectors import root
+from drivax.geometry.vectors import first_smallest, root
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
@@ -60,11 +60,6 @@ def _runs(
         inside.append(jnp.arange(run) < bounds[3] - bounds[0])
     # Read once: without the barrier XLA repeats the reads in every operation that uses them.
     return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
-
-
-def _first_smallest(values: Float[Array, " K"]) -> Int[Array, ""]:
-    """``argmin`` as two reductions that vectorise; XLA's own compares pairs one by one on a CPU."""
-    return jnp.min(jnp.where(values == values.min(), jnp.arange(values.shape[0]), values.shape[0] - 1))
 
 
 def _to_segments(
@@ -158,9 +153,9 @@ def around_lanes(
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
     reachable = own <= LANE_CUTOFF_M**2
-    best = _first_smallest(jnp.where(aligned, own, _FAR))
+    best = first_smallest(jnp.where(aligned, own, _FAR))
     has_lane = aligned[best] & reachable[best]
-    nearest = _first_smallest(own)
+    nearest = first_smallest(own)
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
@@ -290,7 +285,7 @@ def project_on_route(
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
     rows = jnp.stack([a[:, 0], a[:, 1], b[:, 0], b[:, 1]])
     squared, side = _to_segments(rows, xy[None])
-    k = _first_smallest(jnp.where(real, squared[0], _FAR))
+    k = first_smallest(jnp.where(real, squared[0], _FAR))
     u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
     distance = root(squared[0, k])
@@ -372,6 +367,6 @@ def lane_course(
     cos = (ux * heading[0] + uy * heading[1]) / length
     sin = (ux * heading[1] - uy * heading[0]) / length
     fits = inside & (jnp.abs(rows[4] - z) <= LEVEL_M) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
-    best = _first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
+    best = first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
     direction = jnp.stack([ux[best], uy[best]]) / length[best]
     return direction, side[0, best], fits[best]

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
+from drivax.geometry.vectors import first_smallest
 from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_SPEED, AgentPaths
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
@@ -105,25 +106,37 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     look = _look(movers.speed)
     nodes, tangents, arcs = _path_ahead(paths, index, movers, look)
     things, real = _closest(movers, frame, nodes)
-    box, velocity = frame.box[things], frame.velocity[things]
-    a, b = nodes[:, None, :-1], nodes[:, None, 1:]
-    u, w = b - a, box[:, :, None, :2] - a
-    square = jnp.maximum(jnp.sum(u * u, axis=-1), 1e-6)
-    part = jnp.clip(jnp.sum(u * w, axis=-1) / square, 0.0, 1.0)
-    apart = w - part[..., None] * u
-    distance = jnp.sum(apart * apart, axis=-1)
-    best = jnp.argmin(distance, axis=-1)[..., None]
-    part, distance, square = (
-        jnp.take_along_axis(one, best, axis=-1)[..., 0]
-        for one in (part, distance, jnp.broadcast_to(square, distance.shape))
+    box, velocity = jax.lax.optimization_barrier((frame.box[things], frame.velocity[things]))
+    # Coordinates one by one: pairs of numbers at the end of an array do not vectorise.
+    x, y = (nodes[:, None, :, axis] for axis in (X, Y))
+    ux, uy = x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1]
+    wx, wy = box[:, :, None, X] - x[..., :-1], box[:, :, None, Y] - y[..., :-1]
+    part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
+    apart_x, apart_y = wx - part * ux, wy - part * uy
+    part, distance = jax.lax.optimization_barrier((part, apart_x * apart_x + apart_y * apart_y))
+    best = first_smallest(distance)[..., None]
+    part, distance = (jnp.take_along_axis(one, best, axis=-1)[..., 0] for one in (part, distance))
+    row, best = jnp.arange(things.shape[0])[:, None], best[..., 0]
+    # Everything about a piece in one row, so that it is read once.
+    rows = jnp.concatenate(
+        [
+            nodes[:, :-1],
+            nodes[:, 1:],
+            tangents[:, :-1],
+            tangents[:, 1:],
+            arcs[:, :-1, None],
+            arcs[:, 1:, None],
+        ],
+        -1,
     )
-    row = jnp.arange(things.shape[0])[:, None]
-    best = best[..., 0]
-    way = (nodes[row, best + 1] - nodes[row, best]) * jax.lax.rsqrt(square)[..., None]
-    beside = _cross(way, box[..., :2] - nodes[row, best])
-    beside -= _bulge(part, way, tangents[row, best], tangents[row, best + 1]) * jnp.sqrt(square)
+    piece = jax.lax.optimization_barrier(rows[row, best])
+    way = piece[..., 2:4] - piece[..., :2]
+    long = jnp.sqrt(jnp.maximum(jnp.sum(way * way, axis=-1), 1e-6))
+    way = way / long[..., None]
+    beside = _cross(way, box[..., :2] - piece[..., :2])
+    beside -= _bulge(part, way, piece[..., 4:6], piece[..., 6:8]) * long
     distance = jnp.where((part > 0.0) & (part < 1.0), beside * beside, distance)
-    along = arcs[row, best] + part * (arcs[row, best + 1] - arcs[row, best]) - movers.arc[:, None]
+    along = piece[..., 8] + part * (piece[..., 9] - piece[..., 8]) - movers.arc[:, None]
     cos = jnp.abs(box[..., COS] * way[..., 0] + box[..., SIN] * way[..., 1])
     sin = jnp.abs(box[..., SIN] * way[..., 0] - box[..., COS] * way[..., 1])
     half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
@@ -132,10 +145,9 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
     inside = real & (distance < room * room) & (along > 0.0) & ~beyond
     gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
-    first = jnp.argmin(gap, axis=1)[:, None]
-    speed = jnp.sum(velocity * way, axis=-1)
-    gap, speed = (jnp.take_along_axis(one, first, axis=1)[:, 0] for one in (gap, speed))
-    return Leaders(gap=gap, speed=speed, things=things, real=real)
+    nearest = first_smallest(gap)[:, None] == jnp.arange(CLOSEST)
+    speed = jnp.sum(jnp.where(nearest, jnp.sum(velocity * way, axis=-1), 0.0), axis=1)
+    return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
 
 
 def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, ...]:
@@ -178,22 +190,27 @@ def _closest(
     movers: Movers, frame: Frame, nodes: Float[Array, "R 13 2"]
 ) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
     """The 8 closest things whose box reaches into one of the rectangles around the corridor."""
-    me, box = movers.box[:, None], frame.box[None]
-    near = jnp.zeros((me.shape[0], box.shape[1]), bool)
-    count = PIECES // RECTANGLES
-    for first in range(0, PIECES, count):
-        behind = me[..., LENGTH] / 2 + BEHIND_M if first == 0 else 0.0
-        near |= _in_rectangle(me, box, nodes[:, first : first + count + 1], behind)
-    dx, dy = box[..., X] - me[..., X], box[..., Y] - me[..., Y]
+    me = movers.box[:, None]
+    behind = me[..., LENGTH] / 2 + BEHIND_M
+    near = reaching(frame.box[None], nodes, me[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
     slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
-    counts = near & frame.valid & (slot != movers.slot[:, None])
-    counts &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
-    counts &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
+    near &= frame.valid & (slot != movers.slot[:, None])
+    near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
+    near &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
+    return closest(near, movers.box, frame.box)
+
+
+def closest(
+    near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "S 6"]
+) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
+    """Of the boxes that are near the 8 whose centres are the closest; and whether there are as many."""
+    slot = jnp.arange(near.shape[1], dtype=jnp.int32)
+    dx, dy = box[:, X] - me[:, X : X + 1], box[:, Y] - me[:, Y : Y + 1]
+    square = jax.lax.stop_gradient(dx * dx + dy * dy).astype(jnp.float32)
     # Floats that are not negative are ordered like their bits; the low ones give way to the slot.
-    bits = jax.lax.bitcast_convert_type(
-        jax.lax.stop_gradient(dx * dx + dy * dy).astype(jnp.float32), jnp.int32
-    )
-    key = jnp.where(counts, (bits & ~((1 << _SLOT_BITS) - 1)) | slot, _NONE)
+    bits = jax.lax.bitcast_convert_type(square, jnp.int32)
+    # Computed once: without the barrier XLA computes it anew for each of the minima.
+    key = jax.lax.optimization_barrier(jnp.where(near, (bits & ~((1 << _SLOT_BITS) - 1)) | slot, _NONE))
     found = [jnp.min(key, axis=1, keepdims=True)]
     for _ in range(CLOSEST - 1):
         found.append(jnp.min(jnp.where(key > found[-1], key, _NONE), axis=1, keepdims=True))
@@ -202,22 +219,45 @@ def _closest(
     return jnp.where(real, chosen & ((1 << _SLOT_BITS) - 1), 0), real
 
 
-def _in_rectangle(
-    me: Float[Array, "R 1 6"], box: Float[Array, "1 S 6"], nodes: Float[Array, "R K 2"], behind: Any
-) -> Bool[Array, "R S"]:
-    """Which boxes reach into the rectangle, along its chord, around the corridor of a stretch of path.
+def reaching(
+    box: Float[Array, "1 S 6"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
+    rectangles: int,
+) -> Bool[Array, "R S"]:  # fmt: skip
+    """Which boxes reach into one of the rectangles along the chords of K points on a path.
 
-    ``behind`` is how much further back than the stretch it begins, m.
+    Args:
+        box: Boxes.
+        nodes: Points on the path.
+        half: Half the width of the corridor, m.
+        behind: How much further back the first rectangle reaches, m.
+        beyond: How much further on the last one reaches, m.
+        rectangles: How many; K - 1 is a multiple of it.
     """
+    count = (nodes.shape[1] - 1) // rectangles
+    found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
+    for number in range(rectangles):
+        stretch = nodes[:, number * count : (number + 1) * count + 1]
+        back, on = behind if number == 0 else 0.0, beyond if number == rectangles - 1 else 0.0
+        found |= _in_rectangle(box, stretch, half, back, on)
+    return found
+
+
+def _in_rectangle(
+    box: Float[Array, "1 S 6"],
+    nodes: Float[Array, "R K 2"],
+    half: Float[Array, "R 1"],
+    behind: Any,
+    beyond: Any,
+) -> Bool[Array, "R S"]:
     chord = nodes[:, -1] - nodes[:, 0]
     long = jnp.sqrt(jnp.maximum(jnp.sum(chord * chord, axis=-1, keepdims=True), 1e-6))
     # Beyond its end a path is one point; there any direction will do.
-    chord = jnp.where(long > 1e-2, chord / long, me[:, 0, COS : SIN + 1])
+    chord = jnp.where(long > 1e-2, chord / long, jnp.array([1.0, 0.0]))
     cos, sin = chord[:, :1], chord[:, 1:]
     rest = nodes - nodes[:, :1]
     ahead, left = rest[..., 0] * cos + rest[..., 1] * sin, rest[..., 1] * cos - rest[..., 0] * sin
-    half = me[..., WIDTH] / 2 + SIDE_M + _BULGE_M
-    far, near = ahead.max(axis=1, keepdims=True) + half, ahead.min(axis=1, keepdims=True) - half - behind
+    near = ahead.min(axis=1, keepdims=True) - half - behind
+    far = ahead.max(axis=1, keepdims=True) + half + beyond
     low, high = left.min(axis=1, keepdims=True) - half, left.max(axis=1, keepdims=True) + half
     dx, dy = box[..., X] - nodes[:, :1, 0], box[..., Y] - nodes[:, :1, 1]
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin

@@ -82,8 +82,8 @@ def offroad_potential(
         index: Row of the bank.
         box: x, y, cos, sin, length, width.
         ground: Height of the road under the box, m.
-        margin_m: Distance before the tolerance of the metric (0.3 m beyond an edge) at which the potential begins; at most
-            3, since edges further away are not seen.
+        margin_m: Distance before the tolerance of the metric (0.3 m beyond an edge) at which the potential begins; at
+            most 3, since edges further away are not seen.
 
     Returns:
         Positive where a corner is off the road, zero where every corner is further than the margin from being so and
