@@ -66,13 +66,13 @@ def more_segments(bank: ScenarioBank) -> ScenarioBank:
 
 
 def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
-    """The bank with so many agent slots; those that it lacks are empty."""
-    more = count - bank.agents.shape[2]
+    """The bank with so many agent slots: the nearest to ego, and empty ones where it has fewer."""
+    more = max(0, count - bank.agents.shape[2])
     return replace(
         bank,
-        agents=jnp.pad(bank.agents, ((0, 0), (0, 0), (0, more), (0, 0))),
-        agent_box=jnp.pad(bank.agent_box, ((0, 0), (0, more), (0, 0))),
-        extension=jnp.pad(bank.extension, ((0, 0), (0, more), (0, 0), (0, 0))),
+        agents=jnp.pad(bank.agents[:, :, :count], ((0, 0), (0, 0), (0, more), (0, 0))),
+        agent_box=jnp.pad(bank.agent_box[:, :count], ((0, 0), (0, more), (0, 0))),
+        extension=jnp.pad(bank.extension[:, :count], ((0, 0), (0, more), (0, 0), (0, 0))),
     )
 
 
