@@ -176,5 +176,5 @@ def test_without_a_map_nothing_is_off_the_road():
 
 
 def test_a_margin_beyond_what_queries_see_is_refused():
-    with pytest.raises(UsageError, match="margin_m is 3.5"):
+    with pytest.raises(UsageError, match=r"margin_m is 3\.5"):
         offroad_potential(None, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=3.5)
