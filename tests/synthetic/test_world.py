@@ -179,7 +179,7 @@ def test_recordings_are_complete():
         assert recording.lights or one.family != "signalised_junction"
         for light in recording.lights:
             assert np.array_equal(light.stop_point, ids[light.lane_id].points[0])
-    assert len(families) >= 6 and families <= {family.name for family, _ in DOMAINS["grid"].families}
+    assert len(families) >= 5 and families <= {family.name for family, _ in DOMAINS["grid"].families}
 
 
 def test_rare_scenarios_have_one_labelled_event():
