@@ -22,7 +22,6 @@ import tempfile
 import time
 from collections import Counter
 from dataclasses import asdict, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +37,7 @@ from drivax.synthetic.events import EventKind
 from drivax.synthetic.events.kinds import SEVERITY_MPS2
 from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
+from drivax.tracking.runs import versions, write_text
 from world_measures import (
     NEAR_S,
     against,
@@ -237,36 +237,48 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
     rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
     return {
-        "command": " ".join(["python", "benchmarks/world.py", *sys.argv[1:]]),
+        "command": command(),
         "scenarios": all_count,
         "rare_scenarios": rare_count,
         "seed": args.seed,
         "domain": args.domain,
         **summary(rows["all"], rows["rare"], world),
         "generation": made,
-        "versions": versions(),
+        "versions": made_with(),
     }
 
 
-def versions() -> dict[str, Any]:
+def made_with() -> dict[str, Any]:
     """What a result was made with."""
-    return {
-        "drivax": metadata.version("drivax"),
-        "world": WORLD_VERSION,
-        "numpy": np.__version__,
-        "jax": metadata.version("jax"),
-        "python": platform.python_version(),
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-    }
+    processor = platform.processor() or platform.machine()
+    return {**versions(), "world": WORLD_VERSION, "processor": processor, "cores": os.cpu_count()}
 
 
 def stored(name: str, result: dict[str, Any]) -> None:
     """Writes a result."""
-    target = RESULTS / name
-    partial = target.with_name(f".{target.name}.partial")
-    partial.write_text(json.dumps(result, indent=1) + "\n")
-    partial.replace(target)
+    write_text(RESULTS / name, json.dumps(result, indent=1) + "\n")
+
+
+def tabulate() -> None:
+    """The stored results of both domains into the guide."""
+    rates = json.loads((RESULTS / "world_speed.json").read_text())
+    results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
+    for name, result in results.items():
+        result["speed"] = rates[name]
+    print(into_guide(results))
+
+
+def clock(scenarios: int, workers: int) -> None:
+    """Times both domains, prints and stores that."""
+    rates = {name: speed(name, scenarios, workers) for name in DOMAINS}
+    for name, rate in rates.items():
+        print(f"{name}: {rate['scenarios_per_second']:.1f}/s")
+    stored("world_speed.json", {"command": command(), **rates, "versions": made_with()})
+
+
+def command() -> str:
+    """How this was called."""
+    return " ".join(["python", "benchmarks/world.py", *sys.argv[1:]])
 
 
 def main() -> None:
@@ -301,14 +313,10 @@ def main() -> None:
     )
     args = parser.parse_args()
     if args.table:
-        rates = json.loads((RESULTS / "world_speed.json").read_text())
-        results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
-        print(into_guide({name: result | {"speed": rates[name]} for name, result in results.items()}))
+        tabulate()
         return
     if args.timed is not None:
-        rates = {name: speed(name, args.timed, args.workers) for name in DOMAINS}
-        print("\n".join(f"{name}: {made['scenarios_per_second']:.1f}/s" for name, made in rates.items()))
-        stored("world_speed.json", rates | {"versions": versions()})
+        clock(args.timed, args.workers)
         return
     if args.keep is not None:
         args.keep.mkdir(parents=True, exist_ok=True)

@@ -212,6 +212,28 @@ assert "jax" not in sys.modules
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, timeout=60)
 
 
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds child processes in /proc")
+def test_an_interrupt_that_reaches_workers_first_is_one(wire, write_records, tmp_path):
+    shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
+    (tmp_path / "src" / "0.tfrecord").write_bytes(shard)
+    (tmp_path / "src" / "1.tfrecord").write_bytes(shard)
+    call = ["-m", "drivax", "convert", str(tmp_path / "src"), str(tmp_path / "set"), "--workers", "2"]
+    process = subprocess.Popen([sys.executable, *call], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 30
+    while not list(tmp_path.glob(".set.*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(1.5)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    workers = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+    for worker in workers:
+        os.kill(int(worker), signal.SIGKILL)
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert workers and (process.returncode, errors.splitlines()[-1]) == (130, "drivax: interrupted")
+    assert leftovers(tmp_path) == ["src"]
+
+
 def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
     """Ctrl-C on a terminal reaches the whole process group, workers included."""
     shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300

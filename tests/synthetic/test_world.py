@@ -21,7 +21,7 @@ from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one, gen
 
 from .oracles import box_corners, shared_area, winding_number
 
-COUNT = 20
+SEED, COUNT = 2, 20
 RED = (LightState.ARROW_STOP, LightState.STOP)
 
 
@@ -31,7 +31,7 @@ EXACT = WorldConfig(noise=NoiseConfig(level=0.0))
 
 @cache
 def drawn(index, config=EXACT):
-    return generate_one(3, index, config)
+    return generate_one(SEED, index, config)
 
 
 def fields_of(recording):
@@ -45,7 +45,7 @@ def fields_of(recording):
 
 
 def test_a_seed_and_an_index_are_a_recording():
-    again = generate_recording(3, 1, EXACT)
+    again = generate_recording(SEED, 1, EXACT)
     assert fields_of(again) == fields_of(drawn(1).recording)
     assert fields_of(generate_recording(4, 1, EXACT)) != fields_of(again)
     assert fields_of(drawn(2).recording)[1] != fields_of(again)[1]
@@ -126,8 +126,8 @@ def test_the_expert_drives_gently_and_makes_way():
         moved.append(np.hypot(*np.diff(tracks.xy[0], axis=0).T).sum())
     assert min(hardest) > -4.05
     assert max(turning) < 4.89
-    assert min(moved) > 5.0
-    assert np.median(moved) > 25.0
+    assert min(moved) > 9.9  # 10 m by speeds; here by positions
+    assert np.median(moved) > 40.0
 
 
 def test_driving_on_as_before_is_not_enough():
@@ -160,10 +160,10 @@ def test_recordings_are_complete():
         recording, tracks = one.recording, one.recording.tracks
         families.add(one.family)
         assert recording.dataset == "drivax" and recording.current_step == CURRENT_STEP
-        assert recording.scenario_id == f"w{WORLD_VERSION}-grid-s3-{index:06d}-{one.family}"
+        assert recording.scenario_id == f"w{WORLD_VERSION}-grid-s{SEED}-{index:06d}-{one.family}"
         if not recording.events:
             place = f"m{index // EXACT.scenarios_per_map:06d}"
-            assert recording.segment.startswith(f"w{WORLD_VERSION}-grid-s3-{place}.")
+            assert recording.segment.startswith(f"w{WORLD_VERSION}-grid-s{SEED}-{place}.")
         assert recording.tags["family"] == one.family and recording.tags["domain"] == "grid"
         assert np.allclose(np.diff(recording.timestamps_s), 0.1)
         assert tracks.xy.shape == (len(tracks.kind), STEPS, 2) and tracks.valid.any(axis=1).all()
@@ -226,7 +226,7 @@ def test_the_world_needs_no_jax():
 
 def test_the_others_are_recorded_with_errors_and_ego_and_the_mask_are_exact():
     """Noise moves nobody by more than decimetres and changes neither ego, nor who is there, nor what is seen."""
-    exact, noisy = drawn(1).recording, generate_recording(3, 1)
+    exact, noisy = drawn(1).recording, generate_recording(SEED, 1)
     assert np.array_equal(exact.tracks.valid, noisy.tracks.valid) and np.array_equal(exact.seen, noisy.seen)
     assert np.array_equal(exact.tracks.xy[0], noisy.tracks.xy[0])
     apart = np.hypot(*np.moveaxis(exact.tracks.xy - noisy.tracks.xy, -1, 0))[1:][exact.tracks.valid[1:]]

@@ -20,7 +20,7 @@ import numpy as np
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError
 from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
-from drivax.tracking.workers import worker_pool
+from drivax.tracking.workers import await_interrupt, worker_pool
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ def _unspool(
     try:
         items = future.result()
     except BrokenProcessPool as error:
+        await_interrupt()
         raise DataError(
             "a worker process died (out of memory, or a script without a main guard)",
             cure="use fewer --workers; what is finished is kept, the same command continues",

@@ -22,7 +22,7 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
-from drivax.tracking.workers import worker_pool
+from drivax.tracking.workers import await_interrupt, worker_pool
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
@@ -232,6 +232,7 @@ def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, 
         while waiting:
             yield from waiting.popleft().result()
     except BrokenProcessPool as error:
+        await_interrupt()
         raise DrivaxError("a worker process was killed", cure="try fewer --workers") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from concurrent.futures import ProcessPoolExecutor
 
 
@@ -16,6 +17,15 @@ def worker_pool(workers: int) -> ProcessPoolExecutor:
         workers: Number of processes.
     """
     return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_start)
+
+
+def await_interrupt() -> None:
+    """For whoever finds a worker dead: Ctrl-C kills workers, too, and may reach them first.
+
+    Raises:
+        KeyboardInterrupt: That was it.
+    """
+    time.sleep(0.3)
 
 
 def _start() -> None:
