@@ -24,9 +24,10 @@ from drivax.simulator.catalogue import prepared
 from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
-from drivax.studies.bench import BenchConfig, bench, bench_metrics, speed
+from drivax.studies.bench import BenchConfig, bench, bench_metrics, speed, use_all_cores
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
+from drivax.testing.worlds import padded
 from drivax.tracking.runs import versions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,7 +38,7 @@ TASKS = {
     "full": Task(observation=PRESETS["optimal"], metrics="full"),
     "lean": Task(observation=PRESETS["minimal"], metrics="training"),
 }
-BATCHES = (256, 1024)
+BATCHES = (128, 256, 1024)
 SCENARIOS, MANY = 1024, 4096
 
 
@@ -66,14 +67,16 @@ def more_segments(bank: ScenarioBank) -> ScenarioBank:
 
 
 def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
-    """The bank with so many agent slots: the nearest to ego, and empty ones where it has fewer."""
-    more = max(0, count - bank.agents.shape[2])
-    return replace(
+    """The bank with so many slots: of everyone the first ones, and empty ones where it has fewer."""
+    few = replace(
         bank,
-        agents=jnp.pad(bank.agents[:, :, :count], ((0, 0), (0, 0), (0, more), (0, 0))),
-        agent_box=jnp.pad(bank.agent_box[:, :count], ((0, 0), (0, more), (0, 0))),
-        extension=jnp.pad(bank.extension[:, :count], ((0, 0), (0, more), (0, 0), (0, 0))),
+        agents=bank.agents[:, :, :count],
+        extension=bank.extension[:, :count],
+        agent_box=bank.agent_box[:, :count],
+        parked=bank.parked[:, :count],
+        parked_when=bank.parked_when[:, :, :count],
     )
+    return padded(few, count - few.agents.shape[2])
 
 
 def growth(small: ScenarioBank, large: ScenarioBank, config: BenchConfig) -> dict[str, float]:
@@ -107,6 +110,7 @@ def state_bytes(bank: ScenarioBank) -> dict[str, int]:
 
 def measure(folder: Path, repeats: int) -> dict[str, Any]:
     """Everything, one after the other."""
+    use_all_cores()
     stored = ScenarioSet.open(folder)
     if len(stored) < MANY:
         raise SystemExit(f"{folder} has {len(stored)} scenarios; generate at least {MANY}")

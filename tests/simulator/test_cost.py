@@ -15,6 +15,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
+from drivax.testing.worlds import padded
 
 BATCH = 4096
 
@@ -28,15 +29,6 @@ def bank():
 def with_segments(bank, more):
     pad = ((0, 0), (0, 0), (0, more))
     return replace(bank, edges=jnp.pad(bank.edges, pad), lanes=jnp.pad(bank.lanes, pad))
-
-
-def with_agents(bank, more):
-    return replace(
-        bank,
-        agents=jnp.pad(bank.agents, ((0, 0), (0, 0), (0, more), (0, 0))),
-        agent_box=jnp.pad(bank.agent_box, ((0, 0), (0, more), (0, 0))),
-        extension=jnp.pad(bank.extension, ((0, 0), (0, more), (0, 0), (0, 0))),
-    )
 
 
 def operations(bank, simulator=None):
@@ -57,7 +49,7 @@ def test_a_step_costs_the_same_on_a_map_of_twice_the_segments(bank):
 
 
 def test_a_step_costs_at_most_in_proportion_to_agents(bank):
-    few, many = operations(bank), operations(with_agents(bank, bank.agents.shape[2]))
+    few, many = operations(bank), operations(padded(bank, bank.agents.shape[2]))
     assert few < many < 1.5 * few
 
 
@@ -68,7 +60,7 @@ def test_the_count_would_see_pairs_of_agents(bank):
             return {"apart": jnp.sum((xy[:, None] - xy) ** 2)}
 
     few = operations(bank, Pairs(Task()))
-    many = operations(with_agents(bank, bank.agents.shape[2]), Pairs(Task()))
+    many = operations(padded(bank, bank.agents.shape[2]), Pairs(Task()))
     assert many - few > 3 * 64 * 64 * 2  # differences and squares of pairs, four times as many
 
 

@@ -175,6 +175,6 @@ def test_without_a_map_nothing_is_off_the_road():
     assert not np.asarray(value).any() and not np.asarray(slope).any()
 
 
-def test_a_margin_beyond_what_queries_see_is_refused():
+def test_a_margin_beyond_what_queries_see_is_refused(road):
     with pytest.raises(UsageError, match=r"margin_m is 3\.5"):
-        offroad_potential(None, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=3.5)
+        offroad_potential(road, jnp.int32(0), jnp.zeros(6), jnp.zeros(()), margin_m=3.5)

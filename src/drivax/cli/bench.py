@@ -13,7 +13,7 @@ from typing import Any
 from drivax import settings
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.studies.bench import BenchConfig, bench, bench_metrics
+from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.progress import Progress
 
@@ -48,6 +48,7 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Time and print."""
     given = {"batch": args.batch, "repeats": args.repeats, "traffic": args.traffic}
     config = settings.load(BenchConfig, given, overrides)
+    use_all_cores()
     if args.data is not None:
         bank = ScenarioBank.from_scenarios(ScenarioSet.open(args.data))
     else:
@@ -67,7 +68,7 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
 
 def _parts(result: dict[str, Any]) -> str:
     lines = [
-        f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']}, "
+        f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']} on {result['devices']} device(s), "
         f"{result['scenarios']:,} scenarios, {result['traffic']} traffic, with resets, observation, reward, metrics)",
         f"state {result['state_bytes']:,} B, scenario {result['bank_bytes_per_scenario']:,} B, "
         f"compiled in {result['compile_seconds']} s",

@@ -7,10 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.vectors import first_smallest
 from drivax.planners.planner import Memoryless
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import LIGHT_ARC, ScenarioBank
 from drivax.scenario.queries import LEVEL_M, route_ahead
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import LightState
@@ -93,36 +92,32 @@ class IdmPlanner(Memoryless):
         gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
         speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
         nearest = first_smallest(gaps)
-        stop = stop_line_m(bank, situation, path, there, offsets) + self.parameters.min_gap_m - STOP_SHORT_M
+        stop = stop_line_m(bank, situation) + self.parameters.min_gap_m - STOP_SHORT_M
         gap = jnp.minimum(gaps[nearest], stop)
         gap = jnp.where(jnp.isfinite(gap), gap, 1e4)
         return gap, jnp.where(stop < gaps[nearest], 0.0, speed[nearest])
 
 
-def stop_line_m(
-    bank: ScenarioBank, situation: Situation, path: Array, there: Array, offsets: Array
-) -> Float[Array, ""]:
+def stop_line_m(bank: ScenarioBank, situation: Situation) -> Float[Array, ""]:
     """Distance from the front bumper to the nearest stop line of the route whose light asks to stop."""
     scene = situation.scene
     line = bank.light_line[scene.index]
     state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
-    middle = (line[:, 0:2] + line[:, 2:4]) / 2
-    heading = jnp.stack([jnp.cos(line[:, 5]), jnp.sin(line[:, 5])], axis=-1)
-    along, lateral, _, _ = project(path, there, offsets, middle, heading)
-    front = along - situation.surroundings.frame.box[scene.slot, 4] / 2
+    front = line[LIGHT_ARC] - scene.route_m - situation.surroundings.frame.box[scene.slot, 4] / 2
     speed = scene.history[-1, 3]
     can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
-    asks = (red | (yellow & can_stop)) & (line[:, 7] > 0) & (jnp.abs(lateral) < 2.5) & (front > 0.0)
+    asks = (red | (yellow & can_stop)) & (front > 0.0) & (front < _POINTS * _STEP_M)
     return jnp.min(jnp.where(asks, front, jnp.inf))
 
 
 def desired_speed(path: Array, there: Array, offsets: Array) -> Float[Array, ""]:
     """The limit here, and what the curves ahead allow with gentle braking."""
     limit = jnp.where(path[0, 5] > 0, path[0, 5], _FALLBACK_LIMIT_MPS)
-    heading = jnp.arctan2(path[:, 4], path[:, 3])
-    curvature = jnp.abs(wrap(heading[1:] - heading[:-1])) / _STEP_M
+    cos, sin = path[:, 3], path[:, 4]
+    dot, cross = cos[1:] * cos[:-1] + sin[1:] * sin[:-1], cos[:-1] * sin[1:] - cos[1:] * sin[:-1]
+    curvature = jnp.arctan2(jnp.abs(cross), dot) / _STEP_M
     curvature = jnp.where(there[1:], curvature, 0.0)
     allowed = _CURVE_MPS2 / jnp.maximum(curvature, 1e-4) + 2.0 * _CURVE_BRAKING_MPS2 * offsets[:-1]
     return jnp.minimum(limit, jnp.sqrt(jnp.min(allowed)))

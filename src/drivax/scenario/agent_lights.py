@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.geometry.angles import wrap
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import (
+    LIGHT_COS, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_HALF, LIGHT_SIN, LIGHT_X, LIGHT_Y, LIGHT_Z, NEVER_M, ScenarioBank,
+)  # fmt: skip
 from drivax.scenario.queries import LEVEL_M
 
 #: Stop lines of a path that are kept, the first ones.
@@ -19,7 +21,6 @@ _ONE_PLACE_M = 3.0
 _JUDGED_AFTER_M = 20.0
 #: A line counts for paths that cross it within this angle of its lane's heading.
 _ASKEW_COS = 0.5
-NEVER_M = 1e6
 Array = np.ndarray[Any, Any]
 
 
@@ -41,15 +42,16 @@ def light_arcs(
     arcs = np.full((len(scenario), STOPS), NEVER_M)
     lights = np.zeros((len(scenario), STOPS), np.int64)
     line, state = np.asarray(bank.light_line, np.float64), np.asarray(bank.light_state)
+    exits = np.arctan2(line[:, LIGHT_EXIT_SIN], line[:, LIGHT_EXIT_COS])
     for row in np.unique(scenario):
         seen = np.flatnonzero((state[row] >= 0).any(axis=0))
         mine = np.flatnonzero(scenario == row)
         if not len(seen):
             continue
-        crossed = _crossings(line[row, seen], points[mine], spacing[mine])
+        crossed = _crossings(line[row][:, seen], points[mine], spacing[mine])
         for path, arc in zip(mine, crossed, strict=True):
             heading = np.arctan2(points[path, :, 4], points[path, :, 3])
-            found = _places(arc, heading, spacing[path], line[row, seen, 6])
+            found = _places(arc, heading, spacing[path], exits[row, seen])
             for place, (where, light) in enumerate(found[:STOPS]):
                 arcs[path, place], lights[path, place] = where, seen[light]
     return arcs, lights
@@ -57,15 +59,14 @@ def light_arcs(
 
 def _crossings(line: Array, points: Array, spacing: Array) -> Float[np.ndarray, "V L"]:
     """Arc length at which each path first passes forwards through each stop line; infinite where it does not."""
-    middle, cos, sin = (line[:, 0:2] + line[:, 2:4]) / 2, np.cos(line[:, 5]), np.sin(line[:, 5])
-    half = np.hypot(line[:, 2] - line[:, 0], line[:, 3] - line[:, 1]) / 2
-    dx, dy = (points[:, :, None, i] - middle[:, i] for i in (0, 1))
+    cos, sin = line[LIGHT_COS], line[LIGHT_SIN]
+    dx, dy = (points[:, :, None, i] - line[at] for i, at in ((0, LIGHT_X), (1, LIGHT_Y)))
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
     before, after = ahead[:, :-1], ahead[:, 1:]
     share = -before / np.where(after > before, after - before, 1.0)
-    through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= half
+    through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= line[LIGHT_HALF]
     facing = points[:, :-1, None, 3] * cos + points[:, :-1, None, 4] * sin > _ASKEW_COS
-    level = np.abs(points[:, :-1, None, 2] - line[:, 4]) <= LEVEL_M
+    level = np.abs(points[:, :-1, None, 2] - line[LIGHT_Z]) <= LEVEL_M
     crosses = (before < 0.0) & (after >= 0.0) & through & facing & level
     first = np.argmax(crosses, axis=1)
     arc = (first + np.take_along_axis(share, first[:, None], axis=1)[:, 0]) * spacing[:, None]

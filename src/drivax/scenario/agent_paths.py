@@ -17,7 +17,7 @@ from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
 from drivax.scenario.agent_lights import light_arcs
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_VX, AGENT_VY, AGENT_Z, ScenarioBank
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_VX, AGENT_VY, AGENT_Z, WORD, ScenarioBank
 from drivax.scenario.queries import LANE_CUTOFF_M, LEVEL_M
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
@@ -114,7 +114,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     courses = _courses(bank, logs)
     count = np.bincount(logs.scenario, minlength=len(bank))
     # A bank that keeps its padding shares programs with others of its capacity.
-    rows = max(8, -(-int(count.max(initial=0)) // 8) * 8) if bank.trimmed else bank.agents.shape[2]
+    rows = max(2, -(-int(count.max(initial=0)) // 2) * 2) if bank.trimmed else bank.agents.shape[2]
     row = np.arange(len(logs.slot)) - np.concatenate(([0], np.cumsum(count)))[logs.scenario]
     shape, at = (len(bank), rows), (logs.scenario, row)
 
@@ -146,7 +146,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
 
 def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
     """Logs of the agents that may react: of these kinds, moving more than 2 m, never backwards."""
-    agents, kind = np.asarray(bank.agents, np.float64), np.asarray(bank.agent_box[:, :, 3])
+    agents, kind = np.asarray(bank.agents, np.float64), np.asarray(bank.agent_box[:, : bank.agents.shape[2], 3])
     valid = agents[..., AGENT_VALID] > 0
     there = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1))
     scenario, slot = there[:, 0], there[:, 1]
@@ -292,7 +292,7 @@ def _appears(valid: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
 def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -> Numbers:
     """Frame slots whose box each agent's own overlaps in the log, step by step; the first two, -1 for none."""
     found = np.full((len(bank), bank.steps, rows, OVERLAPS), -1, np.int16)
-    tables = tuple(np.asarray(part) for part in (bank.agents, bank.agent_box, bank.parked, bank.parked_valid))
+    tables = tuple(np.asarray(part) for part in (bank.agents, bank.agent_box, bank.parked, bank.parked_when))
     for scenario in np.unique(logs.scenario):
         mine = np.flatnonzero(logs.scenario == scenario)
         boxes, z, valid = _logged_boxes(tables, int(scenario))
@@ -315,14 +315,11 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -
 
 def _logged_boxes(tables: _Tables, scenario: int) -> tuple[Numbers, Numbers, Numbers]:
     """Boxes, heights and validity of all slots of a frame, at every logged step."""
-    agents, box, parked, there = (table[scenario] for table in tables)
-    steps = len(agents)
-    size = np.broadcast_to(box[None, :, :2], (steps, len(box), 2))
-    moving = np.concatenate([agents[..., :2], agents[..., 3:5], size], axis=-1)
-    still = np.broadcast_to(parked[None, :, :6], (steps, *parked[:, :6].shape))
-    z = np.concatenate([agents[..., AGENT_Z], np.broadcast_to(parked[:, 6], there.shape)], axis=1)
-    return (
-        np.concatenate([moving, still], axis=1),
-        z,
-        np.concatenate([agents[..., AGENT_VALID] > 0, there], axis=1),
-    )
+    agents, box, parked, when = (table[scenario] for table in tables)
+    step = np.arange(len(agents))
+    there = (when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
+    rows = np.pad(agents, ((0, 0), (0, len(box) - agents.shape[1]), (0, 0)))
+    rows = np.where(there[..., None], parked, rows)
+    size = np.broadcast_to(box[None, :, :2], (len(rows), len(box), 2))
+    boxes = np.concatenate([rows[..., :2], rows[..., 3:5], size], axis=-1)
+    return boxes, rows[..., AGENT_Z], rows[..., AGENT_VALID] > 0

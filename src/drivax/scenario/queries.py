@@ -7,13 +7,16 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.vectors import first_smallest, root
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import (
+    LIGHT_COS, LIGHT_HALF, LIGHT_SIN, LIGHT_X, LIGHT_Y, LIGHT_Z, ROUTE_LIMIT, ScenarioBank,
+)  # fmt: skip
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
 
@@ -63,7 +66,7 @@ def _runs(
 
 
 def _to_segments(
-    rows: Float[Array, "F K"], points: Float[Array, "P 2"]
+    rows: Float[Array, "F K"] | Sequence[Float[Array, " K"]], points: Float[Array, "P 2"]
 ) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
     """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
     ax, ay, bx, by = rows[0], rows[1], rows[2], rows[3]
@@ -168,12 +171,12 @@ def around_lanes(
     return LaneHits(
         near=near,
         points_near=points_near,
-        on_corridor=((rows[8] == 1.0) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
+        on_corridor=((rows[7] > jnp.floor(rows[7])) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
         leaving_lane=has_lane & leaving.any(),
         limit=jnp.where(has_lane, limit[best], -1.0),
-        lane=jnp.where(has_lane, rows[7, best], -1.0).astype(jnp.int32),
+        lane=jnp.where(has_lane, jnp.floor(rows[7, best]), -1.0).astype(jnp.int32),
         offset=jnp.where(has_lane, side[0, best], 0.0),
         z=jnp.where(near, rows[4, nearest], z),
     )
@@ -283,7 +286,7 @@ def project_on_route(
     a, b = window[:-1], window[1:]
     place = first + jnp.arange(size - 1)
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
-    rows = jnp.stack([a[:, 0], a[:, 1], b[:, 0], b[:, 1]])
+    rows = [a[:, 0], a[:, 1], b[:, 0], b[:, 1]]
     squared, side = _to_segments(rows, xy[None])
     k = first_smallest(jnp.where(real, squared[0], _FAR))
     u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
@@ -305,10 +308,9 @@ def route_ahead(
     at = jnp.maximum(along_m + offsets_m, 0.0)
     last = bank.route_points[index, route] - 1
     low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
-    part = (at - low)[:, None]
-    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
     # Lanes and limits are not numbers to blend.
-    rows = rows.at[:, 5:].set(bank.routes[index, route, low, 5:])
+    part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < ROUTE_LIMIT)
+    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
     return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
 
 
@@ -325,26 +327,18 @@ def light_crossing(
     finite segment. The distance is infinite for lines of other lanes (more than 2 m beside the segment) and levels.
     """
     line = bank.light_line[index]
-    middle = (line[:, 0:2] + line[:, 2:4]) / 2
-    half = jnp.sqrt(jnp.sum((line[:, 2:4] - line[:, 0:2]) ** 2, -1)) / 2
-    cos, sin = jnp.cos(line[:, 5]), jnp.sin(line[:, 5])
+    cos, sin, half = line[LIGHT_COS], line[LIGHT_SIN], line[LIGHT_HALF]
 
     def split(point: Float[Array, " 2"]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
-        d = point - middle
-        return d[:, 0] * cos + d[:, 1] * sin, d[:, 1] * cos - d[:, 0] * sin
+        dx, dy = point[0] - line[LIGHT_X], point[1] - line[LIGHT_Y]
+        return dx * cos + dy * sin, dy * cos - dx * sin
 
     (s0, t0), (s1, t1) = split(before), split(now)
     share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
     through = jnp.abs(t0 + (t1 - t0) * share) <= half
-    level = jnp.abs(line[:, 4] - z) <= LEVEL_M
+    level = jnp.abs(line[LIGHT_Z] - z) <= LEVEL_M
     before_m = jnp.where(level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
     return (s0 < 0.0) & (s1 >= 0.0) & through & level, before_m
-
-
-def turns_right(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, " L"]:
-    """Whether the lane behind each stop line ends more than 45 deg to the right of its start."""
-    line = bank.light_line[index]
-    return wrap(line[:, 6] - line[:, 5]) < -jnp.pi / 4
 
 
 def lane_course(

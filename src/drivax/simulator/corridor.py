@@ -1,12 +1,14 @@
 """Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
 
 All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
-leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima over whole
-numbers (a sort costs several times as much), and only these are measured against the path.
+leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima
+(a sort costs several times as much), and only these are measured against the path.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -34,9 +36,8 @@ BEHIND_M = 1.0
 _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 #: Gap of a free road, m; a number, so that gradients stay finite.
 FREE_M = 1e4
-#: The low bits of a key hold the thing, the others its squared distance, to within 0.03 %.
-_SLOT_BITS = 10
-_NONE = 2**31 - 1
+#: So many low bits of a squared distance hold the thing or piece; what is left is exact to 0.03 % (of 1 m2 at least).
+_SLOT_BITS, _PIECE_BITS = 10, 4
 
 
 @record
@@ -106,65 +107,59 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     look = _look(movers.speed)
     nodes, tangents, arcs = _path_ahead(paths, index, movers, look)
     things, real = _closest(movers, frame, nodes)
-    box, velocity = jax.lax.optimization_barrier((frame.box[things], frame.velocity[things]))
+    box, velocity = frame.box[things], frame.velocity[things]
     # Coordinates one by one: pairs of numbers at the end of an array do not vectorise.
-    x, y = (nodes[:, None, :, axis] for axis in (X, Y))
-    ux, uy = x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1]
-    wx, wy = box[:, :, None, X] - x[..., :-1], box[:, :, None, Y] - y[..., :-1]
-    part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
-    apart_x, apart_y = wx - part * ux, wy - part * uy
-    part, distance = jax.lax.optimization_barrier((part, apart_x * apart_x + apart_y * apart_y))
-    best = first_smallest(distance)[..., None]
-    part, distance = (jnp.take_along_axis(one, best, axis=-1)[..., 0] for one in (part, distance))
-    row, best = jnp.arange(things.shape[0])[:, None], best[..., 0]
+    x, y = nodes[..., X, None], nodes[..., Y, None]
+    keys = []
+    for number in range(PIECES):
+        ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
+        keys.append(_numbered(_from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
+    # Computed once: without the barrier XLA computes it anew for each of the columns that are read.
+    best = jax.lax.optimization_barrier(_number(reduce(jnp.minimum, keys), _PIECE_BITS))
     # Everything about a piece in one row, so that it is read once.
-    rows = jnp.concatenate(
-        [
-            nodes[:, :-1],
-            nodes[:, 1:],
-            tangents[:, :-1],
-            tangents[:, 1:],
-            arcs[:, :-1, None],
-            arcs[:, 1:, None],
-        ],
-        -1,
-    )
-    piece = jax.lax.optimization_barrier(rows[row, best])
-    way = piece[..., 2:4] - piece[..., :2]
-    long = jnp.sqrt(jnp.maximum(jnp.sum(way * way, axis=-1), 1e-6))
-    way = way / long[..., None]
-    beside = _cross(way, box[..., :2] - piece[..., :2])
-    beside -= _bulge(part, way, piece[..., 4:6], piece[..., 6:8]) * long
+    last = jnp.broadcast_to(jnp.arange(PIECES) == PIECES - 1, (len(nodes), PIECES)).astype(nodes.dtype)
+    columns = [part[:, at : at + PIECES] for part in (nodes, tangents, arcs[..., None]) for at in (0, 1)]
+    rows = jnp.concatenate([*columns, last[..., None]], axis=-1)
+    piece = jnp.moveaxis(rows[jnp.arange(len(things))[:, None], best], -1, 0)
+    x0, y0, x1, y1, *slopes, arc, end, last = piece
+    part, distance = _from_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
+    long = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
+    ux, uy = (x1 - x0) / long, (y1 - y0) / long
+    beside = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), slopes) * long
     distance = jnp.where((part > 0.0) & (part < 1.0), beside * beside, distance)
-    along = piece[..., 8] + part * (piece[..., 9] - piece[..., 8]) - movers.arc[:, None]
-    cos = jnp.abs(box[..., COS] * way[..., 0] + box[..., SIN] * way[..., 1])
-    sin = jnp.abs(box[..., SIN] * way[..., 0] - box[..., COS] * way[..., 1])
+    along = arc + part * (end - arc) - movers.arc[:, None]
+    cos = jnp.abs(box[..., COS] * ux + box[..., SIN] * uy)
+    sin = jnp.abs(box[..., SIN] * ux - box[..., COS] * uy)
     half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
     half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
     room = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
-    beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
+    beyond = (along >= look[:, None]) | ((last > 0) & (part >= 1.0))
     inside = real & (distance < room * room) & (along > 0.0) & ~beyond
     gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
     nearest = first_smallest(gap)[:, None] == jnp.arange(CLOSEST)
-    speed = jnp.sum(jnp.where(nearest, jnp.sum(velocity * way, axis=-1), 0.0), axis=1)
+    speed = jnp.sum(jnp.where(nearest, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
     return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
 
 
-def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, ...]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Where on a piece, as a share of it, the point nearest to another one lies, and their squared distance."""
+    ux, uy, wx, wy = x1 - x0, y1 - y0, x - x0, y - y0
+    part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
+    dx, dy = wx - part * ux, wy - part * uy
+    return part, dx * dx + dy * dy
 
 
-def _bulge(
-    part: Float[Array, ...],
-    way: Float[Array, "... 2"],
-    begin: Float[Array, "... 2"],
-    end: Float[Array, "... 2"],
-) -> Float[Array, ...]:
-    """How far to the left of a straight piece the path runs, as a share of its length: the cubic with both tangents."""
-    slopes = [
-        jnp.clip(_cross(way, tangent) / jnp.maximum(jnp.sum(way * tangent, axis=-1), 0.1), -1.0, 1.0)
-        for tangent in (begin, end)
-    ]
+def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
+    """How far to the left of a straight piece the path runs, as a share of its length: the cubic with both tangents.
+
+    Args:
+        part: Where on the piece, as a share of it.
+        way: Direction of the piece: cosine, sine.
+        tangents: Directions of the path at its beginning and end: cosine, sine, cosine, sine.
+    """
+    (ux, uy), slopes = way, []
+    for cos, sin in (tangents[:2], tangents[2:]):
+        slopes.append(jnp.clip((ux * sin - uy * cos) / jnp.maximum(ux * cos + uy * sin, 0.1), -1.0, 1.0))
     return part * (1 - part) * ((1 - part) * slopes[0] - part * slopes[1])
 
 
@@ -204,19 +199,30 @@ def closest(
     near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "S 6"]
 ) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
     """Of the boxes that are near the 8 whose centres are the closest; and whether there are as many."""
-    slot = jnp.arange(near.shape[1], dtype=jnp.int32)
     dx, dy = box[:, X] - me[:, X : X + 1], box[:, Y] - me[:, Y : Y + 1]
-    square = jax.lax.stop_gradient(dx * dx + dy * dy).astype(jnp.float32)
-    # Floats that are not negative are ordered like their bits; the low ones give way to the slot.
-    bits = jax.lax.bitcast_convert_type(square, jnp.int32)
+    key = jnp.where(near, _numbered(dx * dx + dy * dy, jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
     # Computed once: without the barrier XLA computes it anew for each of the minima.
-    key = jax.lax.optimization_barrier(jnp.where(near, (bits & ~((1 << _SLOT_BITS) - 1)) | slot, _NONE))
+    key = jax.lax.optimization_barrier(key)
     found = [jnp.min(key, axis=1, keepdims=True)]
     for _ in range(CLOSEST - 1):
-        found.append(jnp.min(jnp.where(key > found[-1], key, _NONE), axis=1, keepdims=True))
+        found.append(jnp.min(jnp.where(key > found[-1], key, jnp.inf), axis=1, keepdims=True))
     chosen = jnp.concatenate(found, axis=1)
-    real = chosen < _NONE
-    return jnp.where(real, chosen & ((1 << _SLOT_BITS) - 1), 0), real
+    real = jnp.isfinite(chosen)
+    return jnp.where(real, _number(chosen, _SLOT_BITS), 0), real
+
+
+def _numbered(square: Float[Array, "..."], number: Any, bits: int) -> Float[Array, "..."]:
+    """Squared distances with a number in place of the low bits, so that the smallest one says which it is.
+
+    They stay floats, whose minima vectorise, of at least one, since what is below the smallest normal float may count
+    as zero.
+    """
+    key = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(1.0 + square).astype(jnp.float32), jnp.int32)
+    return jax.lax.bitcast_convert_type((key & ~((1 << bits) - 1)) | number, jnp.float32)
+
+
+def _number(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
+    return jax.lax.bitcast_convert_type(key, jnp.int32) & ((1 << bits) - 1)
 
 
 def reaching(
@@ -233,37 +239,41 @@ def reaching(
         beyond: How much further on the last one reaches, m.
         rectangles: How many; K - 1 is a multiple of it.
     """
-    count = (nodes.shape[1] - 1) // rectangles
+    origin, direction, near, far, low, high = _rectangles(nodes, half, behind, beyond, rectangles)
+    deep, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
     found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
     for number in range(rectangles):
-        stretch = nodes[:, number * count : (number + 1) * count + 1]
-        back, on = behind if number == 0 else 0.0, beyond if number == rectangles - 1 else 0.0
-        found |= _in_rectangle(box, stretch, half, back, on)
+        one = slice(number, number + 1)
+        (x, y), (cos, sin) = (part[:, :, one] for part in (origin, direction))
+        dx, dy = box[..., X] - x, box[..., Y] - y
+        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+        turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
+        turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
+        reach_ahead, reach_left = turn_cos * deep + turn_sin * wide, turn_sin * deep + turn_cos * wide
+        inside = (ahead > near[:, one] - reach_ahead) & (ahead < far[:, one] + reach_ahead)
+        found |= inside & (left > low[:, one] - reach_left) & (left < high[:, one] + reach_left)
     return found
 
 
-def _in_rectangle(
-    box: Float[Array, "1 S 6"],
-    nodes: Float[Array, "R K 2"],
-    half: Float[Array, "R 1"],
-    behind: Any,
-    beyond: Any,
-) -> Bool[Array, "R S"]:
-    chord = nodes[:, -1] - nodes[:, 0]
-    long = jnp.sqrt(jnp.maximum(jnp.sum(chord * chord, axis=-1, keepdims=True), 1e-6))
+def _rectangles(
+    nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any, count: int
+) -> tuple[Float[Array, "2 R Q"], Float[Array, "2 R Q"], Any, Any, Any, Any]:
+    """Origins and directions of the rectangles, and how far each goes back, on, to the right and to the left, m."""
+    long = (nodes.shape[1] - 1) // count
+    x, y = (
+        jnp.stack([nodes[:, q * long : (q + 1) * long + 1, axis] for q in range(count)], axis=1)
+        for axis in (X, Y)
+    )
+    rest_x, rest_y = x - x[..., :1], y - y[..., :1]
+    chord_x, chord_y = rest_x[..., -1], rest_y[..., -1]
+    chord = jnp.sqrt(jnp.maximum(chord_x * chord_x + chord_y * chord_y, 1e-6))
     # Beyond its end a path is one point; there any direction will do.
-    chord = jnp.where(long > 1e-2, chord / long, jnp.array([1.0, 0.0]))
-    cos, sin = chord[:, :1], chord[:, 1:]
-    rest = nodes - nodes[:, :1]
-    ahead, left = rest[..., 0] * cos + rest[..., 1] * sin, rest[..., 1] * cos - rest[..., 0] * sin
-    near = ahead.min(axis=1, keepdims=True) - half - behind
-    far = ahead.max(axis=1, keepdims=True) + half + beyond
-    low, high = left.min(axis=1, keepdims=True) - half, left.max(axis=1, keepdims=True) + half
-    dx, dy = box[..., X] - nodes[:, :1, 0], box[..., Y] - nodes[:, :1, 1]
-    ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
-    turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
-    turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
-    deep, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
-    reach_ahead, reach_left = turn_cos * deep + turn_sin * wide, turn_sin * deep + turn_cos * wide
-    inside = (ahead > near - reach_ahead) & (ahead < far + reach_ahead)
-    return inside & (left > low - reach_left) & (left < high + reach_left)
+    cos, sin = jnp.where(chord > 1e-2, chord_x / chord, 1.0), jnp.where(chord > 1e-2, chord_y / chord, 0.0)
+    ahead = rest_x * cos[..., None] + rest_y * sin[..., None]
+    left = rest_y * cos[..., None] - rest_x * sin[..., None]
+    number = jnp.arange(count)
+    near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind, 0.0)
+    far = ahead.max(axis=-1) + half + jnp.where(number == count - 1, beyond, 0.0)
+    found = (jnp.stack([x[..., 0], y[..., 0]]), jnp.stack([cos, sin]), near, far)
+    # Once, not for every box.
+    return jax.lax.optimization_barrier((*found, left.min(axis=-1) - half, left.max(axis=-1) + half))

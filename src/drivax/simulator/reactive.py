@@ -109,9 +109,9 @@ class IdmTraffic:
         here, speed = path_rows(paths, scene.index, now.arc[at]), now.speed[at]
         parts = [here[:, :5], speed[:, None] * here[:, 3:5], now.there[at][:, None]]
         driven = jnp.concatenate(parts, axis=-1)
-        row = paths.row[scene.index].astype(jnp.int32)
-        reacts = (row >= 0) & (now.phase[row] != REPLAYS) & (step > now.begin)
-        return jnp.where(reacts[:, None], driven[row], logged)
+        slot = paths.slot[scene.index].astype(jnp.int32)
+        reacts = (now.phase != REPLAYS) & (step > now.begin)
+        return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
 
     def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> Reactive:
         """One step of 0.1 s: everyone looks at the present frame, then all move."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, WORD, ScenarioBank
 from drivax.simulator.types import HISTORY, Frame, Scene
 
 
@@ -59,7 +59,7 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
 def frame_of(
     bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: Scene, back: int
 ) -> Frame:
-    """Everyone at one step: traffic's rows, the driven agents put in their place, then the parked ones.
+    """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
 
     Args:
         bank: The scenarios.
@@ -76,16 +76,18 @@ def frame_of(
     # Before the recording nobody else was seen.
     agents = agents.at[:, AGENT_VALID].mul(step >= back)
     agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
-    box, parked = bank.agent_box[index], bank.parked[index]
-    there = bank.parked_valid[index, jnp.clip(step - back, 0, bank.steps - 1)] & (step >= back)
+    box = bank.agent_box[index]
+    at = jnp.clip(step - back, 0, bank.steps - 1)
+    bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
+    there = (bit & 1 > 0) & (step >= back)
+    agents = jnp.pad(agents, ((0, len(box) - len(agents)), (0, 0)))
+    agents = jnp.where(there[:, None], bank.parked[index], agents)
     return Frame(
-        box=jnp.concatenate(
-            [jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1), parked[:, :6]]
-        ),
-        velocity=jnp.concatenate([agents[:, 5:7], jnp.zeros((parked.shape[0], 2))]),
-        z=jnp.concatenate([agents[:, 2], parked[:, 6]]),
-        valid=jnp.concatenate([agents[:, 7] > 0, there]),
-        kind=jnp.concatenate([box[:, 3], parked[:, 7]]).astype(jnp.int32),
+        box=jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1),
+        velocity=agents[:, 5:7],
+        z=agents[:, 2],
+        valid=agents[:, 7] > 0,
+        kind=box[:, 3].astype(jnp.int32),
     )
 
 

@@ -44,7 +44,7 @@ class Scene:
 
 @record
 class Frame:
-    """Everyone at one step: the A moving slots of the bank, then its P parked ones.
+    """Everyone at one step: in each of the S slots a moving or a parked agent, or nobody.
 
     Attributes:
         box: x, y, cos, sin, length, width.

@@ -1,17 +1,25 @@
-"""How fast the simulator steps on this machine: as a whole, by part, and by what is measured."""
+"""How fast the simulator steps on this machine: as a whole, by part, and by what is measured.
+
+Every device steps its share of the environments. A CPU is one device unless :func:`use_all_cores` makes each core one,
+which is faster: most operations of a step are too small to be worth dividing between cores.
+"""
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import Wanted
@@ -39,7 +47,7 @@ class BenchConfig:
     """What is timed.
 
     Attributes:
-        batch: Environments side by side.
+        batch: Environments side by side, a multiple of the number of devices.
         steps: Steps per timed call.
         repeats: Timed calls; the median counts.
         task: Observation, reward, metrics.
@@ -70,6 +78,12 @@ class Speed:
     temporary_bytes: int
 
 
+def use_all_cores() -> None:
+    """Makes every core that this process may use a device of its own; without effect once JAX has started."""
+    with suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+
+
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
     """Times stepping with resets, observation, reward and metrics, driven by IDM, and each part alone.
 
@@ -92,6 +106,7 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
     return {
         "environment_steps_per_second": round(whole.steps_per_second),
         "batch": config.batch,
+        "devices": jax.device_count(),
         "scenarios": len(bank),
         "traffic": simulator.traffic.name,
         "state_bytes": whole.state_bytes,
@@ -142,37 +157,59 @@ def speed(bank: ScenarioBank, config: BenchConfig) -> Speed:
     simulator, bank = _simulator(bank, config)
     states = _states(simulator, bank, config.batch)
     began = time.perf_counter()
-    traced = jax.jit(lambda *args: _run(simulator, config, *args)).lower(bank, states, jax.random.key(0))
-    program = traced.compile()
+    keys = jax.random.split(jax.random.key(2), jax.device_count())
+    program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, states, keys).compile()
     compiled = time.perf_counter() - began
-    alive = int(program(bank, states, jax.random.key(2))[1])
-    seconds = _median(lambda: program(bank, states, jax.random.key(2)), config.repeats)
+    alive = int(program(bank, states, keys)[1].sum())
+    seconds = _median(lambda: program(bank, states, keys), config.repeats)
     memory = program.memory_analysis()
     return Speed(
         steps_per_second=alive / seconds,
         compile_seconds=compiled,
         state_bytes=sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
-        temporary_bytes=0 if memory is None else memory.temp_size_in_bytes // config.batch,
+        temporary_bytes=0 if memory is None else memory.temp_size_in_bytes * jax.device_count() // config.batch,
     )
 
 
 def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
+    """The simulator, and the bank on every device."""
+    if config.batch % jax.device_count():
+        raise UsageError(
+            f"a batch of {config.batch} does not divide among {jax.device_count()} devices",
+            cure="give a multiple",
+        )
     traffic = make_traffic(config.traffic)
-    return Simulator(config.task, traffic), prepared(traffic, bank)
+    bank = jax.device_put(prepared(traffic, bank), NamedSharding(_mesh(), PartitionSpec()))
+    return Simulator(config.task, traffic), bank
 
 
 def _states(simulator: Simulator, bank: ScenarioBank, batch: int) -> SimState:
     index = jax.random.randint(jax.random.key(1), (batch,), 0, len(bank))
-    return jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
+    states = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
+    return jax.device_put(states, NamedSharding(_mesh(), PartitionSpec("device")))
+
+
+def _mesh() -> Mesh:
+    return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
+
+
+def _shared(function: Callable[..., Any]) -> Any:
+    """A program of bank, states and keys in which every device has its share of the states, and a key."""
+    share = PartitionSpec("device")
+    return jax.jit(
+        jax.shard_map(
+            function, mesh=_mesh(), in_specs=(PartitionSpec(), share, share), out_specs=share, check_vma=False
+        )
+    )
 
 
 def _run(
-    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState, key: Array
-) -> tuple[Array, Array]:
-    """Steps a batch; the sum of all that was computed, so that nothing is optimised away, and how many were steps."""
-    driver = IdmPlanner(config.task.actions)
+    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState, keys: Array
+) -> tuple[Any, Array]:
+    """Steps a batch; what was earned and is seen, so that nothing is optimised away, and how many were steps."""
+    driver, key, batch = IdmPlanner(config.task.actions), keys[0], states.start.shape[0]
 
-    def act(state: SimState, key: Array) -> Float[Array, " D"]:
+    def act(state: SimState) -> Float[Array, " D"]:
         return driver.act((), bank, state, simulator.situation(bank, state), None, key)[0]
 
     step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
@@ -182,22 +219,20 @@ def _run(
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
         return sum((value.value.sum() for value in values.values()), start=jnp.zeros(()))
 
-    def one(carry: tuple[SimState, Array, Array, Array], _: None) -> tuple[Any, Array]:
-        states, over, key, total = carry
-        key, action_key, index_key = jax.random.split(key, 3)
-        action = jax.vmap(act)(states, jax.random.split(action_key, config.batch))
-        index = jax.random.randint(index_key, (config.batch,), 0, len(bank))
+    def one(carry: tuple[Any, ...], index: Int[Array, " B"]) -> tuple[Any, Array]:
+        states, over, total, _ = carry
+        action = jax.vmap(act)(states)
         states, transition = step(bank, states, action, over, index)
-        seen = [jnp.sum(value, dtype=jnp.float32) for value in jax.tree.leaves(observe(bank, states.scene))]
         done = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.
         total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
-        total += sum(seen) + transition.reward.sum()
-        return (states, done, key, total), (~over).sum()
+        total += transition.reward
+        return (states, done, total, observe(bank, states.scene)), (~over).sum()
 
-    start = (states, jnp.zeros(config.batch, bool), key, jnp.zeros(()))
-    (_, _, _, total), alive = jax.lax.scan(one, start, None, config.steps)
-    return total, alive.sum()
+    start = (states, jnp.zeros(batch, bool), jnp.zeros(batch), observe(bank, states.scene))
+    begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
+    (_, _, total, seen), alive = jax.lax.scan(one, start, begins)
+    return (total, seen), alive.sum()[None]
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
@@ -260,16 +295,16 @@ def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
 def _rounds(config: BenchConfig, part: Part) -> Callable[[ScenarioBank, SimState], Array]:
     """A program that computes one part again and again."""
 
-    @jax.jit
-    def many(bank: ScenarioBank, states: SimState) -> Array:
+    def many(bank: ScenarioBank, states: SimState, _: Any) -> Array:
         def one(shift: Array, _: None) -> tuple[Array, None]:
             seen = jax.vmap(lambda state, by: _total(part, bank, _shifted(state, by)))(states, shift)
             # The next round depends on this one, so that nothing is taken out of the loop.
             return shift + 1e-20 * jnp.where(jnp.isfinite(seen), seen, 0.0), None
 
-        return jax.lax.scan(one, jnp.zeros(config.batch), None, config.steps)[0]
+        return jax.lax.scan(one, jnp.zeros(states.start.shape), None, config.steps)[0]
 
-    return many
+    program = _shared(many)
+    return lambda bank, states: program(bank, states, None)
 
 
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:

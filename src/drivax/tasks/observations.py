@@ -15,10 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import rotate
-from drivax.scenario.bank import ROUTE_LIMIT, ScenarioBank
+from drivax.scenario.bank import (
+    LIGHT_ARC, LIGHT_COS, LIGHT_SIN, LIGHT_X, LIGHT_Y, NEVER_M, ROAD_AREA, ROAD_EDGE, ROAD_LANE, ROAD_NONE,
+    ROUTE_LIMIT, ScenarioBank,
+)  # fmt: skip
 from drivax.scenario.queries import route_ahead
 from drivax.scenario.record import record
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, LightState
+from drivax.scenario.schema import Flag, LightState
 from drivax.simulator.types import HISTORY, Frame, Scene
 from drivax.tasks.own import own_name, refuse_taken
 
@@ -173,8 +176,8 @@ def _agents(config: ObservationConfig, scene: Scene, view: View, frames: Frames)
     now = frames(0)
     slots = now.valid.shape[0]
     seen = now.valid & (jnp.arange(slots) != scene.slot)
-    offset = now.box[:, :2] - view.xy
-    distance = jnp.where(seen, jnp.sum(offset * offset, axis=-1), jnp.inf)
+    dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
+    distance = jnp.where(seen, dx * dx + dy * dy, jnp.inf)
     chosen = _nearest(distance, config.agents)
     there = seen[chosen] & (jnp.arange(config.agents) < slots)
 
@@ -198,45 +201,36 @@ def _agents(config: ObservationConfig, scene: Scene, view: View, frames: Frames)
 
 
 def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    rows = bank.road[scene.index]
-    count = rows.shape[0]
-    kind = rows[:, 5]
-    lane, edge, area = (_is_one_of(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS))
-    xy = view.point(rows[:, :2])
-    inside = (xy[:, 0] < ROAD_AHEAD_M) & (xy[:, 0] > -ROAD_BEHIND_M) & (jnp.abs(xy[:, 1]) < ROAD_SIDE_M)
-    wanted = lane | area | (edge if config.edges else jnp.zeros_like(edge))
-    inside &= wanted & (jnp.arange(count) < bank.road_rows[scene.index])
+    x, y, layer = bank.road_at[scene.index]
+    dx, dy = x - view.xy[0], y - view.xy[1]
+    ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
+    inside = (ahead < ROAD_AHEAD_M) & (ahead > -ROAD_BEHIND_M) & (jnp.abs(left) < ROAD_SIDE_M)
+    inside &= (layer != ROAD_NONE) if config.edges else (layer != ROAD_NONE) & (layer != ROAD_EDGE)
     # Compact without sorting: the running count says where each row inside goes.
     running = jnp.cumsum(inside.astype(jnp.int32))
     place = jnp.where(inside, running - 1, config.road)
-    take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(count), mode="drop")
-    mask = jnp.arange(config.road) < running[-1]
-    types = jnp.stack([lane, edge, area], axis=-1).astype(jnp.float32)[take]
-    chosen = rows[take]
-    limit = jnp.where(chosen[:, 6:7] > 0, chosen[:, 6:7] / SPEED_MPS, 0.0)
-    parts = [xy[take] / POSITION_M, view.vector(chosen[:, 2:4]), chosen[:, 4:5] / PIECE_M, types, limit]
-    parts.append((chosen[:, 6:7] > 0).astype(jnp.float32))
-    return _masked("road", jnp.concatenate(parts, axis=-1), mask)
-
-
-def _is_one_of(kind: Float[Array, " R"], kinds: tuple[int, ...]) -> Bool[Array, " R"]:
-    return (kind >= min(kinds)) & (kind <= max(kinds))
+    take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
+    rows = bank.road[scene.index, take]
+    parts = [view.point(rows[:, :2]) / POSITION_M, view.vector(rows[:, 2:4])]
+    types = (rows[:, 5:6] == jnp.asarray([ROAD_LANE, ROAD_EDGE, ROAD_AREA])).astype(jnp.float32)
+    limit = rows[:, 6:7]
+    parts += [rows[:, 4:5] / PIECE_M, types, jnp.maximum(limit, 0.0) / SPEED_MPS, (limit > 0).astype(jnp.float32)]
+    return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
 def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     line = bank.light_line[scene.index]
     state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
-    middle = (line[:, 0:2] + line[:, 2:4]) / 2
-    offset = middle - view.xy
-    distance = jnp.sqrt(jnp.sum(offset * offset, axis=-1))
+    dx, dy = line[LIGHT_X] - view.xy[0], line[LIGHT_Y] - view.xy[1]
     # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
-    ahead = offset[:, 0] * jnp.cos(line[:, 5]) + offset[:, 1] * jnp.sin(line[:, 5])
-    seen = (state >= 0) & (ahead > -_PASSED_M)
-    rank = distance + jnp.where(line[:, 7] > 0, 0.0, 1e4)
+    seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
+    on_route = line[LIGHT_ARC] < NEVER_M
+    rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
     colour = _colour(state[chosen])
-    parts = [view.point(middle[chosen]) / POSITION_M, colour, line[chosen, 7:8]]
+    middle = line[LIGHT_X : LIGHT_Y + 1, chosen].T
+    parts = [view.point(middle) / POSITION_M, colour, on_route[chosen, None].astype(jnp.float32)]
     return _masked("lights", jnp.concatenate(parts, axis=-1), there)
 
 

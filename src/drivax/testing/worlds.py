@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from drivax.geometry.angles import wrap
 from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank, as_words
 from drivax.scenario.record import record
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CAPACITIES
@@ -182,14 +182,15 @@ def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
 def shuffled(bank: ScenarioBank, seed: int = 0) -> ScenarioBank:
     """The same scenarios with the agents in other slots; ego stays in slot 0."""
     moving = order_of(bank.agents.shape[2], seed)
-    parked = np.random.default_rng(seed).permutation(bank.parked.shape[1])
+    behind = np.random.default_rng(seed).permutation(np.arange(len(moving), bank.parked.shape[1]))
+    everyone = np.concatenate([moving, behind])
     return replace(
         bank,
         agents=bank.agents[:, :, moving],
-        agent_box=bank.agent_box[:, moving],
         extension=bank.extension[:, moving],
-        parked=bank.parked[:, parked],
-        parked_valid=bank.parked_valid[:, :, parked],
+        agent_box=bank.agent_box[:, everyone],
+        parked=bank.parked[:, everyone],
+        parked_when=bank.parked_when[:, :, everyone],
     )
 
 
@@ -202,7 +203,7 @@ def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
         agent_box=jnp.concatenate([bank.agent_box, jnp.zeros((n, slots, 4))], axis=1),
         extension=jnp.pad(bank.extension, ((0, 0), (0, slots), (0, 0), (0, 0))),
         parked=jnp.concatenate([bank.parked, jnp.zeros((n, slots, 8))], axis=1),
-        parked_valid=jnp.concatenate([bank.parked_valid, jnp.zeros((n, steps, slots), bool)], axis=2),
+        parked_when=jnp.pad(bank.parked_when, ((0, 0), (0, 0), (0, slots))),
     )
 
 
@@ -210,7 +211,7 @@ def littered(bank: ScenarioBank) -> ScenarioBank:
     """The same scenarios; rows of agents that are not there hold garbage."""
     there = bank.agents[..., AGENT_VALID] > 0
     agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AGENT_VALID].set(there)
-    ever = bank.parked_valid.any(axis=1)[..., None]
+    ever = (bank.parked_when > 0).any(axis=1)[..., None]
     return replace(bank, agents=agents, parked=jnp.where(ever, bank.parked, GARBAGE))
 
 
@@ -218,7 +219,7 @@ def deserted(bank: ScenarioBank) -> ScenarioBank:
     """The same roads with nobody on them but ego."""
     others = jnp.arange(bank.agents.shape[2]) > 0
     agents = bank.agents.at[..., AGENT_VALID].multiply(~others)
-    return replace(bank, agents=agents, parked_valid=jnp.zeros_like(bank.parked_valid))
+    return replace(bank, agents=agents, parked_when=jnp.zeros_like(bank.parked_when))
 
 
 def forgotten(bank: ScenarioBank, step: int) -> ScenarioBank:
@@ -232,7 +233,7 @@ def forgotten(bank: ScenarioBank, step: int) -> ScenarioBank:
     return replace(
         bank,
         agents=jnp.where(later[None, :, None, None], moved, bank.agents),
-        parked_valid=jnp.where(later[None, :, None], ~bank.parked_valid, bank.parked_valid),
+        parked_when=bank.parked_when ^ as_words(np.asarray(later)[None, :, None]),
         light_state=jnp.where(later[None, :, None], (bank.light_state + 1) % 9, bank.light_state),
         log_progress=jnp.where(later[None], bank.log_progress + 99.0, bank.log_progress),
         log_ahead=jnp.full_like(bank.log_ahead, 99.0),
