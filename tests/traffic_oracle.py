@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.geometry.boxes import overlap
+from drivax.scenario.agent_paths import PATH_SPEED, PATH_X, PATH_Y, PATH_Z
 from drivax.simulator.reactive import DRIVES, IdmTraffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import alone
@@ -51,8 +52,8 @@ class Path:
         self.arc = np.arange(len(self.points)) * self.spacing
 
     def at(self, s):
-        columns = [np.interp(s, self.arc, self.points[:, k]) for k in range(6)]
-        return columns[0], columns[1], columns[2], columns[5]
+        columns = [np.interp(s, self.arc, self.points[:, k]) for k in range(self.points.shape[1])]
+        return columns[PATH_X], columns[PATH_Y], columns[PATH_Z], columns[PATH_SPEED]
 
     def project(self, xy, first, reach):
         """Arc, distance and direction of the nearest point between two arc lengths."""

@@ -25,7 +25,7 @@ Array = np.ndarray[Any, Any]
 
 
 def light_arcs(
-    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 6"],
+    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 8"],
     spacing: Float[np.ndarray, " V"],
 ) -> tuple[Float[np.ndarray, "V 4"], Int[np.ndarray, "V 4"]]:  # fmt: skip
     """Arc lengths of the stop lines that paths cross forwards, and the light of each.
@@ -33,7 +33,7 @@ def light_arcs(
     Args:
         bank: The scenarios.
         scenario: Row of the bank of each path.
-        points: Paths: x, y, z, cos, sin, speed at equally distant points.
+        points: Paths (``scenario.agent_paths.AgentPaths.points``).
         spacing: Arc length between two points, m.
 
     Returns:

@@ -24,7 +24,8 @@ from drivax.scenario.schema import AgentKind, Flag
 
 #: Points of a path, equally far apart along it.
 PATH_POINTS = 96
-PATH_X, PATH_Y, PATH_Z, PATH_COS, PATH_SIN, PATH_SPEED = range(6)
+#: The direction comes twice: a row of a path times its speed is a row of ``ScenarioBank.agents``.
+PATH_X, PATH_Y, PATH_Z, PATH_COS, PATH_SIN, _PATH_COS, _PATH_SIN, PATH_SPEED = range(8)
 #: How far a path goes on beyond the last logged pose, m (semantics, Traffic), and the stored points' distance.
 EXTENSION_M, _EXTENSION_STEP_M = 60.0, 4.0
 #: An agent reacts if it travels further than this in the rest of its log, m.
@@ -50,7 +51,7 @@ class AgentPaths:
     Attributes:
         slot: Agent slot of each path.
         row: Path of each slot, -1 for none.
-        points: x, y, z, cos, sin, and the highest speed that peak and curves allow (m/s), equally far apart.
+        points: x, y, z, cos, sin, cos, sin, and the highest speed that peak and curves allow (m/s), equally far apart.
         spacing: Arc length between two points, m.
         log_arc: Where the log is on the path at each step, m; never decreases, holds while the agent is unseen.
         appears: The first step at or after each one at which the log has the agent; T where there is none.
@@ -62,7 +63,7 @@ class AgentPaths:
 
     slot: Int[Array, "N R"]
     row: Int[Array, "N A"]
-    points: Float[Array, "N R M 6"]
+    points: Float[Array, "N R M 8"]
     spacing: Float[Array, "N R"]
     log_arc: Float[Array, "N T R"]
     appears: Int[Array, "N T R"]
@@ -263,12 +264,12 @@ def _peak(logs: _Logs) -> Float[np.ndarray, " V"]:
     return np.max(np.where(logs.valid, logs.speed, 0.0), axis=1, initial=0.0)
 
 
-def _sampled(lines: Polylines, peak: Numbers) -> tuple[Float[np.ndarray, "V M 6"], Float[np.ndarray, " V"]]:
+def _sampled(lines: Polylines, peak: Numbers) -> tuple[Float[np.ndarray, "V M 8"], Float[np.ndarray, " V"]]:
     """Paths at equally distant points, with the speed that they allow; and the distance between two points."""
     row, spacing = np.arange(lines.count)[:, None], lines.length / (PATH_POINTS - 1)
     arc = spacing[:, None] * np.arange(PATH_POINTS)
     if not lines.count:
-        return np.zeros((0, PATH_POINTS, 6)), spacing
+        return np.zeros((0, PATH_POINTS, 8)), spacing
     points = lines.at(row, arc)
     half = np.maximum(_CURVE_M, _CURVE_S * peak)[:, None]
     ahead = np.minimum(arc + half, lines.length[:, None])
@@ -279,8 +280,8 @@ def _sampled(lines: Polylines, peak: Numbers) -> tuple[Float[np.ndarray, "V M 6"
     for point in range(PATH_POINTS - 2, -1, -1):
         reach = np.sqrt(speed[:, point + 1] ** 2 + 2 * CURVE_BRAKING_MPS2 * spacing)
         speed[:, point] = np.minimum(speed[:, point], reach)
-    columns = [points[..., :3], np.cos(points[..., 3:]), np.sin(points[..., 3:]), speed[..., None]]
-    return np.concatenate(columns, axis=-1), spacing
+    direction = [np.cos(points[..., 3:]), np.sin(points[..., 3:])]
+    return np.concatenate([points[..., :3], *direction, *direction, speed[..., None]], axis=-1), spacing
 
 
 def _appears(valid: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:

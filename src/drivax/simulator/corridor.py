@@ -1,6 +1,6 @@
 """Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
 
-All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
+All R vehicles of a scenario at once. Of all S things, comparing boxes with two rectangles around the path ahead
 leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima
 (a sort costs several times as much), and only these are measured against the path.
 """
@@ -22,12 +22,12 @@ from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.simulator.types import Frame
 
-#: How many things are measured against a path.
+#: How many things C are measured against a path. A few fewer would do (docs/log), but eight fill a vector.
 CLOSEST = 8
 #: Free space that a corridor has beside the vehicle, m.
 SIDE_M = 0.1
 #: Pieces that stand for the path ahead, and rectangles around as many of them each.
-PIECES, RECTANGLES = 12, 3
+PIECES, RECTANGLES = 12, 2
 #: How far the path may run beside its pieces, m: rectangles are so much wider.
 _BULGE_M = 0.5
 #: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
@@ -74,22 +74,20 @@ class Leaders:
 
     gap: Float[Array, " R"]
     speed: Float[Array, " R"]
-    things: Int[Array, "R 8"]
-    real: Bool[Array, "R 8"]
+    things: Int[Array, "R C"]
+    real: Bool[Array, "R C"]
 
 
-def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]) -> Float[Array, "R 6"]:
-    """Pose (x, y, z, cos, sin) and highest speed at arc lengths of a scenario's paths."""
+def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]) -> Float[Array, "R 8"]:
+    """Rows at arc lengths of a scenario's paths, as those of ``AgentPaths.points``."""
     at = arc / paths.spacing[index]
     low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
     row = jnp.arange(arc.shape[0])
     part = jnp.clip(at - low, 0.0, 1.0)[:, None]
     here = paths.points[index, row, low] * (1 - part) + paths.points[index, row, low + 1] * part
-    unit = jax.lax.rsqrt(jnp.maximum(here[:, 3] ** 2 + here[:, 4] ** 2, 1e-9))
-    return jnp.stack(
-        [here[:, 0], here[:, 1], here[:, 2], here[:, 3] * unit, here[:, 4] * unit, here[:, PATH_SPEED]],
-        axis=-1,
-    )
+    unit = jax.lax.rsqrt(jnp.maximum(here[:, PATH_COS] ** 2 + here[:, PATH_SIN] ** 2, 1e-9))
+    column = jnp.arange(here.shape[1])
+    return here * jnp.where((column >= PATH_COS) & (column < PATH_SPEED), unit[:, None], 1.0)
 
 
 def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
@@ -114,8 +112,9 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     for number in range(PIECES):
         ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
         keys.append(_numbered(_from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
-    # Computed once: without the barrier XLA computes it anew for each of the columns that are read.
-    best = jax.lax.optimization_barrier(_number(reduce(jnp.minimum, keys), _PIECE_BITS))
+    best = _number(reduce(jnp.minimum, keys), _PIECE_BITS)
+    # Written out once: XLA would compute it anew for each of the columns that are read.
+    best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
     # Everything about a piece in one row, so that it is read once.
     last = jnp.broadcast_to(jnp.arange(PIECES) == PIECES - 1, (len(nodes), PIECES)).astype(nodes.dtype)
     columns = [part[:, at : at + PIECES] for part in (nodes, tangents, arcs[..., None]) for at in (0, 1)]
@@ -183,8 +182,8 @@ def _path_ahead(
 
 def _closest(
     movers: Movers, frame: Frame, nodes: Float[Array, "R 13 2"]
-) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
-    """The 8 closest things whose box reaches into one of the rectangles around the corridor."""
+) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
+    """The closest things whose box reaches into one of the rectangles around the corridor."""
     me = movers.box[:, None]
     behind = me[..., LENGTH] / 2 + BEHIND_M
     near = reaching(frame.box[None], nodes, me[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
@@ -197,8 +196,8 @@ def _closest(
 
 def closest(
     near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "S 6"]
-) -> tuple[Int[Array, "R 8"], Bool[Array, "R 8"]]:
-    """Of the boxes that are near the 8 whose centres are the closest; and whether there are as many."""
+) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
+    """Of the boxes that are near the C whose centres are the closest; and whether there are as many."""
     dx, dy = box[:, X] - me[:, X : X + 1], box[:, Y] - me[:, Y : Y + 1]
     key = jnp.where(near, _numbered(dx * dx + dy * dy, jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
     # Computed once: without the barrier XLA computes it anew for each of the minima.

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.scenario.agent_paths import PATH_POINTS, PATH_SPEED, TRAVELS_M, AgentPaths, with_paths
-from drivax.scenario.bank import AGENT_VX, AGENT_VY, ScenarioBank
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_VX, AGENT_VY, ScenarioBank
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind, LightState
@@ -88,7 +88,8 @@ class IdmTraffic:
         now = reacts & (entry <= step)
         logged = bank.agents[index, at, jnp.maximum(slot, 0)]
         arc = paths.log_arc[index, at, row]
-        speed = jnp.maximum(jnp.sum(logged[:, AGENT_VX : AGENT_VY + 1] * logged[:, 3:5], axis=-1), 0.0)
+        along = logged[:, AGENT_VX] * logged[:, AGENT_COS] + logged[:, AGENT_VY] * logged[:, AGENT_SIN]
+        speed = jnp.maximum(along, 0.0)
         phase = jnp.where(reacts, jnp.where(now, DRIVES, WAITS), REPLAYS)
         return Reactive(
             begin=step,
@@ -107,8 +108,9 @@ class IdmTraffic:
         logged = bank.agents[scene.index, jnp.clip(step, 0, bank.steps - 1)]
         at = PAST - 1 - min(back, PAST - 1)
         here, speed = path_rows(paths, scene.index, now.arc[at]), now.speed[at]
-        parts = [here[:, :5], speed[:, None] * here[:, 3:5], now.there[at][:, None]]
-        driven = jnp.concatenate(parts, axis=-1)
+        column = jnp.arange(here.shape[1])
+        driven = here * jnp.where((column == AGENT_VX) | (column == AGENT_VY), speed[:, None], 1.0)
+        driven = jnp.where(column == AGENT_VALID, now.there[at][:, None], driven)
         slot = paths.slot[scene.index].astype(jnp.int32)
         reacts = (now.phase != REPLAYS) & (step > now.begin)
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
