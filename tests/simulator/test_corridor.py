@@ -34,13 +34,14 @@ def thing(arc, left, size):
 def paths():
     arc = np.linspace(0.0, LENGTH, PATH_POINTS)
     x, y, heading = pose(arc)
-    points = np.stack([x, y, 0 * x, np.cos(heading), np.sin(heading), 0 * x + 15.0], -1)
+    way = [np.cos(heading), np.sin(heading)]
+    points = np.stack([x, y, 0 * x, *way, *way, 0 * x + 15.0], -1)
     return AgentPaths(
         slot=jnp.zeros((1, 1), jnp.int16),
-        row=jnp.zeros((1, 1), jnp.int16),
         points=jnp.asarray(points, jnp.float32)[None, None],
         spacing=jnp.full((1, 1), LENGTH / (PATH_POINTS - 1)),
         log_arc=jnp.zeros((1, 91, 1)),
+        log_speed=jnp.zeros((1, 91, 1)),
         appears=jnp.zeros((1, 91, 1), jnp.int16),
         stop_arc=jnp.full((1, 1, 4), 1e6),
         stop_light=jnp.zeros((1, 1, 4), jnp.int16),

@@ -62,7 +62,8 @@ class Run:
         self.box[..., :2] += origin
         self.x, self.y = self.box[..., 0], self.box[..., 1]
         self.speed = np.hypot(*np.moveaxis(np.asarray(frames.velocity)[:, slots], -1, 0))
-        self.row = np.pad(np.asarray(bank.paths.row[0]), (0, 8), constant_values=-1)[slots]
+        paths = list(np.asarray(bank.paths.slot[0]))
+        self.row = [paths.index(slot) if slot in paths else -1 for slot in slots]
         self.slots = slots
 
     def gap(self, behind, ahead, step=-1):
@@ -74,9 +75,9 @@ class Run:
 
 
 def slots_in(recording):
-    """The slot of each car of a recording: the nearest to ego come first, parked ones last."""
+    """The slot of each car of a recording: the nearest to ego come first, parked ones right behind."""
     scenario = assemble(recording, SMALL)
-    ids = [*scenario.agent_id, *scenario.parked_id]
+    ids = [*scenario.agent_id[scenario.agent_valid.any(axis=0)], *scenario.parked_id]
     return [ids.index(number) for number in recording.tracks.track_id]
 
 
@@ -295,7 +296,7 @@ def test_the_past_of_a_vehicle_is_what_it_drove():
 
 def test_paths_go_through_the_log_and_on_along_the_lane():
     bank = TRAFFIC.prepare(bank_of(straight_road([EGO, car(0, 0.8, 0, 10)])))
-    paths, row = bank.paths, int(np.asarray(bank.paths.row[0])[1])
+    paths, row = bank.paths, list(np.asarray(bank.paths.slot[0])).index(1)
     points, spacing = np.array(paths.points[0, row]), float(paths.spacing[0, row])
     points[:, :2] += [-100.0, 3.7]
     assert spacing * (PATH_POINTS - 1) == pytest.approx(90.0 + 60.0, abs=0.1)

@@ -97,7 +97,7 @@ def test_what_fills_up_the_stack_does_nothing(bank, braking):
 def test_reactive_traffic_sees_every_driven_agent(bank, braking):
     slots, _, ((states, _), _) = braking
     behind = int(np.argmin(np.asarray(bank.agents[0, 10, :4, 0])))
-    row = int(bank.paths.row[0, behind])
+    row = int(np.flatnonzero(np.asarray(bank.paths.slot[0]) == behind)[0])
     free = np.asarray(states.scene.traffic.speed)[:, :, -1, row]
     # All states of the stack hold the same traffic.
     np.testing.assert_array_equal(free[:, 0], free[:, 1])

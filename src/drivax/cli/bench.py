@@ -68,7 +68,8 @@ def run(args: Bench, overrides: Sequence[str] = ()) -> int:
 
 def _parts(result: dict[str, Any]) -> str:
     lines = [
-        f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']} on {result['devices']} device(s), "
+        f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']}, "
+        f"{result['devices']} device(s), "
         f"{result['scenarios']:,} scenarios, {result['traffic']} traffic, with resets, observation, reward, metrics)",
         f"state {result['state_bytes']:,} B, scenario {result['bank_bytes_per_scenario']:,} B, "
         f"compiled in {result['compile_seconds']} s",

@@ -9,8 +9,17 @@ from jaxtyping import Float, Int
 
 from drivax.geometry.angles import wrap
 from drivax.scenario.bank import (
-    LIGHT_COS, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_HALF, LIGHT_SIN, LIGHT_X, LIGHT_Y, LIGHT_Z, NEVER_M, ScenarioBank,
-)  # fmt: skip
+    LIGHT_COS,
+    LIGHT_EXIT_COS,
+    LIGHT_EXIT_SIN,
+    LIGHT_HALF,
+    LIGHT_SIN,
+    LIGHT_X,
+    LIGHT_Y,
+    LIGHT_Z,
+    NEVER_M,
+    ScenarioBank,
+)
 from drivax.scenario.queries import LEVEL_M
 
 #: Stop lines of a path that are kept, the first ones.

@@ -17,7 +17,16 @@ from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
 from drivax.scenario.agent_lights import light_arcs
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_VX, AGENT_VY, AGENT_Z, WORD, ScenarioBank
+from drivax.scenario.bank import (
+    AGENT_COS,
+    AGENT_SIN,
+    AGENT_VALID,
+    AGENT_VX,
+    AGENT_VY,
+    AGENT_Z,
+    WORD,
+    ScenarioBank,
+)
 from drivax.scenario.queries import LANE_CUTOFF_M, LEVEL_M
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
@@ -50,10 +59,10 @@ class AgentPaths:
 
     Attributes:
         slot: Agent slot of each path.
-        row: Path of each slot, -1 for none.
         points: x, y, z, cos, sin, cos, sin, and the highest speed that peak and curves allow (m/s), equally far apart.
         spacing: Arc length between two points, m.
         log_arc: Where the log is on the path at each step, m; never decreases, holds while the agent is unseen.
+        log_speed: Speed of the log at each step, not negative, m/s.
         appears: The first step at or after each one at which the log has the agent; T where there is none.
         stop_arc: Arc lengths of the stop lines that the path crosses, m; very large for none.
         stop_light: Slot of the light of each of them.
@@ -62,10 +71,10 @@ class AgentPaths:
     """
 
     slot: Int[Array, "N R"]
-    row: Int[Array, "N A"]
     points: Float[Array, "N R M 8"]
     spacing: Float[Array, "N R"]
     log_arc: Float[Array, "N T R"]
+    log_speed: Float[Array, "N T R"]
     appears: Int[Array, "N T R"]
     stop_arc: Float[Array, "N R 4"]
     stop_light: Int[Array, "N R 4"]
@@ -125,17 +134,15 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
         return jnp.asarray(result)
 
     points, spacing = _sampled(courses.lines, _peak(logs))
-    of_slot = np.full((len(bank), bank.agents.shape[2]), -1, np.int16)
-    of_slot[logs.scenario, logs.slot] = row
     stop_arc, stop_light = light_arcs(bank, logs.scenario, points, spacing)
     return replace(
         bank,
         paths=AgentPaths(
             slot=placed(logs.slot, -1, np.int16),
-            row=jnp.asarray(of_slot),
             points=placed(points, 0.0, np.float32),
             spacing=placed(spacing, 1.0, np.float32),
             log_arc=jnp.swapaxes(placed(courses.log_arc, 0.0, np.float32), 1, 2),
+            log_speed=jnp.swapaxes(placed(np.maximum(logs.speed, 0.0), 0.0, np.float32), 1, 2),
             appears=jnp.swapaxes(placed(_appears(logs.valid), bank.steps, np.int16), 1, 2),
             stop_arc=placed(stop_arc, 1e6, np.float32),
             stop_light=placed(stop_light, 0, np.int16),
@@ -147,7 +154,10 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
 
 def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
     """Logs of the agents that may react: of these kinds, moving more than 2 m, never backwards."""
-    agents, kind = np.asarray(bank.agents, np.float64), np.asarray(bank.agent_box[:, : bank.agents.shape[2], 3])
+    agents, kind = (
+        np.asarray(bank.agents, np.float64),
+        np.asarray(bank.agent_box[:, : bank.agents.shape[2], 3]),
+    )
     valid = agents[..., AGENT_VALID] > 0
     there = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1))
     scenario, slot = there[:, 0], there[:, 1]

@@ -27,8 +27,8 @@ CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE):
 
 AGENT_X, AGENT_Y, AGENT_Z, AGENT_COS, AGENT_SIN, AGENT_VX, AGENT_VY, AGENT_VALID = range(8)
 ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range(7)
-#: A stop line: middle, direction and heading of its lane, half length, height, direction of the lane's end, whether that
-#: end is more than 45 deg to the right, arc length along route 0 where a lane of that leads over it (else very large).
+#: A stop line: middle, direction of its lane there, half length, height, direction of the lane's end, whether that end
+#: is more than 45 deg to the right, arc length along route 0 where a lane of that leads over it (else very large).
 (
     LIGHT_X, LIGHT_Y, LIGHT_COS, LIGHT_SIN, LIGHT_HALF, LIGHT_Z, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, LIGHT_ARC,
 ) = range(10)  # fmt: skip
@@ -43,8 +43,8 @@ ROAD_LANE, ROAD_EDGE, ROAD_AREA, ROAD_NONE = range(4)
 class ScenarioBank:
     """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, S slots of a frame, G grid cells a side.
 
-    In a frame the parked agents of a scenario come right behind its own moving ones, so that the slots of a frame are as
-    many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
+    In a frame the parked agents of a scenario come right behind its own moving ones, so that the slots of a frame are
+    as many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
 
     Attributes:
         agents: x, y, z, cos, sin, vx, vy, valid of moving agents; slot 0 is ego.
@@ -233,7 +233,7 @@ def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
     return (bits << np.arange(WORD, dtype=np.uint32)[:, None]).sum(axis=2, dtype=np.uint32)
 
 
-def _ends(mask: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _ends(mask: Any) -> np.ndarray[Any, Any]:
     """One more than the last column that each row of ``mask [N, columns]`` uses."""
     return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
@@ -272,7 +272,10 @@ def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
 def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
     z, heading, exits = (_column(scenarios, f"light_{name}") for name in ("z", "heading", "exit_heading"))
-    middle, half = (line[..., :2] + line[..., 2:]) / 2, np.hypot(*np.moveaxis(line[..., 2:] - line[..., :2], -1, 0)) / 2
+    middle, half = (
+        (line[..., :2] + line[..., 2:]) / 2,
+        np.hypot(*np.moveaxis(line[..., 2:] - line[..., :2], -1, 0)) / 2,
+    )
     x, y = np.moveaxis(middle, -1, 0)
     right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
     arc = np.stack([_stop_arcs(scenario, at) for scenario, at in zip(scenarios, middle, strict=True)])
@@ -341,7 +344,8 @@ def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarr
     rows = _column(scenarios, "road_rows").astype(np.int32)
     used = max(1, int(rows.max())) if trim else scenarios[0].capacity.road_rows
     xy, direction, length, kind, limit = (
-        _column(scenarios, f"road_{name}")[:, :used] for name in ("xy", "direction", "length", "kind", "limit")
+        _column(scenarios, f"road_{name}")[:, :used]
+        for name in ("xy", "direction", "length", "kind", "limit")
     )
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
     there = np.arange(used) < rows[:, None]

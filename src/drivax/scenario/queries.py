@@ -15,8 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import first_smallest, root
 from drivax.scenario.bank import (
-    LIGHT_COS, LIGHT_HALF, LIGHT_SIN, LIGHT_X, LIGHT_Y, LIGHT_Z, ROUTE_LIMIT, ScenarioBank,
-)  # fmt: skip
+    LIGHT_COS,
+    LIGHT_HALF,
+    LIGHT_SIN,
+    LIGHT_X,
+    LIGHT_Y,
+    LIGHT_Z,
+    ROUTE_LIMIT,
+    ScenarioBank,
+)
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
 

@@ -1,6 +1,6 @@
 """Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
 
-All R vehicles of a scenario at once. Of all S things, comparing boxes with two rectangles around the path ahead
+All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
 leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima
 (a sort costs several times as much), and only these are measured against the path.
 """
@@ -27,7 +27,7 @@ CLOSEST = 8
 #: Free space that a corridor has beside the vehicle, m.
 SIDE_M = 0.1
 #: Pieces that stand for the path ahead, and rectangles around as many of them each.
-PIECES, RECTANGLES = 12, 2
+PIECES, RECTANGLES = 12, 3
 #: How far the path may run beside its pieces, m: rectangles are so much wider.
 _BULGE_M = 0.5
 #: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
@@ -82,9 +82,13 @@ def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"])
     """Rows at arc lengths of a scenario's paths, as those of ``AgentPaths.points``."""
     at = arc / paths.spacing[index]
     low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
-    row = jnp.arange(arc.shape[0])
     part = jnp.clip(at - low, 0.0, 1.0)[:, None]
-    here = paths.points[index, row, low] * (1 - part) + paths.points[index, row, low + 1] * part
+
+    def both(row: Array, low: Array) -> Float[Array, "2 8"]:
+        return jax.lax.dynamic_slice(paths.points, (index, row, low, 0), (1, 1, 2, 8))[0, 0]
+
+    ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
+    here = ends[:, 0] * (1 - part) + ends[:, 1] * part
     unit = jax.lax.rsqrt(jnp.maximum(here[:, PATH_COS] ** 2 + here[:, PATH_SIN] ** 2, 1e-9))
     column = jnp.arange(here.shape[1])
     return here * jnp.where((column >= PATH_COS) & (column < PATH_SPEED), unit[:, None], 1.0)
@@ -176,7 +180,7 @@ def _path_ahead(
     stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
     first = (movers.arc / spacing).astype(jnp.int32)
     place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
-    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place]
+    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place, : PATH_SIN + 1]
     return rows[..., :2], rows[..., PATH_COS : PATH_SIN + 1], place * spacing[:, None]
 
 
@@ -238,26 +242,25 @@ def reaching(
         beyond: How much further on the last one reaches, m.
         rectangles: How many; K - 1 is a multiple of it.
     """
-    origin, direction, near, far, low, high = _rectangles(nodes, half, behind, beyond, rectangles)
+    around = _rectangles(nodes, half, behind, beyond, rectangles)
     deep, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
     found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
     for number in range(rectangles):
-        one = slice(number, number + 1)
-        (x, y), (cos, sin) = (part[:, :, one] for part in (origin, direction))
+        x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
         dx, dy = box[..., X] - x, box[..., Y] - y
-        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
         turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
         turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
-        reach_ahead, reach_left = turn_cos * deep + turn_sin * wide, turn_sin * deep + turn_cos * wide
-        inside = (ahead > near[:, one] - reach_ahead) & (ahead < far[:, one] + reach_ahead)
-        found |= inside & (left > low[:, one] - reach_left) & (left < high[:, one] + reach_left)
+        ahead, left = jnp.abs(dx * cos + dy * sin), jnp.abs(dy * cos - dx * sin)
+        found |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
+            left < width + turn_sin * deep + turn_cos * wide
+        )
     return found
 
 
 def _rectangles(
     nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any, count: int
-) -> tuple[Float[Array, "2 R Q"], Float[Array, "2 R Q"], Any, Any, Any, Any]:
-    """Origins and directions of the rectangles, and how far each goes back, on, to the right and to the left, m."""
+) -> tuple[Float[Array, "R Q"], ...]:
+    """Rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
     long = (nodes.shape[1] - 1) // count
     x, y = (
         jnp.stack([nodes[:, q * long : (q + 1) * long + 1, axis] for q in range(count)], axis=1)
@@ -273,6 +276,8 @@ def _rectangles(
     number = jnp.arange(count)
     near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind, 0.0)
     far = ahead.max(axis=-1) + half + jnp.where(number == count - 1, beyond, 0.0)
-    found = (jnp.stack([x[..., 0], y[..., 0]]), jnp.stack([cos, sin]), near, far)
+    right, left = left.min(axis=-1) - half, left.max(axis=-1) + half
+    on, aside = (near + far) / 2, (right + left) / 2
+    centre_x, centre_y = x[..., 0] + on * cos - aside * sin, y[..., 0] + on * sin + aside * cos
     # Once, not for every box.
-    return jax.lax.optimization_barrier((*found, left.min(axis=-1) - half, left.max(axis=-1) + half))
+    return jax.lax.optimization_barrier((centre_x, centre_y, cos, sin, (far - near) / 2, (left - right) / 2))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.scenario.agent_paths import PATH_POINTS, PATH_SPEED, TRAVELS_M, AgentPaths, with_paths
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_VX, AGENT_VY, ScenarioBank
+from drivax.scenario.bank import AGENT_VALID, AGENT_VX, AGENT_VY, ScenarioBank
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind, LightState
@@ -86,10 +86,8 @@ class IdmTraffic:
         travels = paths.log_arc[index, -1] - paths.log_arc[index, step] > TRAVELS_M
         reacts = (slot >= 0) & travels & (entry < bank.steps) & (self._class(bank, index, slot) >= 0)
         now = reacts & (entry <= step)
-        logged = bank.agents[index, at, jnp.maximum(slot, 0)]
         arc = paths.log_arc[index, at, row]
-        along = logged[:, AGENT_VX] * logged[:, AGENT_COS] + logged[:, AGENT_VY] * logged[:, AGENT_SIN]
-        speed = jnp.maximum(along, 0.0)
+        speed = paths.log_speed[index, at, row]
         phase = jnp.where(reacts, jnp.where(now, DRIVES, WAITS), REPLAYS)
         return Reactive(
             begin=step,
@@ -252,7 +250,9 @@ def _may_enter(scene: Scene, movers: Movers, ahead: Leaders, frame: Frame) -> Bo
     reach = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
     dx, dy = (movers.box[:, None, i] - movers.box[None, :, i] for i in (0, 1))
     near = dx * dx + dy * dy < (reach[:, None] + reach + 2 * _ENTRY_END_M) ** 2
-    first = ready[None] & (order[None] < order[:, None]) & (late[None] | late[:, None])
+    # Those that are not ready come after everyone.
+    order = jnp.where(ready, order, jnp.iinfo(jnp.int32).max)
+    first = (order[None] < order[:, None]) & (late[None] | late[:, None])
     return ready & ~(near & first).any(axis=1)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -61,23 +61,6 @@ class BenchConfig:
     traffic: str = "log"
 
 
-@dataclass(frozen=True)
-class Speed:
-    """What a timing found.
-
-    Attributes:
-        steps_per_second: Environment steps that count; those that only begin an episode do not.
-        compile_seconds: From the traced function to the program.
-        state_bytes: State of one environment.
-        temporary_bytes: What the program needs beside bank and states, per environment.
-    """
-
-    steps_per_second: float
-    compile_seconds: float
-    state_bytes: int
-    temporary_bytes: int
-
-
 def use_all_cores() -> None:
     """Makes every core that this process may use a device of its own; without effect once JAX has started."""
     with suppress(RuntimeError):
@@ -97,14 +80,14 @@ def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, An
     """
     config = config or BenchConfig()
     simulator, bank = _simulator(bank, config)
-    whole = speed(bank, config)
+    whole = compiled(bank, config)
     states = _states(simulator, bank, config.batch)
     parts = _parts(simulator)
     seconds = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
     whole_bank = without_grid(bank)
     brute = sum(_time_part(config, parts[name], whole_bank, states) for name in ("edges", "lanes"))
     return {
-        "environment_steps_per_second": round(whole.steps_per_second),
+        "environment_steps_per_second": round(steps_per_second([whole], config.repeats)[0]),
         "batch": config.batch,
         "devices": jax.device_count(),
         "scenarios": len(bank),
@@ -128,15 +111,20 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
     """
     config = config or BenchConfig()
 
-    def timed(metrics: Wanted, batch: int) -> float:
+    def program(metrics: Wanted, batch: int) -> Program:
         task = replace(config.task, metrics=metrics)
-        return speed(bank, replace(config, batch=batch, task=task)).steps_per_second
+        return compiled(bank, replace(config, batch=batch, task=task))
 
+    bank = spread(bank)
+    kinds = [(metrics, batch) for metrics in METRIC_SETS for batch in (*BATCHES, *LARGER)]
+    speeds = dict(
+        zip(kinds, steps_per_second([program(*kind) for kind in kinds], config.repeats), strict=True)
+    )
     rows = []
     for metrics in METRIC_SETS:
-        found = [(batch, timed(metrics, batch)) for batch in BATCHES]
-        best = max(((batch, timed(metrics, batch)) for batch in LARGER), key=lambda one: one[1])
-        for batch, value in (*found, best):
+        best = max(LARGER, key=lambda batch: speeds[metrics, batch])
+        for batch in (*BATCHES, best):
+            value = speeds[metrics, batch]
             rows.append(
                 {"metrics": metrics, "batch": batch, "best": batch not in BATCHES, "steps_per_second": value}
             )
@@ -152,23 +140,55 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
     return {"scenarios": len(bank), "rows": rows, "versions": versions()}
 
 
-def speed(bank: ScenarioBank, config: BenchConfig) -> Speed:
-    """Times one program that steps, resets, observes, rewards and judges a batch."""
+@dataclass(frozen=True)
+class Program:
+    """A compiled program that steps a batch.
+
+    Attributes:
+        run: Steps it; what it returns must be waited for.
+        steps: Environment steps of a run that count; those that only begin an episode do not.
+        compile_seconds: From the traced function to the program.
+        state_bytes: State of one environment.
+        temporary_bytes: What the program needs beside bank and states, per environment.
+    """
+
+    run: Callable[[], Any]
+    steps: int
+    compile_seconds: float
+    state_bytes: int
+    temporary_bytes: int
+
+
+def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
+    """One program that steps, resets, observes, rewards and judges a batch, driven by IDM."""
     simulator, bank = _simulator(bank, config)
     states = _states(simulator, bank, config.batch)
-    began = time.perf_counter()
     keys = jax.random.split(jax.random.key(2), jax.device_count())
+    began = time.perf_counter()
     program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, states, keys).compile()
-    compiled = time.perf_counter() - began
-    alive = int(program(bank, states, keys)[1].sum())
-    seconds = _median(lambda: program(bank, states, keys), config.repeats)
+    seconds = time.perf_counter() - began
     memory = program.memory_analysis()
-    return Speed(
-        steps_per_second=alive / seconds,
-        compile_seconds=compiled,
+    return Program(
+        run=lambda: program(bank, states, keys),
+        steps=int(program(bank, states, keys)[1].sum()),
+        compile_seconds=seconds,
         state_bytes=sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
-        temporary_bytes=0 if memory is None else memory.temp_size_in_bytes * jax.device_count() // config.batch,
+        temporary_bytes=0
+        if memory is None
+        else memory.temp_size_in_bytes * jax.device_count() // config.batch,
     )
+
+
+def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
+    """Environment steps per second of each program, medians of timings by turns."""
+    times: list[list[float]] = [[] for _ in programs]
+    for turn in range(repeats + 1):
+        for program, seen in zip(programs, times, strict=True):
+            began = time.perf_counter()
+            jax.block_until_ready(program.run())
+            if turn:
+                seen.append(time.perf_counter() - began)
+    return [program.steps / statistics.median(seen) for program, seen in zip(programs, times, strict=True)]
 
 
 def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
@@ -179,8 +199,12 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
             cure="give a multiple",
         )
     traffic = make_traffic(config.traffic)
-    bank = jax.device_put(prepared(traffic, bank), NamedSharding(_mesh(), PartitionSpec()))
-    return Simulator(config.task, traffic), bank
+    return Simulator(config.task, traffic), spread(prepared(traffic, bank))
+
+
+def spread(bank: ScenarioBank) -> ScenarioBank:
+    """The bank on every device; without cost where it is there already."""
+    return jax.device_put(bank, NamedSharding(_mesh(), PartitionSpec()))
 
 
 def _states(simulator: Simulator, bank: ScenarioBank, batch: int) -> SimState:

@@ -16,9 +16,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import rotate
 from drivax.scenario.bank import (
-    LIGHT_ARC, LIGHT_COS, LIGHT_SIN, LIGHT_X, LIGHT_Y, NEVER_M, ROAD_AREA, ROAD_EDGE, ROAD_LANE, ROAD_NONE,
-    ROUTE_LIMIT, ScenarioBank,
-)  # fmt: skip
+    LIGHT_ARC,
+    LIGHT_COS,
+    LIGHT_SIN,
+    LIGHT_X,
+    LIGHT_Y,
+    NEVER_M,
+    ROAD_AREA,
+    ROAD_EDGE,
+    ROAD_LANE,
+    ROAD_NONE,
+    ROUTE_LIMIT,
+    ScenarioBank,
+)
 from drivax.scenario.queries import route_ahead
 from drivax.scenario.record import record
 from drivax.scenario.schema import Flag, LightState
@@ -214,7 +224,12 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
     parts = [view.point(rows[:, :2]) / POSITION_M, view.vector(rows[:, 2:4])]
     types = (rows[:, 5:6] == jnp.asarray([ROAD_LANE, ROAD_EDGE, ROAD_AREA])).astype(jnp.float32)
     limit = rows[:, 6:7]
-    parts += [rows[:, 4:5] / PIECE_M, types, jnp.maximum(limit, 0.0) / SPEED_MPS, (limit > 0).astype(jnp.float32)]
+    parts += [
+        rows[:, 4:5] / PIECE_M,
+        types,
+        jnp.maximum(limit, 0.0) / SPEED_MPS,
+        (limit > 0).astype(jnp.float32),
+    ]
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
