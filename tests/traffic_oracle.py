@@ -56,14 +56,23 @@ class Path:
         return columns[PATH_X], columns[PATH_Y], columns[PATH_Z], columns[PATH_SPEED]
 
     def project(self, xy, first, reach):
-        """Arc, distance and direction of the nearest point between two arc lengths."""
+        """Arc, distance and direction of the nearest point between two arc lengths, and that of the 4 m around it."""
         keep = (self.arc[1:] > first - self.spacing) & (self.arc[:-1] < reach)
         a, b = self.points[:-1, :2][keep], self.points[1:, :2][keep]
         u = b - a
         share = np.clip(((xy - a) * u).sum(1) / np.maximum((u * u).sum(1), 1e-12), 0, 1)
         away = np.hypot(*(xy - a - share[:, None] * u).T)
         k = int(away.argmin())
-        return self.arc[:-1][keep][k] + share[k] * self.spacing, away[k], u[k] / max(np.hypot(*u[k]), 1e-9)
+        arc = self.arc[:-1][keep][k] + share[k] * self.spacing
+        (x0, x1), (y0, y1) = (np.interp([arc - 2.0, arc + 2.0], self.arc, self.points[:, i]) for i in (0, 1))
+        around = np.array([x1 - x0, y1 - y0])
+        return arc, away[k], *(way / max(np.hypot(*way), 1e-9) for way in (u[k], around))
+
+
+def extents(box, way):
+    """Half of what a box measures along and across a direction."""
+    turn_cos, turn_sin = abs(box[2:4] @ way), abs(box[3] * way[0] - box[2] * way[1])
+    return turn_cos * box[4] / 2 + turn_sin * box[5] / 2, turn_sin * box[4] / 2 + turn_cos * box[5] / 2
 
 
 def law(speed, desired, gap, leader):
@@ -78,17 +87,17 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
     x, y, z, most = path.at(arc)
     length, width = np.asarray(bank.agent_box[index, slot, :2], np.float64)
     look = min(20 + 1.5 * speed + speed * speed / 6, 120)
-    gap, leader, close = 1e4, 0.0, np.inf
+    gap, leader, close, first, nearest = 1e4, 0.0, np.inf, -1, (np.inf, -1)
     box = np.asarray(frame.box, np.float64)
     for other in range(len(box)):
         there = frame.valid[other] and other != slot and other not in ignored
         if not there or abs(frame.z[other] - z) > 3 or np.hypot(*(box[other, :2] - [x, y])) > look + 12:
             continue
-        s, away, way = path.project(box[other, :2], arc, arc + look)
-        turn_cos, turn_sin = abs(box[other, 2:4] @ way), abs(box[other, 3] * way[0] - box[other, 2] * way[1])
-        half_length = turn_cos * box[other, 4] / 2 + turn_sin * box[other, 5] / 2
-        half_width = turn_sin * box[other, 4] / 2 + turn_cos * box[other, 5] / 2
-        border = abs(away - (width / 2 + 0.1 + half_width))
+        s, away, way, around = path.project(box[other, :2], arc, arc + look)
+        (half_length, half_width), (long, wide) = extents(box[other], way), extents(box[other], around)
+        # A logged path jitters, and with it what a long thing measures along and across it.
+        beyond = [away - (width / 2 + 0.1 + half) for half in (half_width, wide)]
+        border = min(abs(beyond[0]), abs(beyond[1])) if beyond[0] * beyond[1] > 0 else 0.0
         ahead = s - arc
         if ahead > -1 and ahead < look + 1:
             close = min(
@@ -96,8 +105,10 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
             )
         if away < width / 2 + 0.1 + half_width and 0 < ahead < look:
             here = ahead - half_length - length / 2
+            nearest = min(nearest, (ahead - long - length / 2, other))
             if here < gap:
-                gap, leader = here, float(np.asarray(frame.velocity[other], np.float64) @ way)
+                gap, leader, first = here, float(np.asarray(frame.velocity[other], np.float64) @ way), other
+    close = close if first == nearest[1] else 0.0
     result = law(speed, most, gap, leader)
     state = np.asarray(bank.light_state[index, min(step, 90)])
     for line, light in zip(bank.paths.stop_arc[index, row], bank.paths.stop_light[index, row], strict=True):

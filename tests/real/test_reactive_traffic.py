@@ -45,18 +45,19 @@ def test_vehicles_do_what_the_law_says(bank, runs):
 
 def test_paths_follow_the_logs_and_vehicles_their_paths(bank, runs):
     agents = np.asarray(bank.agents, np.float64)
-    away, left = [], []
+    away, left, moves = [], [], []
     for index, (frames, traffic) in enumerate(runs):
         for row in np.flatnonzero((traffic.phase == DRIVES).any(0)):
             slot, path = int(bank.paths.slot[index, row]), Line(bank.paths, index, row)
             seen = agents[index, :, slot, AGENT_VALID] > 0
             x, y, _, _ = path.at(np.asarray(bank.paths.log_arc[index, seen, row]))
             away += np.hypot(x - agents[index, seen, slot, 0], y - agents[index, seen, slot, 1]).tolist()
+            moves += (np.hypot(*agents[index, seen, slot, 5:7].T) > 1.0).tolist()
             there = np.flatnonzero(frames.valid[1:, slot])[::10] + 1
             if slot > 0:
                 left += [path.project(frames.box[t, slot, :2].astype(float), 0, np.inf)[1] for t in there]
-    # A standing car's boxes jitter by up to a metre; 99 % of all logged positions are within 0.3 m.
-    assert np.quantile(away, 0.99) < 0.3 and max(away) < 1.1
+    # A standing car's boxes jitter by up to a metre, which shapes no path.
+    assert np.quantile(np.array(away)[moves], 0.99) < 0.1 and max(away) < 1.1
     assert max(left) < 0.02
 
 

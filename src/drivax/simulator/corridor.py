@@ -85,7 +85,7 @@ def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"])
     part = jnp.clip(at - low, 0.0, 1.0)[:, None]
 
     def both(row: Array, low: Array) -> Float[Array, "2 8"]:
-        return jax.lax.dynamic_slice(paths.points, (index, row, low, 0), (1, 1, 2, 8))[0, 0]
+        return jax.lax.dynamic_slice(paths.points, (index, row, low, jnp.int32(0)), (1, 1, 2, 8))[0, 0]
 
     ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
     here = ends[:, 0] * (1 - part) + ends[:, 1] * part
@@ -221,7 +221,9 @@ def _numbered(square: Float[Array, "..."], number: Any, bits: int) -> Float[Arra
     as zero.
     """
     key = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(1.0 + square).astype(jnp.float32), jnp.int32)
-    return jax.lax.bitcast_convert_type((key & ~((1 << bits) - 1)) | number, jnp.float32)
+    return jax.lax.bitcast_convert_type(
+        (key & ~((1 << bits) - 1)) | jnp.asarray(number, jnp.int32), jnp.float32
+    )
 
 
 def _number(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
