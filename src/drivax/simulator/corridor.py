@@ -22,7 +22,7 @@ from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.simulator.types import Frame
 
-#: How many things C are measured against a path. A few fewer would do (docs/log), but eight fill a vector.
+#: How many things C are measured against a path. Six would do (docs/log), but eight fill a vector.
 CLOSEST = 8
 #: Free space that a corridor has beside the vehicle, m.
 SIDE_M = 0.1
