@@ -85,10 +85,10 @@ def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldC
 def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
     """Wall time of the command for a set that is thrown away, from its start to its end, at the default rare rate."""
     with tempfile.TemporaryDirectory() as folder:
-        command = ["generate", str(Path(folder) / "set"), "--domain", domain, "--seed", "3"]
-        command += ["--scenarios", str(scenarios), "--workers", str(workers)]
+        call = ["generate", str(Path(folder) / "set"), "--domain", domain, "--seed", "3"]
+        call += ["--scenarios", str(scenarios), "--workers", str(workers)]
         begin = time.monotonic()
-        subprocess.run([sys.executable, "-m", "drivax", *command], check=True, capture_output=True)
+        subprocess.run([sys.executable, "-m", "drivax", *call], check=True, capture_output=True)
         seconds = time.monotonic() - begin
     return {"scenarios": scenarios, "workers": workers, "scenarios_per_second": scenarios / seconds}
 

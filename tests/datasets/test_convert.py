@@ -219,18 +219,18 @@ def test_an_interrupt_that_reaches_workers_first_is_one(wire, write_records, tmp
     (tmp_path / "src" / "1.tfrecord").write_bytes(shard)
     call = ["-m", "drivax", "convert", str(tmp_path / "src"), str(tmp_path / "set"), "--workers", "2"]
     process = subprocess.Popen([sys.executable, *call], stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 30
-    while not list(tmp_path.glob(".set.*")) and time.monotonic() < deadline:
+    workers, deadline = [], time.monotonic() + 30
+    while len(workers) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)
-    time.sleep(1.5)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    workers = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        workers = [c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+    time.sleep(0.5)
     for worker in workers:
         os.kill(int(worker), signal.SIGKILL)
     time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
-    assert workers and (process.returncode, errors.splitlines()[-1]) == (130, "drivax: interrupted")
+    assert len(workers) == 2 and (process.returncode, errors.splitlines()[-1]) == (130, "drivax: interrupted")
     assert leftovers(tmp_path) == ["src"]
 
 
