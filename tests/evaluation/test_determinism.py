@@ -90,7 +90,9 @@ def test_automatic_resets_change_no_episode(world):
     def or_begin(bank, states, over, following):
         def one(state, over, row):
             taken = action(state.scene)
-            after, transition = simulator.step_or_begin(bank, state, taken, over, row, LATE)
+            after, transition = simulator.step_or_begin(
+                bank, state, taken, over, simulator.scene(bank, row, LATE)
+            )
             return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
 
         return jax.vmap(one)(states, over, following)

@@ -88,8 +88,9 @@ def advance_all(
     begins: Bool[Any, " B"], rows: Any,
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
     """The same for a batch; where an episode ``begins``, scenario ``rows`` starts instead and earns nothing."""
+    fresh = jax.vmap(simulator.scene, in_axes=(None, 0))(bank, jnp.asarray(rows))
     step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
-    states, transition = step(bank, states, jnp.asarray(actions), jnp.asarray(begins), jnp.asarray(rows))
+    states, transition = step(bank, states, jnp.asarray(actions), jnp.asarray(begins), fresh)
     reward = jnp.where(begins, 0.0, transition.reward)
     seen = jax.vmap(partial(limited, simulator, bank))(states)
     return states, seen, (reward, transition.terminated, transition.truncated)

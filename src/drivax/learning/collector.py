@@ -15,7 +15,7 @@ from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import SimState
+from drivax.simulator.types import Frame, SimState
 
 
 @record
@@ -80,11 +80,13 @@ def collect(
         ``"<name>"`` the sum and ``"<name>/n"`` the number of episodes that define it.
     """
     count = environments.over.shape[0]
-    step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0, None, 0))
+    begin_all = jax.vmap(simulator.scene, in_axes=(None, 0, 0, None, 0))
+    step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
     observe_all = jax.vmap(simulator.observe, in_axes=(None, 0))
+    everyone = jax.vmap(simulator.now, in_axes=(None, 0))
 
-    def one(carry: tuple[Environments, Array], _: None) -> tuple[Any, Any]:
-        now, key = carry
+    def one(carry: tuple[Environments, Frame, Array], _: None) -> tuple[Any, Any]:
+        now, seen, key = carry
         key, act_key, index_key, start_key = jax.random.split(key, 4)
         choice, action, extra = actor(now.observation, act_key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
@@ -92,7 +94,8 @@ def collect(
         keys = jax.random.split(
             jax.random.fold_in(start_key, 1), count
         )  # not computed where starts are logged
-        state, transition = step_all(bank, now.state, action, now.over, index, start, 0, keys)
+        fresh = begin_all(bank, index, start, 0, keys)
+        state, transition = step_all(bank, now.state, action, now.over, fresh, seen)
         row = Rollout(
             observation=now.observation,
             choice=choice,
@@ -105,9 +108,10 @@ def collect(
         done = transition.terminated | transition.truncated
         tally = _tally(bank, state, transition.reward_terms, done, now.over)
         following = Environments(state, done, dict(observe_all(bank, state.scene)))
-        return (following, key), (row, tally)
+        return (following, everyone(bank, state.scene), key), (row, tally)
 
-    (environments, _), (rollout, tally) = jax.lax.scan(one, (environments, key), None, steps)
+    first = (environments, everyone(bank, environments.state.scene), key)
+    (environments, _, _), (rollout, tally) = jax.lax.scan(one, first, None, steps)
     return environments, rollout, jax.tree.map(lambda leaf: leaf.sum(axis=0), tally)
 
 

@@ -173,7 +173,7 @@ def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
 
 def _path_ahead(
     paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
-) -> tuple[Float[Array, "R 13 2"], Float[Array, "R 13 2"], Float[Array, "R 13"]]:
+) -> tuple[Float[Array, "R K 2"], Float[Array, "R K 2"], Float[Array, "R K"]]:
     """Points of the path from the one behind the vehicle to as far as it looks, directions and arc lengths."""
     spacing = paths.spacing[index]
     # One point more than it takes, since the first one lies behind.
@@ -185,7 +185,7 @@ def _path_ahead(
 
 
 def _closest(
-    movers: Movers, frame: Frame, nodes: Float[Array, "R 13 2"]
+    movers: Movers, frame: Frame, nodes: Float[Array, "R K 2"]
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
     """The closest things whose box reaches into one of the rectangles around the corridor."""
     me = movers.box[:, None]
@@ -249,10 +249,10 @@ def reaching(
     found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
     for number in range(rectangles):
         x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
-        dx, dy = box[..., X] - x, box[..., Y] - y
         turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
         turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
-        ahead, left = jnp.abs(dx * cos + dy * sin), jnp.abs(dy * cos - dx * sin)
+        ahead = jnp.abs(box[..., X] * cos + (box[..., Y] * sin - (x * cos + y * sin)))
+        left = jnp.abs(box[..., Y] * cos - (box[..., X] * sin + (y * cos - x * sin)))
         found |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
             left < width + turn_sin * deep + turn_cos * wide
         )
@@ -264,12 +264,10 @@ def _rectangles(
 ) -> tuple[Float[Array, "R Q"], ...]:
     """Rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
     long = (nodes.shape[1] - 1) // count
-    x, y = (
-        jnp.stack([nodes[:, q * long : (q + 1) * long + 1, axis] for q in range(count)], axis=1)
-        for axis in (X, Y)
-    )
+    # All points but the last, by stretches; the end of each is (chord, 0) in its own frame.
+    x, y = (nodes[:, :-1, axis].reshape(len(nodes), count, long) for axis in (X, Y))
     rest_x, rest_y = x - x[..., :1], y - y[..., :1]
-    chord_x, chord_y = rest_x[..., -1], rest_y[..., -1]
+    chord_x, chord_y = nodes[:, long::long, X] - x[..., 0], nodes[:, long::long, Y] - y[..., 0]
     chord = jnp.sqrt(jnp.maximum(chord_x * chord_x + chord_y * chord_y, 1e-6))
     # Beyond its end a path is one point; there any direction will do.
     cos, sin = jnp.where(chord > 1e-2, chord_x / chord, 1.0), jnp.where(chord > 1e-2, chord_y / chord, 0.0)
@@ -277,7 +275,7 @@ def _rectangles(
     left = rest_y * cos[..., None] - rest_x * sin[..., None]
     number = jnp.arange(count)
     near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind, 0.0)
-    far = ahead.max(axis=-1) + half + jnp.where(number == count - 1, beyond, 0.0)
+    far = jnp.maximum(ahead.max(axis=-1), chord) + half + jnp.where(number == count - 1, beyond, 0.0)
     right, left = left.min(axis=-1) - half, left.max(axis=-1) + half
     on, aside = (near + far) / 2, (right + left) / 2
     centre_x, centre_y = x[..., 0] + on * cos - aside * sin, y[..., 0] + on * sin + aside * cos

@@ -69,12 +69,12 @@ def measure(
     Returns:
         The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
     """
-    me, z = frame.box[scene.slot], frame.z[scene.slot]
-    ground = z - (height := bank.agent_box[scene.index, scene.slot, 2]) / 2
-    lanes, beyond, left_map, offroad = _on_the_map(bank, scene.index, me, ground)
-    moved = norm(scene.history[-1, :2] - scene.history[-2, :2])
-    route = project_on_route(bank, scene.index, me[:2], scene.route_m, 1.5 * moved + 2.0)
-    z = jnp.where(lanes.near, lanes.z + height / 2, z)
+    around = surroundings(bank, scene, frame)
+    lanes, route, me = around.lanes, around.route, frame.box[scene.slot]
+    ground = _ground(bank, scene, frame)
+    beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
+    half = bank.agent_box[scene.index, scene.slot, 2] / 2
+    z = jnp.where(lanes.near, lanes.z + half, frame.z[scene.slot])
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
     codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
@@ -100,7 +100,7 @@ def measure(
         ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
-        moved_m=moved,
+        moved_m=_moved(scene),
         progress_m=scene.route_m,
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
@@ -110,7 +110,26 @@ def measure(
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
     )
-    return Situation(scene, _kept(facts, reads), Surroundings(frame, lanes, route)), codes, lights
+    return Situation(scene, _kept(facts, reads), around), codes, lights
+
+
+def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings:
+    """Everyone now, the lanes around the driven agent, and where it is on its route."""
+    me = frame.box[scene.slot]
+    ground = _ground(bank, scene, frame)
+    lanes = around_lanes(bank, scene.index, me[:2], me[2:4], corners(me), ground)
+    ahead_m = 1.5 * _moved(scene) + 2.0
+    return Surroundings(frame, lanes, project_on_route(bank, scene.index, me[:2], scene.route_m, ahead_m))
+
+
+def _ground(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
+    """Height of the ground under the driven agent, m."""
+    return frame.z[scene.slot] - bank.agent_box[scene.index, scene.slot, 2] / 2
+
+
+def _moved(scene: Scene) -> Float[Array, ""]:
+    """How far the driven agent has come in the last step, m."""
+    return norm(scene.history[-1, :2] - scene.history[-2, :2])
 
 
 def _touch(
@@ -145,15 +164,13 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
     return facts if reads == FACTS else jax.tree_util.tree_map_with_path(keep, facts)
 
 
-def _on_the_map(
-    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""]
-) -> tuple[LaneHits, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """Lanes around a box, how far its worst corner is off the road (m), whether it left the map, or only the road."""
-    box_corners = corners(me)
-    lanes = around_lanes(bank, index, me[:2], me[2:4], box_corners, ground)
-    beyond = offroad_distance(bank, index, me[:2], box_corners, lanes.points_near, ground).max()
+def _off_the_road(
+    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""], lanes: LaneHits
+) -> tuple[Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
+    """How far a box's worst corner is off the road (m), whether it left the map, or only the road."""
+    beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
     left_map = left_the_map(bank, index, me[:2])
-    return lanes, beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
+    return beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
 
 
 def _speed(frame: Frame) -> Float[Array, " S"]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, WORD, ScenarioBank
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_Z, WORD, ScenarioBank
 from drivax.simulator.types import HISTORY, Frame, Scene
 
 
@@ -72,20 +72,24 @@ def frame_of(
     driven = cast.history[:, HISTORY - 1 - back]
     cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
     one = jnp.ones_like(cos)
-    rows = [driven[:, 0], driven[:, 1], cast.z, cos, sin, driven[:, 3] * cos, driven[:, 3] * sin, one]
+    # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
+    rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
+    rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
     # Before the recording nobody else was seen.
     agents = agents.at[:, AGENT_VALID].mul(step >= back)
+    z = agents[:, AGENT_Z].at[cast.slot].set(cast.z, mode="drop")
     agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
     box = bank.agent_box[index]
     at = jnp.clip(step - back, 0, bank.steps - 1)
     bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
     there = (bit & 1 > 0) & (step >= back)
-    agents = jnp.pad(agents, ((0, len(box) - len(agents)), (0, 0)))
-    agents = jnp.where(there[:, None], bank.parked[index], agents)
+    parked, more = bank.parked[index], len(box) - len(agents)
+    z = jnp.where(there, parked[:, AGENT_Z], jnp.pad(z, (0, more)))
+    agents = jnp.where(there[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
     return Frame(
         box=jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1),
         velocity=agents[:, 5:7],
-        z=agents[:, 2],
+        z=z,
         valid=agents[:, 7] > 0,
         kind=box[:, 3].astype(jnp.int32),
     )

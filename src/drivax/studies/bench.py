@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
@@ -32,7 +32,7 @@ from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import alone
-from drivax.simulator.types import SimState
+from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.runs import versions
 
@@ -40,6 +40,9 @@ from drivax.tracking.runs import versions
 METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
 #: Environments of which the compiler counts operations and bytes.
 _COUNTED = 16384
+#: Actions, observations and everyone now; and states, whose episodes are over, what was earned, and the former.
+_Driven = tuple[Array, Mapping[str, Array], Frame]
+_Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
 
 
 @dataclass(frozen=True)
@@ -164,13 +167,14 @@ def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
     simulator, bank = _simulator(bank, config)
     states = _states(simulator, bank, config.batch)
     keys = jax.random.split(jax.random.key(2), jax.device_count())
+    carry = _carry(simulator, config, bank, states)
     began = time.perf_counter()
-    program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, states, keys).compile()
+    program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
     seconds = time.perf_counter() - began
     memory = program.memory_analysis()
     return Program(
-        run=lambda: program(bank, states, keys),
-        steps=int(program(bank, states, keys)[1].sum()),
+        run=lambda: program(bank, carry, keys),
+        steps=int(program(bank, carry, keys)[1].sum()),
         compile_seconds=seconds,
         state_bytes=sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
         temporary_bytes=0
@@ -228,35 +232,50 @@ def _shared(function: Callable[..., Any]) -> Any:
 
 
 def _run(
-    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState, keys: Array
+    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
 ) -> tuple[Any, Array]:
     """Steps a batch; what was earned and is seen, so that nothing is optimised away, and how many were steps."""
-    driver, key, batch = IdmPlanner(config.task.actions), keys[0], states.start.shape[0]
-
-    def act(state: SimState) -> Float[Array, " D"]:
-        return driver.act((), bank, state, simulator.situation(bank, state), None, key)[0]
-
-    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
-    observe = jax.vmap(simulator.observe, in_axes=(None, 0))
+    key, batch = keys[0], carry[1].shape[0]
+    begin = jax.vmap(simulator.scene, in_axes=(None, 0))
+    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
 
     def judged(states: SimState) -> Array:
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
-        return sum((value.value.sum() for value in values.values()), start=jnp.zeros(()))
+        return jnp.sum(jnp.asarray([value.value for value in values.values()], jnp.float32))
 
-    def one(carry: tuple[Any, ...], index: Int[Array, " B"]) -> tuple[Any, Array]:
-        states, over, total, _ = carry
-        action = jax.vmap(act)(states)
-        states, transition = step(bank, states, action, over, index)
+    def one(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
+        states, over, total, (action, _, seen) = carry
+        states, transition = step(bank, states, action, over, begin(bank, index), seen)
         done = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.
         total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
         total += transition.reward
-        return (states, done, total, observe(bank, states.scene)), (~over).sum()
+        # Here, where everyone is at hand, and not at the beginning of the next round.
+        return (states, done, total, _driven(simulator, config, bank, states)), (~over).sum()
 
-    start = (states, jnp.zeros(batch, bool), jnp.zeros(batch), observe(bank, states.scene))
     begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
-    (_, _, total, seen), alive = jax.lax.scan(one, start, begins)
-    return (total, seen), alive.sum()[None]
+    (_, _, total, driven), alive = jax.lax.scan(one, carry, begins)
+    return (total, driven), alive.sum()[None]
+
+
+def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Driven:
+    """The driver's actions, the task's observations and everyone now."""
+    driver = IdmPlanner(config.task.actions)
+
+    def one(state: SimState) -> _Driven:
+        situation = simulator.situation(bank, state)
+        action, _ = driver.act((), bank, state, situation, None, jax.random.key(0))
+        return action, simulator.observe(bank, state.scene), situation.surroundings.frame
+
+    return jax.vmap(one)(states)
+
+
+def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Carry:
+    """Before the first round, in which every episode begins, nothing is driven or seen."""
+    driven = jax.eval_shape(lambda: _driven(simulator, config, bank, states))
+    driven = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), driven)
+    begins = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
+    return states, *jax.device_put((*begins, driven), NamedSharding(_mesh(), PartitionSpec("device")))
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
