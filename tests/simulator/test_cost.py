@@ -88,7 +88,7 @@ def test_one_configuration_is_compiled_once(traffic):
     assert driven(data[:1], [0, 0], trim=False) == driven(data[1:2], [0, 0], trim=False)
 
 
-@pytest.mark.parametrize("part", ["reset", "metrics"])
+@pytest.mark.parametrize("part", [pytest.param("reset", marks=pytest.mark.slow), "metrics"])
 def test_parts_are_timed_on_states_as_they_are(part):
     # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])

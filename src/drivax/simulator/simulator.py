@@ -179,7 +179,7 @@ class Simulator:
             action: What the agent does if its episode goes on.
             over: Whether it is over.
             fresh: The :meth:`scene` that begins then.
-            seen: ``now(bank, state.scene)``, by who has it at hand from the step before; a tenth less to compute.
+            seen: ``now(bank, state.scene)``, from who has it at hand, so that it is not computed again.
         """
         seen = self.now(bank, state.scene) if seen is None else seen
         moved = self._move(bank, state.scene, seen, action, None)
