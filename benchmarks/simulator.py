@@ -3,16 +3,19 @@
 Every ratio is of two timings of one run; every timing is a median. Nothing else may run on the machine.
 
 Run: python benchmarks/simulator.py --data SET [--write]      SET: at least 4,096 scenarios of the built-in world
-     python benchmarks/simulator.py --table                   (the stored result into docs/results/speed.md)
+     python benchmarks/simulator.py --data SET --again        (the speeds once more, added to simulator_runs.json)
+     python benchmarks/simulator.py --table                   (the stored results into docs/results/speed.md)
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import statistics
 import sys
 import time
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +44,7 @@ from drivax.tracking.runs import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "simulator.json"
+RUNS = RESULT.with_name("simulator_runs.json")
 PAGE = ROOT / "docs" / "results" / "speed.md"
 #: What is simulated: the fullest task, and the leanest that still learns.
 TASKS = {
@@ -74,6 +78,39 @@ def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
             "temporary_bytes": program.temporary_bytes,
         }
     return result
+
+
+def machine_ms() -> float:
+    """Milliseconds of a fixed program on one core, which tells how fast a shared machine is just now.
+
+    It reads rows at random and computes on what it read, as a step does.
+    """
+    table = jnp.arange(1 << 24, dtype=jnp.float32).reshape(-1, 64)
+    rows = jax.random.randint(jax.random.key(0), (1 << 16,), 0, len(table))
+    program = jax.jit(lambda table, rows: jnp.sin(table[rows] * 1e-3).sum(axis=-1))
+    times = []
+    for _ in range(21):
+        began = time.perf_counter()
+        jax.block_until_ready(program(table, rows))
+        times.append(time.perf_counter() - began)
+    return round(statistics.median(times) * 1e3, 2)
+
+
+def again(folder: Path, repeats: int) -> dict[str, Any]:
+    """The speeds once more, at the batch sizes that were the best in the stored result, timed by turns."""
+    use_all_cores()
+    stored = ScenarioSet.open(folder)
+    bank = spread(prepared(IdmTraffic(), ScenarioBank.from_scenarios([stored[i] for i in range(SCENARIOS)])))
+    best = {name: one["batch"] for name, one in json.loads(RESULT.read_text())["speed"].items()}
+    programs = []
+    for name, batch in best.items():
+        task, traffic = name.split(", ")
+        config = BenchConfig(batch=batch, repeats=repeats, task=TASKS[task], traffic=traffic)
+        programs.append(compiled(bank, config))
+    before = machine_ms()
+    speeds = dict(zip(best, map(round, steps_per_second(programs, repeats)), strict=True))
+    when = datetime.now(UTC).isoformat(timespec="minutes")
+    return {"when": when, "machine_ms": [before, machine_ms()], "steps_per_second": speeds}
 
 
 def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
@@ -171,7 +208,27 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
     return result
 
 
-def table(result: dict[str, Any]) -> str:
+def runs_table(runs: list[dict[str, Any]]) -> list[str]:
+    """The speeds of every run, as they came."""
+    if not runs:
+        return []
+    names = list(runs[0]["steps_per_second"])
+    rows = [
+        f"| run (UTC) | machine (ms) | {' | '.join(names)} | lean: idm / log |",
+        "|---" * (len(names) + 3) + "|",
+    ]
+    for run in runs:
+        one = run["steps_per_second"]
+        ratio = one["lean, idm"] / one["lean, log"]
+        cells = [f"{one[name]:,}" for name in names]
+        machine = " to ".join(f"{value:.0f}" for value in sorted(run["machine_ms"]))
+        rows.append(
+            f"| {run['when'][:16].replace('T', ' ')} | {machine} | {' | '.join(cells)} | {ratio:.2f} |"
+        )
+    return rows
+
+
+def table(result: dict[str, Any], runs: list[dict[str, Any]]) -> str:
     """The page's tables."""
     rows = ["| task | traffic | steps/s | batch | state (B) | a step, compiled (s) | all, compiled (s) |"]
     rows += ["|---|---|---|---|---|---|---|"]
@@ -181,6 +238,7 @@ def table(result: dict[str, Any]) -> str:
             f"| {task} | `{traffic}` | {one['steps_per_second']:,} | {one['batch']} | {one['state_bytes']:,} "
             f"| {one['compile_seconds']:.1f} | {one['program_compile_seconds']:.1f} |"
         )
+    rows += ["", *runs_table(runs)]
     rows += ["", "| metrics | batch | steps/s | relative |", "|---|---|---|---|"]
     for row in result["metrics"]:
         batch = f"{row['batch']}{' (best)' if row['best'] else ''}"
@@ -215,17 +273,24 @@ def main() -> None:
     parser.add_argument(
         "--table", action="store_true", help="put the stored result into docs/results/speed.md"
     )
+    parser.add_argument("--again", action="store_true", help="add the speeds to simulator_runs.json")
     args = parser.parse_args()
+    runs = json.loads(RUNS.read_text()) if RUNS.exists() else []
     if args.table:
         before, rest = PAGE.read_text().split(BEGIN)
-        text = table(json.loads(RESULT.read_text()))
+        text = table(json.loads(RESULT.read_text()), runs)
         PAGE.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{rest.split(END)[1]}")
         return
     if args.data is None:
         parser.error("--data is needed")
+    if args.again:
+        runs.append(again(args.data, args.repeats))
+        RUNS.write_text(json.dumps(runs, indent=1) + "\n")
+        print("\n".join(runs_table(runs)))
+        return
     command = " ".join(["python", "benchmarks/simulator.py", *sys.argv[1:]])
     result = {"command": command, **measure(args.data, args.repeats), "versions": versions()}
-    print(table(result))
+    print(table(result, runs))
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")
 
