@@ -19,6 +19,7 @@ from drivax import cli
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<body>.*?)^(?P=indent)```", re.M | re.S)
+_FILE = re.compile(r"# (?P<file>[\w.]+\.(py|yaml))\n")
 _LINK = re.compile(r"!?\[[^\]]*\]\((?P<target>[^)\s]+)\)")
 
 
@@ -64,7 +65,13 @@ def help_of(command: str) -> str:
     return out.getvalue()
 
 
-PYTHON_PAGES = [page for page in PAGES if blocks(page, "python")]
+#: Pages that take more than a few seconds.
+SLOW_PAGES = ("docs/guide/custom.md",)
+PYTHON_PAGES = [
+    pytest.param(page, marks=pytest.mark.slow) if str(page.relative_to(REPOSITORY)) in SLOW_PAGES else page
+    for page in PAGES
+    if blocks(page, "python")
+]
 SHELL_BLOCKS = [block for page in PAGES for block in blocks(page, "bash", "console", "sh") if commands(block)]
 
 
@@ -75,11 +82,20 @@ def test_pages_are_found():
 
 @pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Blocks of a page share their names, as a reader who types them in order has them."""
+    """Blocks of a page share their names, as a reader who types them in order has them.
+
+    A block that begins with the name of a file, as ``# my_terms.py``, is that file in the folder of the reader.
+    """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     module = types.ModuleType("page")  # dataclasses look their module up
     monkeypatch.setitem(sys.modules, "page", module)
-    for block in blocks(page, "python"):
+    for block in blocks(page, "python", "yaml"):
+        if name := _FILE.match(block.text):
+            (tmp_path / name["file"]).write_text(block.text)
+            continue
+        if block.language == "yaml":
+            continue
         code = compile("\n" * (block.line - 1) + block.text, str(page), "exec", dont_inherit=True)
         exec(code, module.__dict__)
 

@@ -10,15 +10,18 @@ from typing import Any
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
-from drivax.evaluation.runner import evaluate as drive_all
+from drivax.evaluation.runner import evaluate_in
 from drivax.learning.policies import load_policy
+from drivax.named import is_dotted
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.catalogue import make_traffic
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 
 
@@ -52,20 +55,33 @@ def load(data: str | Path | Sequence[Scenario], limit: int | None = None) -> Loa
     return Loaded(scenarios, ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
 
 
-def make_simulator(task: Task | None = None) -> Simulator:
-    """A simulator of a task (the default one otherwise) in log traffic."""
-    return Simulator(task or Task(), LogTraffic())
+def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
+    """A simulator of a task (the default one otherwise).
+
+    Args:
+        task: Action space, observation, reward and ends.
+        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, or a traffic. All but ``log`` may need
+            their bank prepared: ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
+    """
+    return Simulator(task or Task(), _traffic(traffic))
+
+
+def _traffic(given: str | Traffic) -> Traffic:
+    return make_traffic(given) if isinstance(given, str) else given
 
 
 def evaluate(
-    planner: str | Path | Planner, data: str | Path | Loaded, *, task: Task | None = None, **options: Any
-) -> Results:
+    planner: str | Path | Planner, data: str | Path | Loaded, *, task: Task | None = None,
+    traffic: str | Traffic = "log", start: Start | None = None, **options: Any,
+) -> Results:  # fmt: skip
     """Drives every scenario to the end of its log and measures it; writes nothing.
 
     Args:
         planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), or a planner.
         data: Folder of a scenario set, or what :func:`load` returned.
         task: Action space and observation of a planner of your own.
+        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, or a traffic.
+        start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
         options: ``start_step``, ``seed``, ``progress`` of ``evaluation.runner.evaluate``.
     """
     loaded = data if isinstance(data, Loaded) else load(data)
@@ -73,7 +89,8 @@ def evaluate(
         if task is not None:
             raise UsageError("a planner by name brings its own task", cure="leave out task=")
         planner, task = find_planner(str(planner), loaded.bank)
-    return drive_all(planner, loaded.bank, loaded.names, task=task, **options)
+    simulator = Simulator(task or Task(), _traffic(traffic), start or LogStart())
+    return evaluate_in(simulator, planner, loaded.bank, loaded.names, **options)
 
 
 def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
@@ -82,13 +99,13 @@ def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[P
     Raises:
         UsageError: If there is neither such a planner nor such a folder.
     """
-    if name in PLANNERS:
+    if name in PLANNERS or (is_dotted(name) and not Path(name).is_dir()):
         return make_planner(name), Task()
     folder, _, step = name.partition("@")
     if not Path(folder).is_dir():
         raise UsageError(
             f"there is no planner {name!r}",
-            cure=f"use {', '.join(PLANNERS)}, or the folder of a training run",
+            cure=f"use {', '.join(PLANNERS)}, package.module:name, or the folder of a training run",
         )
     if step and not step.isdecimal():
         raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")

@@ -13,8 +13,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import drivax
-from drivax.adapters import gym
-from drivax.adapters.gym import DrivingEnv
+from drivax.adapters import driving, gym
+from drivax.adapters.gym import TASKS, DrivingEnv, VectorDrivingEnv
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.rollout import judging
 from drivax.planners.simple import ConstantVelocity
@@ -53,6 +53,42 @@ def test_gymnasiums_own_checker(data):
     """Warnings are errors here, and a spec lets the checker make and close environments of its own."""
     spec = EnvSpec("Driving-v0", entry_point=DrivingEnv, kwargs={"data": data, "task": SMALL})
     check_env(gymnasium.make(spec).unwrapped)
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_ids(name):
+    """The spec says what the environment is; none is made here."""
+    spec = gymnasium.spec(f"drivax/{name}-v0")
+    assert spec.kwargs == {"task": TASKS[name]}
+    assert (spec.entry_point, spec.vector_entry_point) == (
+        "drivax.adapters.gym:DrivingEnv",
+        "drivax.adapters.gym:VectorDrivingEnv",
+    )
+
+
+def test_environments_by_id(data):
+    """On scenarios of the built-in world where none are given; Gymnasium's own wrappers check every call."""
+    env = gymnasium.make("drivax/minimal-v0", data=data)
+    assert env.unwrapped.observation_space == DrivingEnv(data, SMALL).observation_space
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    assert gymnasium.make("drivax/minimal-v0", data=2).reset(seed=0)[1]["scenario_id"].startswith("w")
+    vector = gymnasium.make_vec("drivax/minimal-v0", num_envs=2, data=data)
+    assert isinstance(vector, VectorDrivingEnv) and vector.num_envs == 2
+
+
+def test_discrete_actions(data):
+    """Choice i of 7 x 13 is acceleration level i // 13 and curvature level i % 13; the middle one does nothing."""
+    env = DrivingEnv(data, replace(SMALL, actions=TASKS["discrete"].actions))
+    assert env.action_space == gymnasium.spaces.Discrete(91)
+    env.reset(options={"scenario": 0})
+    seen = env.step(np.int64(91 // 2))[0]
+    np.testing.assert_allclose(seen["ego"][-1, 4] * SPEED_MPS, 8.0, rtol=1e-5)
+    seen = env.step(6 * 13 + 6)[0]  # full acceleration, straight on: 6 m/s2 for 0.1 s
+    np.testing.assert_allclose(seen["ego"][-1, 4] * SPEED_MPS, 8.6, rtol=1e-5)
+    for action in (91, -1, 0.5, [1, 2]):
+        with pytest.raises(UsageError, match="give choices from 0 to 90"):
+            env.step(action)
 
 
 def test_spaces_are_the_tasks_groups(data):
@@ -152,7 +188,7 @@ def test_errors_are_one_line(env):
             env.reset(options=options)
         assert str(error.value) == words
     for action in (np.zeros(3), np.array([np.nan, 0.0])):
-        with pytest.raises(UsageError, match="give two finite numbers"):
+        with pytest.raises(UsageError, match="give 2 finite numbers"):
             env.step(action)
     drive(env, 1)
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -173,9 +209,87 @@ def test_steps_are_compiled_once(data):
     for env in (first, second):
         env.reset(seed=0)
         env.step(STILL)
-    compiled = gym._advance._cache_size()
+    compiled = driving.advance._cache_size()
     third = DrivingEnv(data, SMALL)
     third.reset(options={"scenario": 1})
     third.step(STILL)
-    assert gym._advance._cache_size() == compiled
+    assert driving.advance._cache_size() == compiled
     assert {device.platform for leaf in jax.tree.leaves(third._state) for device in leaf.devices()} == {"cpu"}
+
+
+def test_a_batch_is_as_many_single_environments(data, env):
+    """Every number of a batch of three against the same episodes one by one, through ends and new beginnings."""
+    vector = VectorDrivingEnv(3, data, SMALL)
+    assert vector.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
+    seen, info = vector.reset(seed=3, options={"scenarios": [1, 0, 1]})
+    assert list(info["scenario_id"]) == ["blocked", "free", "blocked"] and seen in vector.observation_space
+    rng = np.random.default_rng(0)
+    actions = (rng.uniform(-0.1, 0.2, (95, 3, 2)) * (1.0, 0.01)).astype(np.float32)
+    log = [vector.step(action) for action in actions]
+    ended = 0
+    for place in range(3):
+        begins, row = True, [1, 0, 1][place]
+        single, _ = env.reset(options={"scenario": row})
+        for step, (seen, reward, terminated, truncated, info) in enumerate(log):
+            if not begins and over:
+                row = ["free", "blocked"].index(info["scenario_id"][place])
+                single, _ = env.reset(options={"scenario": row})
+                wanted = (0.0, False, False)
+            else:
+                single, *wanted, own = env.step(actions[step, place])
+            begins, over = False, wanted[1] or wanted[2]
+            for name in single:
+                np.testing.assert_allclose(seen[name][place], single[name], atol=2e-4, err_msg=name)
+            assert reward[place] == pytest.approx(wanted[0], abs=1e-4)
+            assert (terminated[place], truncated[place]) == tuple(wanted[1:])
+            if over:
+                ended += 1
+                metrics = {n: v[place] for n, v in info["metrics"].items() if n in own["metrics"]}
+                assert metrics == pytest.approx(own["metrics"], abs=1e-3)
+                assert info["_metrics"][place]
+    assert ended >= 3 and any(truncated.any() for *_, truncated, _ in log)
+
+
+def test_seeds_and_errors_of_a_batch(data):
+    vector = VectorDrivingEnv(3, data, SMALL)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        vector.step(np.zeros((3, 2)))
+    drawn = [[list(vector.reset(seed=seed)[1]["scenario_id"]) for _ in range(2)] for seed in range(4)]
+    assert all(one == other for one, other in drawn) and len({tuple(one) for one, _ in drawn}) > 1
+    for options, words in (
+        ({"scenarios": [0, 1]}, "2 scenarios for 3 environments; give one per environment"),
+        ({"scenarios": [0, 1, 2]}, "there is no scenario 2; use a row from 0 to 1"),
+        ({"scenario": 1}, "there is no reset option 'scenario'; the only one is 'scenarios'"),
+    ):
+        with pytest.raises(UsageError) as error:
+            vector.reset(options=options)
+        assert str(error.value) == words
+    with pytest.raises(UsageError, match="give 3 x 2 finite numbers"):
+        vector.step(np.zeros((2, 2)))
+
+
+def test_pictures(data):
+    """Ego is drawn where it drove: the picture changes when it brakes, not in size."""
+    env = DrivingEnv(data, SMALL, render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+    pictures = []
+    for action in ([0.0, 0.0], [-1.0, 0.0]):
+        env.reset(options={"scenario": 0})
+        env.step(np.array(action, np.float32))
+        env.step(np.array(action, np.float32))
+        pictures.append(env.render())
+    first, second = pictures
+    assert first.dtype == np.uint8 and first.shape == second.shape and first.shape[2] == 3
+    assert (first != second).any()
+    assert env._path.shape == (13, 4) and np.isfinite(env._path).all()
+    assert DrivingEnv(data, SMALL).render() is None
+    with pytest.raises(UsageError, match="the only one is 'rgb_array'"):
+        DrivingEnv(data, SMALL, render_mode="human")
+    vector = VectorDrivingEnv(2, data, SMALL, render_mode="rgb_array")
+    vector.reset(options={"scenarios": [0, 0]})
+    brake = np.array([[0.0, 0.0], [-1.0, 0.0]], np.float32)
+    for _ in range(2):
+        vector.step(brake)
+    for picture, wanted in zip(vector.render(), pictures, strict=True):
+        np.testing.assert_array_equal(picture, wanted)

@@ -9,7 +9,8 @@ import pytest
 
 from drivax.cli import main
 from drivax.evaluation.results import KEYS
-from drivax.metrics.episode import METRICS
+from drivax.metrics.catalogue import METRICS
+from drivax.studies import bench
 from drivax.synthetic.generate import Generation, generate
 
 NUMBER, WHOLE = {"type": "number"}, {"type": "integer", "minimum": 0}
@@ -24,7 +25,7 @@ def exactly(**properties):
 
 SUMMARY = exactly(
     planner={"type": "string"},
-    traffic={"enum": ["log"]},
+    traffic={"enum": ["log", "idm"]},
     metrics={
         "type": "object",
         "additionalProperties": exactly(mean=MAYBE, low=MAYBE, high=MAYBE, n=WHOLE),
@@ -48,12 +49,15 @@ BENCH = {
     "type": "object",
     "required": [
         "environment_steps_per_second", "batch", "state_bytes", "compile_seconds", "brute_force_ratio", "by_part",
-        "versions",
+        "cost_by_part", "versions",
     ],
     "properties": {
         "environment_steps_per_second": NUMBER, "batch": WHOLE, "state_bytes": {"type": "integer", "maximum": 4096},
         "compile_seconds": NUMBER, "brute_force_ratio": NUMBER,
         "by_part": {"type": "object", "additionalProperties": NUMBER, "minProperties": 8},
+        "cost_by_part": {
+            "type": "object", "additionalProperties": exactly(operations=WHOLE, bytes=WHOLE), "minProperties": 8,
+        },
         "versions": {"type": "object"},
     },
 }  # fmt: skip
@@ -125,6 +129,19 @@ def test_inspect(data, capsys):
 def test_bench(data, capsys):
     assert main(["bench", "--data", str(data), "--batch", "4", "--repeats", "1", "--json"]) == 0
     jsonschema.validate(json.loads(capsys.readouterr().out), BENCH)
+
+
+@pytest.mark.slow
+def test_bench_by_metric_set(data, capsys, monkeypatch):
+    monkeypatch.setattr(bench, "BATCHES", (2,))
+    monkeypatch.setattr(bench, "LARGER", (4,))
+    assert main(["bench", "--data", str(data), "--repeats", "1", "--metrics", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["metrics"], row["batch"], row["best"]) for row in rows] == [
+        (name, batch, batch == 4) for name in ("none", "training", "full") for batch in (2, 4)
+    ]
+    assert all(row["steps_per_second"] > 0 for row in rows)
+    assert next(row["relative"] for row in rows if (row["metrics"], row["batch"]) == ("full", 2)) == 1.0
 
 
 def test_report(evaluation, data):

@@ -199,3 +199,20 @@ def test_the_ego_of_every_real_file_is_clean(real_data):
         assert finding["log_offroad_fraction"] <= 0.01, scenario.id
         assert finding["clean"] is True and finding["log_left_map"] is False, scenario.id
         assert finding["first_onroad_step"] == CURRENT_STEP, scenario.id
+
+
+def test_clipped_shares_count_what_the_log_asks_for():
+    # Braking at 5 m/s2 from step 20 to 29 is within `physical` and beyond `published`; at 9 m/s2 beyond both.
+    def braking(deceleration):
+        speed = 16.0 - deceleration * 0.1 * np.clip(np.arange(91) - 20, 0, 10)
+        x = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 0.1)])
+        still = np.zeros(91)
+        return car() | {"xy": np.stack([x, still], -1), "velocity": np.stack([speed, still], -1)}
+
+    soft, hard = audited(straight_road([braking(5.0)]), straight_road([braking(9.0)]))
+    assert (soft["clipped_physical"], soft["clipped_published"]) == (0.0, 10 / 80)
+    assert (hard["clipped_physical"], hard["clipped_published"]) == (10 / 80, 10 / 80)
+    # Steps at which the log does not know ego are judged by nobody: 40 to 49, and the one after.
+    gap = car(0, 0, 0, 5, steps=[*range(40), *range(50, 91)])
+    (finding,) = audited(straight_road([gap]))
+    assert (finding["clipped_physical"], finding["clipped_published"]) == (0.0, 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.metrics.comfort import TAIL, WINDOW, judge_comfort, tail_operator
+from drivax.metrics.comfort import TAIL, WINDOW, judge_comfort, judge_trip, tail_operator
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2)])
@@ -48,6 +48,11 @@ def test_judgement_equals_limits_on_scipys_signals():
     expected = fine[7:]
     assert 0.2 < expected.mean() < 0.98
     np.testing.assert_array_equal(running, expected)
+    motion = jnp.asarray(np.stack([0 * speed, 0 * speed, heading, speed], -1), jnp.float32)
+    whole = jax.jit(judge_trip)(motion)
+    np.testing.assert_array_equal(whole.comfortable, expected)
+    magnitude = np.abs(savgol_filter(np.hypot(a, lateral), 15, 2, deriv=1, delta=0.1))
+    np.testing.assert_allclose(whole.jerk_mps3, magnitude[7:], rtol=1e-3, atol=5e-3)
 
 
 def test_lateral_acceleration_can_fail():

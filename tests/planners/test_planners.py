@@ -15,7 +15,7 @@ from drivax.planners.planner import Planner
 from drivax.planners.simple import RandomActions, expert_action, logged_motion
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import ActionSpace
+from drivax.tasks.actions import PHYSICAL
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
@@ -85,7 +85,7 @@ def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
     np.testing.assert_allclose(logged_motion(bank, ego, 4), [73.8, 0, 0, 9], atol=1e-3)
     gone = simulator.scene(bank, 0, 59, 1)
     np.testing.assert_allclose(logged_motion(bank, gone, 1), gone.history[-1])
-    steady = expert_action(bank, simulator.scene(bank, 0, 10), ActionSpace())
+    steady = expert_action(bank, simulator.scene(bank, 0, 10), PHYSICAL)
     np.testing.assert_allclose(steady, 0.0, atol=1e-4)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.statistics import NOTHING, Interval, bootstrap_mean, rate
-from drivax.metrics.episode import METRICS
+from drivax.metrics.catalogue import METRICS
 from drivax.show.comparison import comparable, difference, summarise
 from drivax.show.glossary import HEADLINE, headline, note, ordered
 from drivax.show.runs import read_runs

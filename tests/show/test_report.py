@@ -14,7 +14,7 @@ import pytest
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.statistics import wilson
-from drivax.metrics.episode import METRICS
+from drivax.metrics.catalogue import METRICS
 from drivax.scenario.store import ScenarioWriter
 from drivax.show.glossary import note
 from drivax.show.palette import LIGHT

@@ -1,6 +1,7 @@
 """Cases that a fresh reader of the simulator found: slopes, no map, other slots, gaps in the log, second contacts."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.rollout import drive, judging
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.scenario.schema import LightState
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -124,3 +126,20 @@ def test_a_right_turn_on_red_without_a_stop_is_not():
     moving = recording.tracks.velocity + np.array([1.0, 0.0]) * (np.arange(91) < 12)[:, None]
     still_rolling = replace(recording, tracks=replace(recording.tracks, velocity=moving))
     assert metrics(Expert(), bank_of(still_rolling), start_step=10)["red_light"] == 1.0
+
+
+def test_a_line_that_was_crossed_before_the_episode_is_not_charged_to_it():
+    # Slot 1, which has no route, crosses the red line between steps 9 and 10.
+    bank = bank_of(straight_road([car(-60, 0, 0, 10), car(37.9, 0, 0, 10)], light=LightState.STOP))
+    simulator = Simulator(Task(metrics=("red_light",), ends=()))
+
+    @partial(jax.jit, static_argnums=0)
+    def run(begin):
+        def one(state, _):
+            state, _ = simulator.step(bank, state, jnp.zeros(2))
+            return state, state.facts.red_light
+
+        return jax.lax.scan(one, simulator.reset(bank, 0, begin, 1), None, length=40)[1]
+
+    assert not np.asarray(run(10)).any()
+    assert np.flatnonzero(run(9)).tolist() == [20]  # found out two seconds later

@@ -157,12 +157,14 @@ def test_order_and_padding_of_agents_change_nothing(simulator):
 def test_step_or_begin_is_step_or_reset(world):
     simulator = Simulator(Task())
     reset, step, either = (jax.jit(f) for f in (simulator.reset, simulator.step, simulator.step_or_begin))
-    state = reset(world, 1)
+    state, another = reset(world, 1), jax.jit(simulator.scene)(world, 3)
     action = jnp.array([0.2, 0.05])
     plain, _ = step(world, state, action)
-    same, _ = either(world, state, action, jnp.asarray(False), 3)
-    fresh, transition = either(world, plain, action, jnp.asarray(True), 3)
-    for a, b in ((plain, same), (reset(world, 3), fresh)):
+    same, _ = either(world, state, action, jnp.asarray(False), another)
+    seen = simulator.now(world, state.scene)
+    at_hand, _ = either(world, state, action, jnp.asarray(False), another, seen)
+    fresh, transition = either(world, plain, action, jnp.asarray(True), another)
+    for a, b in ((plain, same), (plain, at_hand), (reset(world, 3), fresh)):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), a, b)
     assert not bool(transition.terminated) and not bool(transition.truncated)
 

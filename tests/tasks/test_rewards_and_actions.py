@@ -62,7 +62,7 @@ def test_presets_include_those_before_them():
 def test_action_spaces_invert_and_keep_zero(space):
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
     for action in jnp.asarray(grid, jnp.float32):
-        back = space.action(*space.command(action, 4.8), 4.8)
+        back = space.action(jnp.zeros(4), *space.command(action, 4.8), 4.8)
         np.testing.assert_allclose(back, action, atol=1e-5)
     np.testing.assert_array_equal(jnp.stack(space.command(jnp.zeros(2), 4.8)), 0.0)
 

@@ -52,7 +52,9 @@ COMMANDS = {
         "drivax.cli.evaluate", "Evaluate", "drive a planner through a scenario set and judge it"
     ),
     "report": Command("drivax.cli.report", "Report", "one HTML page with tables and pictures from runs"),
-    "bench": Command("drivax.cli.bench", "Bench", "simulation speed on this machine, by part"),
+    "bench": Command(
+        "drivax.cli.bench", "Bench", "simulation speed on this machine, by part", overrides=True
+    ),
 }
 
 #: Packages that come with an extra, by the name they are imported under.

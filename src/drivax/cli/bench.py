@@ -5,21 +5,25 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from drivax import settings
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.studies.bench import BenchConfig, bench
+from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.progress import Progress
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Time environment steps with observation, reward, all metrics and resets, and each part alone.
+    """Time environment steps with observation, reward, metrics and resets, and each part alone; IDM drives.
 
-    Without --data, scenarios of the built-in world are generated for it.
+    Without --data, scenarios of the built-in world are generated for it. What is simulated can be given behind as
+    --task.key VALUE, as --task.metrics training.
 
     Example: drivax bench --batch 512 --json
     """
@@ -32,12 +36,19 @@ class Bench:
     """Environments side by side."""
     repeats: int = 7
     """Timed runs; the median counts."""
+    metrics: bool = False
+    """Compare the metric sets none, training and full at batch 32, 128 and the best one, instead of parts."""
+    traffic: str = "log"
+    """How the others move: log, idm, or package.module:name."""
     json: bool = False
     """Print one JSON object instead of text."""
 
 
-def run(args: Bench) -> int:
+def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Time and print."""
+    given = {"batch": args.batch, "repeats": args.repeats, "traffic": args.traffic}
+    config = settings.load(BenchConfig, given, overrides)
+    use_all_cores()
     if args.data is not None:
         bank = ScenarioBank.from_scenarios(ScenarioSet.open(args.data))
     else:
@@ -50,21 +61,33 @@ def run(args: Bench) -> int:
                 lambda done, total: bar.update(done),
             )  # fmt: skip
             bank = ScenarioBank.from_scenarios(ScenarioSet.open(made.path))
-    result = bench(bank, BenchConfig(batch=args.batch, repeats=args.repeats))
-    print(json.dumps(result, indent=1) if args.json else _text(result))
+    result, text = (bench_metrics(bank, config), _sets) if args.metrics else (bench(bank, config), _parts)
+    print(json.dumps(result, indent=1) if args.json else text(result))
     return 0
 
 
-def _text(result: dict[str, object]) -> str:
-    parts = result["by_part"]
-    assert isinstance(parts, dict)
+def _parts(result: dict[str, Any]) -> str:
     lines = [
         f"{result['environment_steps_per_second']:,} environment steps/s (batch {result['batch']}, "
-        f"{result['scenarios']:,} scenarios, with resets, observation, reward and all metrics)",
+        f"{result['devices']} device(s), "
+        f"{result['scenarios']:,} scenarios, {result['traffic']} traffic, with resets, observation, reward, metrics)",
         f"state {result['state_bytes']:,} B, scenario {result['bank_bytes_per_scenario']:,} B, "
         f"compiled in {result['compile_seconds']} s",
         f"map queries {result['brute_force_ratio']}x faster than brute force over the same segments",
-        "microseconds per environment and step, each part alone:",
-        *(f"  {name:<12} {value:8.2f}" for name, value in parts.items()),
+        "per environment and step, each part alone:    us  operations     bytes",
     ]
+    for name, value in result["by_part"].items():
+        cost = result["cost_by_part"][name]
+        lines.append(f"  {name:<39} {value:8.2f} {cost['operations']:11,.0f} {cost['bytes']:9,.0f}")
+    return "\n".join(lines)
+
+
+def _sets(result: dict[str, Any]) -> str:
+    lines = [
+        f"environment steps/s by metric set ({result['scenarios']:,} scenarios); x is relative to full at batch 32",
+        "  metrics     batch   steps/s      x",
+    ]
+    for row in result["rows"]:
+        batch = f"{row['batch']}{' (best)' if row['best'] else ''}"
+        lines.append(f"  {row['metrics']:<9} {batch:>12} {row['steps_per_second']:9,} {row['relative']:6.2f}")
     return "\n".join(lines)

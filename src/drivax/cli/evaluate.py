@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from drivax.api import find_planner, load
 from drivax.errors import UsageError
 from drivax.evaluation.runs import EvaluationConfig, format_summary, run_evaluation
+from drivax.metrics.selection import selected
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.catalogue import make_traffic
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,16 @@ class Evaluate:
     """Scenario set."""
     out: Path
     """Run folder to write."""
-    traffic: Literal["log"] = "log"
-    """How the others move: log replays them."""
+    traffic: str = "log"
+    """How the others move: log replays them, idm lets vehicles react, or module:name of your own."""
+    noisy_start: bool = False
+    """Begin after a second of wrong driving, drawn per scenario from --seed (docs/guide/dynamics.md)."""
     start_step: int = CURRENT_STEP
     """Step of the log at which to begin."""
     limit: int | None = None
     """Only the first so many scenarios."""
+    metrics: tuple[str, ...] = ()
+    """Metrics of your own beside all of ours, as module:name (docs/guide/custom.md)."""
     seed: int = 0
     """Of planners that draw random numbers."""
     sample: bool = False
@@ -49,11 +54,20 @@ def run(args: Evaluate) -> int:
     """Evaluate and print the headline metrics."""
     if args.limit is not None and args.limit < 1:
         raise UsageError(f"--limit {args.limit} leaves no scenario", cure="use 1 or more")
+    # Names that do not exist are refused before the long work.
+    make_traffic(args.traffic)
+    selected(args.metrics)
     data = ScenarioSet.open(args.data)
     bank = load(args.data, args.limit).bank
     planner, task = find_planner(args.planner, bank, args.sample)
     config = EvaluationConfig(
-        planner=args.planner, start_step=args.start_step, limit=args.limit, seed=args.seed
+        planner=args.planner,
+        traffic=args.traffic,
+        noisy_start=args.noisy_start,
+        start_step=args.start_step,
+        limit=args.limit,
+        seed=args.seed,
+        metrics=args.metrics,
     )
     results = run_evaluation(config, planner, data, args.out, bank=bank, task=task, overwrite=args.overwrite)
     print(format_summary([results.summary()]))

@@ -19,20 +19,20 @@ from drivax.evaluation.runner import BATCH
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, Flag, Scenario
-from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import Facts, Frame, Scene, SimState, Surroundings
-from drivax.tasks.actions import ActionSpace
+from drivax.simulator.types import Facts, Frame, Scene, SimState, Situation, Surroundings
+from drivax.tasks.actions import PHYSICAL, PUBLISHED
 
 Finding = dict[str, float | int | bool | str | None]
 
 #: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
 GOAL_M = 3.0
-_ACTIONS = ActionSpace()
 _READ = (
     "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
     "logged", "log_divergence_m",
 )  # fmt: skip
+#: Action spaces whose bounds the audit holds against the log.
+_SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
@@ -80,9 +80,22 @@ def _known(scenario: Scenario) -> Finding:
 class _Watch:
     """A task that only watches: nothing is learned, accumulated or ended, which keeps the program small."""
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """What the findings are made from."""
+        return frozenset(_READ)
+
     def motion(self, motion: Array, action: Array, length: Any) -> Array:
         """The kinematic bicycle under the default action space."""
-        return bicycle(motion, *_ACTIONS.command(action, length))
+        return PHYSICAL.move(motion, action, length)
+
+    def actuated(self, motion: Array, action: Array, last: Array) -> Array:
+        """The action within its bounds."""
+        return PHYSICAL.actuated(motion, action, last)
+
+    def first_action(self, history: Array, length: Any) -> Array:
+        """None."""
+        return PHYSICAL.first(history, length)
 
     def observe(self, bank: ScenarioBank, scene: Scene, agents: Any, frame: Frame) -> Mapping[str, Any]:
         """Nothing."""
@@ -99,7 +112,7 @@ class _Watch:
     def episode_start(self) -> None:
         """Nothing."""
 
-    def episode_add(self, episode: Any, state: SimState, final: Array) -> None:
+    def episode_add(self, episode: Any, found: Situation, start: Array, final: Array) -> None:
         """Nothing."""
 
 
@@ -113,23 +126,28 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) ->
         driven: Follow the log through the dynamics instead of putting ego where it was logged.
 
     Returns:
-        ``[B, 81]`` each, by the names of ``simulator.types.Facts``.
+        ``[B, 81]`` each, by the names of ``simulator.types.Facts``; and whether the action that follows the log to this
+        step is outside of an action space, ``clipped_<space>``.
     """
     simulator = Simulator(_Watch())
 
     def one(state: SimState, _: None) -> tuple[SimState, dict[str, Array]]:
-        action = jnp.clip(expert_action(bank, state.scene, _ACTIONS), -1.0, 1.0)
+        action = jnp.clip(expert_action(bank, state.scene, PHYSICAL), -1.0, 1.0)
         if driven:
             after, _transition = simulator.step(bank, state, action)
         else:
             logged = logged_motion(bank, state.scene, 1)
             after, _transition = simulator.replay(bank, state, logged, action)
-        return after, _read(after.facts)
+        clipped = {
+            name: space.clipped(expert_action(bank, state.scene, space)) for name, space in _SPACES.items()
+        }
+        return after, _read(after.facts) | clipped
 
     def episode(row: Array) -> dict[str, Array]:
         start = simulator.reset(bank, row)
+        first = _read(start.facts) | dict.fromkeys(_SPACES, jnp.zeros((), bool))
         _, later = jax.lax.scan(one, start, None, length=bank.steps - 1 - CURRENT_STEP)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), _read(start.facts), later)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
 
     return jax.vmap(episode)(index)
 
@@ -173,8 +191,16 @@ def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) ->
         if len(deviation)
         else None,
         "ignored_overlaps": int(series["ignored"].max()),
+        **{name: _share(series[name], judged) for name in _SPACES},
         "clean": not hit.any() and not off.any() and not ran_red if mapped else None,
     }
+
+
+def _share(clipped: np.ndarray[Any, Any], judged: np.ndarray[Any, Any]) -> float | None:
+    """Share of the steps between two judged ones, or from the current step, that ask for more than a space allows."""
+    steps = judged.copy()
+    steps[2:] &= judged[1:-1]
+    return _rounded(clipped[steps].mean(), 4) if steps.any() else None
 
 
 def _first(holds: np.ndarray[Any, Any]) -> int | None:

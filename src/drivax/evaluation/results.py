@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap, rate
-from drivax.metrics.episode import EVENTS, METRICS
+from drivax.metrics.catalogue import EVENTS, METRICS, Metric
 
 #: Columns of ``episodes.csv`` before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
@@ -38,6 +38,7 @@ class Results:
         motion: x, y, heading, speed per step from ``start`` on.
         start: Step of the log at which the episodes began.
         offroad_steps: Steps off the road.
+        own: Those of the metrics that are the user's own: unit, direction and text.
     """
 
     planner: str
@@ -49,6 +50,7 @@ class Results:
     motion: np.ndarray[Any, Any]
     start: int
     offroad_steps: np.ndarray[Any, Any]
+    own: Mapping[str, Metric] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.scenarios)
@@ -61,7 +63,7 @@ class Results:
         """
         clusters = np.array([row["segment"] for row in self.scenarios])
         table = {}
-        for name in METRICS:
+        for name in (*METRICS, *self.own):
             if name in NOT_SUMMARISED:
                 continue
             table[name] = interval_of(name, self.metrics[name], clusters).as_dict()
@@ -81,10 +83,15 @@ class Results:
             rows.append(row)
         return rows
 
+    def notes(self) -> dict[str, Any]:
+        """What ``run.json`` says of the user's own metrics, so that a report can head their columns."""
+        about = {n: {"unit": m.unit, "better": m.better, "text": m.text} for n, m in self.own.items()}
+        return {"own_metrics": about} if about else {}
+
     def write(self, folder: Path) -> None:
         """Writes ``episodes.csv``, ``summary.json`` and ``trajectories.npz`` into an existing folder."""
         with (folder / "episodes.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, [*KEYS, *METRICS], lineterminator="\n")
+            writer = csv.DictWriter(file, [*KEYS, *METRICS, *self.own], lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows())
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n")

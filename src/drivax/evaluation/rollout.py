@@ -20,6 +20,9 @@ from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 
+#: What the key of an episode is folded with to draw its start.
+_START = 1
+
 
 @record
 class Episodes:
@@ -39,8 +42,9 @@ class Episodes:
 
 
 def judging(task: Task) -> Task:
-    """The task as evaluation runs it: failures are recorded and the episode goes on to the end of the log."""
-    return replace(task, to_the_end=True)
+    """The task as evaluation runs it: failures are recorded, episodes go on to the end of the log, with all metrics."""
+    own = task.metrics if isinstance(task.metrics, tuple) else ()
+    return replace(task, to_the_end=True, metrics=("full", *own))
 
 
 @partial(jax.jit, static_argnames=("simulator", "start_step"))
@@ -72,7 +76,7 @@ def _episode(
     index: Array,
     key: Array,
 ) -> Episodes:
-    state = simulator.reset(bank, index, start_step, slot)
+    state = simulator.reset(bank, index, start_step, slot, jax.random.fold_in(key, _START))
     begin_key, key = jax.random.split(key)
     carry = planner.init(bank, state, begin_key)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,14 @@ import numpy as np
 from drivax.errors import DrivaxError, UsageError
 from drivax.evaluation.results import Results
 from drivax.evaluation.rollout import Episodes, drive, judging
+from drivax.metrics.catalogue import METRICS
+from drivax.metrics.selection import catalogue
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.catalogue import prepared
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.traffic import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
@@ -41,7 +46,7 @@ def evaluate(
         bank: The scenarios.
         scenarios: ``dataset``, ``scenario_id`` and ``segment`` of every row of the bank.
         task: Action space and observation that the planner was made for; the default one otherwise.
-        traffic: How the others move; they replay the log by default.
+        traffic: How the others move; they replay the log by default. What it needs is precomputed in the bank.
         start_step: Step of the log at which to begin.
         seed: Every scenario's key is ``fold_in(key(seed), row)``, so batching never changes a result.
         progress: Called with (done, total) after every batch.
@@ -50,9 +55,36 @@ def evaluate(
         UsageError: If the table and the bank disagree, or the start step leaves no action.
         DrivaxError: If the planner produced numbers that are not finite.
     """
-    task = judging(task or Task())
-    simulator = Simulator(task, traffic or LogTraffic())
-    _refuse_misfits(planner, task, bank, scenarios, start_step)
+    simulator = Simulator(task or Task(), traffic or LogTraffic())
+    return evaluate_in(
+        simulator, planner, bank, scenarios, start_step=start_step, seed=seed, progress=progress
+    )
+
+
+def evaluate_in(
+    simulator: Simulator,
+    planner: Planner,
+    bank: ScenarioBank,
+    scenarios: Sequence[Mapping[str, str]],
+    *,
+    start_step: int = CURRENT_STEP,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Results:
+    """:func:`evaluate` in a simulator of your own, whose starts may be noisy; its task is judged to the end of the log.
+
+    A noisy start is drawn from the scenario's key, so every planner has the same ones under one seed.
+
+    Raises:
+        UsageError: As :func:`evaluate`; or a planner that replays the log is to begin elsewhere.
+        DrivaxError: As :func:`evaluate`.
+    """
+    if not isinstance(simulator.task, Task):
+        raise UsageError(f"{type(simulator.task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
+    task = judging(simulator.task)
+    simulator = replace(simulator, task=task)
+    bank = prepared(simulator.traffic, bank)
+    _refuse_misfits(planner, (task, simulator.start), bank, scenarios, start_step)
     root = jax.random.key(seed)
     parts: list[Episodes] = []
     for first in range(0, len(bank), BATCH):
@@ -78,12 +110,18 @@ def evaluate(
         motion=whole.motion,
         start=start_step,
         offroad_steps=whole.offroad_steps,
+        own={name: metric for name, metric in catalogue(task.metrics).items() if name not in METRICS},
     )
 
 
 def _refuse_misfits(
-    planner: Planner, task: Task, bank: ScenarioBank, scenarios: Sequence[Mapping[str, str]], start_step: int
+    planner: Planner,
+    driven: tuple[Task, Start],
+    bank: ScenarioBank,
+    scenarios: Sequence[Mapping[str, str]],
+    start_step: int,
 ) -> None:
+    task, start = driven
     if len(scenarios) != len(bank):
         raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
     if not 0 <= start_step < bank.steps - 1:
@@ -91,6 +129,10 @@ def _refuse_misfits(
     if getattr(planner, "actions", task.actions) != task.actions:
         raise UsageError(
             f"planner {planner.name} acts in another action space than the task", cure="use the task's"
+        )
+    if planner.replays and start != LogStart():
+        raise UsageError(
+            f"planner {planner.name} replays the log and cannot begin elsewhere", cure="use expert_actions"
         )
     absent = np.flatnonzero(np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) <= 0)
     if absent.size:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
-from drivax.evaluation.runner import evaluate
+from drivax.evaluation.runner import evaluate_in
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.catalogue import make_traffic
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
 from drivax.tracking.runs import RunFolder, refuse_existing
@@ -34,9 +37,11 @@ class EvaluationConfig:
 
     planner: str
     traffic: str = "log"
+    noisy_start: bool = False
     start_step: int = CURRENT_STEP
     limit: int | None = None
     seed: int = 0
+    metrics: tuple[str, ...] = ()
 
 
 def run_evaluation(
@@ -52,7 +57,7 @@ def run_evaluation(
     """Evaluates a planner on a set and writes the run folder.
 
     Args:
-        config: Start step, seed and limit.
+        config: Traffic, starts, start step, seed and limit.
         planner: The driver.
         data: The scenarios; the first ``config.limit`` of them.
         out: Run folder; it appears after the drive.
@@ -65,11 +70,12 @@ def run_evaluation(
     bank = ScenarioBank.from_scenarios(scenarios) if bank is None else bank
     refuse_existing(Path(out), overwrite)
     with Progress(f"driving {planner.name}", "scenarios", count) as bar:
-        results = evaluate(
+        start = NoisyStart() if config.noisy_start else LogStart()
+        results = evaluate_in(
+            Simulator(_with_metrics(task or Task(), config.metrics), make_traffic(config.traffic), start),
             planner,
             bank,
             scenario_names(scenarios),
-            task=task,
             start_step=config.start_step,
             seed=config.seed,
             progress=lambda done, total: bar.update(done),
@@ -79,13 +85,19 @@ def run_evaluation(
     partial = out.parent / f".{out.name}.partial-{os.getpid()}"
     notes = {"kind": "evaluation", "planner": results.planner, "traffic": results.traffic}
     try:
-        RunFolder.create(partial, config, data=[data], overwrite=True, **notes)
+        RunFolder.create(partial, config, data=[data], overwrite=True, **notes, **results.notes())
         results.write(partial)
         shutil.rmtree(out, ignore_errors=True)
         partial.rename(out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return results
+
+
+def _with_metrics(task: Task, more: tuple[str, ...]) -> Task:
+    """The task with further metrics."""
+    given = task.metrics if isinstance(task.metrics, tuple) else (task.metrics,)
+    return replace(task, metrics=tuple(dict.fromkeys((*given, *more)))) if more else task
 
 
 def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:

@@ -9,18 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import SimState
-
-#: Metrics of finished episodes that training logs.
-ROLLOUT_METRICS = (
-    "success", "accuracy", "accuracy_at_fault", "collision", "at_fault_collision", "offroad", "red_light",
-    "progress_ratio", "comfortable", "ttc_ok", "vmax_score", "nuplan_score", "distance",
-)  # fmt: skip
+from drivax.simulator.types import Frame, SimState
 
 
 @record
@@ -46,7 +41,7 @@ class Rollout:
     """
 
     observation: dict[str, Array]
-    choice: Float[Array, "*time batch 2"]
+    choice: Float[Array, "*time batch D"]
     extra: dict[str, Array]
     reward: Float[Array, "*time batch"]
     terminated: Bool[Array, "*time batch"]
@@ -63,7 +58,8 @@ def start_environments(simulator: Simulator, bank: ScenarioBank, key: Array, cou
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
     step = _start(bank, index, jax.random.randint(step_key, (count,), CURRENT_STEP, bank.steps - 2))
-    state = jax.vmap(simulator.reset, in_axes=(None, 0, 0))(bank, index, step)
+    keys = jax.random.split(jax.random.fold_in(key, 1), count)
+    state = jax.vmap(simulator.reset, in_axes=(None, 0, 0, None, 0))(bank, index, step, 0, keys)
     observation = jax.vmap(simulator.observe, in_axes=(None, 0))(bank, state.scene)
     return Environments(state, jnp.zeros(count, bool), dict(observation))
 
@@ -84,16 +80,22 @@ def collect(
         ``"<name>"`` the sum and ``"<name>/n"`` the number of episodes that define it.
     """
     count = environments.over.shape[0]
+    begin_all = jax.vmap(simulator.scene, in_axes=(None, 0, 0, None, 0))
     step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
     observe_all = jax.vmap(simulator.observe, in_axes=(None, 0))
+    everyone = jax.vmap(simulator.now, in_axes=(None, 0))
 
-    def one(carry: tuple[Environments, Array], _: None) -> tuple[Any, Any]:
-        now, key = carry
+    def one(carry: tuple[Environments, Frame, Array], _: None) -> tuple[Any, Any]:
+        now, seen, key = carry
         key, act_key, index_key, start_key = jax.random.split(key, 4)
         choice, action, extra = actor(now.observation, act_key)
         index = jax.random.randint(index_key, (count,), 0, len(bank))
         start = _start(bank, index, jax.random.randint(start_key, (count,), CURRENT_STEP, latest_start + 1))
-        state, transition = step_all(bank, now.state, action, now.over, index, start)
+        keys = jax.random.split(
+            jax.random.fold_in(start_key, 1), count
+        )  # not computed where starts are logged
+        fresh = begin_all(bank, index, start, 0, keys)
+        state, transition = step_all(bank, now.state, action, now.over, fresh, seen)
         row = Rollout(
             observation=now.observation,
             choice=choice,
@@ -106,9 +108,10 @@ def collect(
         done = transition.terminated | transition.truncated
         tally = _tally(bank, state, transition.reward_terms, done, now.over)
         following = Environments(state, done, dict(observe_all(bank, state.scene)))
-        return (following, key), (row, tally)
+        return (following, everyone(bank, state.scene), key), (row, tally)
 
-    (environments, _), (rollout, tally) = jax.lax.scan(one, (environments, key), None, steps)
+    first = (environments, everyone(bank, environments.state.scene), key)
+    (environments, _, _), (rollout, tally) = jax.lax.scan(one, first, None, steps)
     return environments, rollout, jax.tree.map(lambda leaf: leaf.sum(axis=0), tally)
 
 
@@ -120,19 +123,20 @@ def _start(bank: ScenarioBank, index: Array, step: Array) -> Array:
 def _tally(
     bank: ScenarioBank, state: SimState, terms: dict[str, Array], done: Array, over: Array
 ) -> dict[str, Array]:
-    """Sums over the batch: metrics of episodes that end now, reward terms of steps that count."""
+    """Sums over the batch: the task's metrics of episodes that end now, reward terms of steps that count."""
+    logged = [name for name in state.episode.selection.names if name not in CODES]
 
     def of_episodes() -> dict[str, Array]:
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, state)
         sums = {}
-        for name in ROLLOUT_METRICS:
+        for name in logged:
             counts = done & values[name].defined
             sums[name] = jnp.sum(jnp.where(counts, values[name].value, 0.0))
             sums[f"{name}/n"] = counts.sum().astype(jnp.float32)
         return sums
 
     # Most steps end no episode; the branch is on the whole batch, so it really is skipped.
-    nothing = {name: jnp.zeros(()) for metric in ROLLOUT_METRICS for name in (metric, f"{metric}/n")}
+    nothing = {name: jnp.zeros(()) for metric in logged for name in (metric, f"{metric}/n")}
     totals = jax.lax.cond(done.any(), of_episodes, lambda: nothing)
     totals |= {"episodes": done.sum().astype(jnp.float32), "steps": (~over).sum().astype(jnp.float32)}
     for name, term in terms.items():

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from drivax.errors import UsageError
+from drivax.learning.algorithm import AlgorithmConfig
 from drivax.learning.ppo import PpoConfig
+from drivax.simulator.starts import LogStart, NoisyStart
+from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
 
 
@@ -15,18 +19,24 @@ class TrainConfig:
     Attributes:
         total_steps: Environment steps; rounded up to whole iterations.
         seed: Of networks, environments and exploration.
-        task: Actions, observation, reward, termination.
+        task: Actions, observation, reward, termination, and the metrics that are logged on the way.
         algorithm: What learns, and how.
+        start: How episodes begin while learning; validation begins as logged.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
     """
 
     total_steps: int = 2_000_000
     seed: int = 0
-    task: Task = field(default_factory=Task)
-    algorithm: PpoConfig = field(default_factory=PpoConfig)
+    task: Task = field(default_factory=lambda: Task(metrics="training"))
+    algorithm: PpoConfig | AlgorithmConfig = field(default_factory=PpoConfig)
+    start: LogStart | NoisyStart = field(default_factory=LogStart)
     evaluate_every: int = 0
     checkpoint_every: int = 20
+
+    def __post_init__(self) -> None:
+        if isinstance(self.task.actions, DirectState):
+            raise UsageError("policies cannot learn in direct_state", cure="choose a space in [-1, 1]")
 
     @property
     def iterations(self) -> int:

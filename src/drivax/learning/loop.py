@@ -14,9 +14,8 @@ import numpy as np
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
+from drivax.learning.algorithm import Learner, LearnerState
 from drivax.learning.config import TrainConfig
-from drivax.learning.policies import policy_planner
-from drivax.learning.ppo import Ppo, PpoState
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
@@ -70,9 +69,9 @@ def train(
     if resume:
         config = folder.config(TrainConfig)
     bank = ScenarioBank.from_scenarios(data)
-    ppo = Ppo(config.algorithm, Simulator(config.task), bank, config.iterations)
+    learner = config.algorithm.build(Simulator(config.task, start=config.start), bank, config.iterations)
     checkpoints = Checkpoints(folder.checkpoints)
-    state = _first_state(ppo, bank, config, checkpoints if resume else None)
+    state = _first_state(learner, bank, config, checkpoints if resume else None)
     held_out = None if validation is None else Validation.of(validation)
     begin = int(state.iteration)
     with (
@@ -80,7 +79,7 @@ def train(
         Progress("training", "steps", _steps(config, config.iterations)) as progress,
     ):
         progress.update(_steps(config, begin))
-        _iterate(config, ppo, bank, state, _Outputs(log, progress, checkpoints, held_out))
+        _iterate(config, learner, bank, state, _Outputs(log, progress, checkpoints, held_out))
     return folder
 
 
@@ -92,8 +91,10 @@ class _Outputs:
     validation: Validation | None
 
 
-def _iterate(config: TrainConfig, ppo: Ppo, bank: ScenarioBank, state: PpoState, outputs: _Outputs) -> None:
-    step = jax.jit(ppo.iterate, donate_argnums=1)
+def _iterate(
+    config: TrainConfig, learner: Learner, bank: ScenarioBank, state: LearnerState, outputs: _Outputs
+) -> None:
+    step = jax.jit(learner.iterate, donate_argnums=1)
     for iteration in range(int(state.iteration) + 1, config.iterations + 1):
         began = time.perf_counter()
         state, raw = step(bank, state)
@@ -104,7 +105,7 @@ def _iterate(config: TrainConfig, ppo: Ppo, bank: ScenarioBank, state: PpoState,
         due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
         score = None
         if due and outputs.validation is not None:
-            score, seen = validate(config, ppo, state, outputs.validation)
+            score, seen = validate(config, learner, state, outputs.validation)
             row |= seen
         outputs.log.write(done, row)
         note = f"success {row.get('rollout/success', float('nan')):.2f}"
@@ -114,10 +115,10 @@ def _iterate(config: TrainConfig, ppo: Ppo, bank: ScenarioBank, state: PpoState,
 
 
 def validate(
-    config: TrainConfig, ppo: Ppo, state: PpoState, validation: Validation
+    config: TrainConfig, learner: Learner, state: LearnerState, validation: Validation
 ) -> tuple[float, dict[str, float]]:
     """Closed-loop score of the policy's mode on held-out scenarios, and what to log."""
-    planner = policy_planner(ppo, state.parameters)
+    planner = learner.planner(state.parameters, "policy", samples=False)
     results = evaluate(planner, validation.bank, validation.names, task=config.task)
     # Full scores where there are any; partial ones are never mixed with them.
     name = next(n for n in ("vmax_score", "vmax_score_partial") if np.isfinite(results.metrics[n]).any())
@@ -134,7 +135,8 @@ def logged(raw: Mapping[str, Any]) -> dict[str, float]:
     """Means to log from the sums of an iteration: metrics per episode that defines them, rewards per step."""
     sums = {name.removeprefix("rollout/"): float(v) for name, v in raw.items() if name.startswith("rollout/")}
     row = {name: float(value) for name, value in raw.items() if not name.startswith("rollout/")}
-    row["rollout/episodes"] = sums["episodes"]
+    if "episodes" in sums:
+        row["rollout/episodes"] = sums["episodes"]
     for name, value in sums.items():
         if name.startswith("reward/"):
             row[name] = value / max(sums["steps"], 1.0)
@@ -147,11 +149,13 @@ def _steps(config: TrainConfig, iteration: int) -> int:
     return iteration * config.algorithm.steps_per_iteration
 
 
-def _first_state(ppo: Ppo, bank: ScenarioBank, config: TrainConfig, stored: Checkpoints | None) -> PpoState:
+def _first_state(
+    learner: Learner, bank: ScenarioBank, config: TrainConfig, stored: Checkpoints | None
+) -> LearnerState:
     if stored is not None and stored.steps():
-        template = jax.eval_shape(ppo.init, bank, jax.random.key(config.seed))
+        template = jax.eval_shape(learner.init, bank, jax.random.key(config.seed))
         return stored.restore(template)
-    return jax.jit(ppo.init)(bank, jax.random.key(config.seed))
+    return jax.jit(learner.init)(bank, jax.random.key(config.seed))
 
 
 def _open(

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import jax
-from flax import nnx
 
 from drivax.learning.config import TrainConfig
-from drivax.learning.ppo import Ppo
-from drivax.planners.network import NetworkPlanner
+from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
@@ -18,15 +15,9 @@ from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder
 
 
-def policy_planner(ppo: Ppo, parameters: Any, name: str = "policy", samples: bool = False) -> NetworkPlanner:
-    """The policy of PPO parameters as a planner; the value network stays behind."""
-    graph, weights = nnx.split(ppo.network(parameters).policy)
-    return NetworkPlanner(weights, graph, name, samples)
-
-
 def load_policy(
     run: str | Path, bank: ScenarioBank, *, step: int | None = None, samples: bool = False
-) -> tuple[NetworkPlanner, Task]:
+) -> tuple[Planner, Task]:
     """The policy of a training run, and the task that it was trained for.
 
     Args:
@@ -40,9 +31,9 @@ def load_policy(
     """
     folder = RunFolder.open(run)
     config = folder.config(TrainConfig)
-    ppo = Ppo(config.algorithm, Simulator(config.task), bank, config.iterations)
+    learner = config.algorithm.build(Simulator(config.task), bank, config.iterations)
     checkpoints = Checkpoints(folder.checkpoints)
-    template = jax.eval_shape(lambda key: ppo.init(bank, key).parameters, jax.random.key(0))
+    template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
     chosen = checkpoints.best() if step is None else step
     parameters = checkpoints.restore(template, chosen, part=".parameters")
-    return policy_planner(ppo, parameters, folder.path.name, samples), config.task
+    return learner.planner(parameters, folder.path.name, samples), config.task

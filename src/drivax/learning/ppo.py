@@ -14,6 +14,7 @@ from jaxtyping import Array
 from drivax.learning.collector import Environments, Rollout, collect, start_environments
 from drivax.networks.actor_critic import ActorCritic, ActorCriticConfig
 from drivax.networks.encoders import group_spec
+from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
 from drivax.scenario.bank import ScenarioBank
@@ -69,6 +70,10 @@ class PpoConfig:
         """Environment steps of one iteration."""
         return self.environments * self.unroll
 
+    def build(self, simulator: Simulator, bank: ScenarioBank, iterations: int) -> Ppo:
+        """PPO on a simulator."""
+        return Ppo(self, simulator, bank, iterations)
+
 
 @record
 class PpoState:
@@ -86,8 +91,9 @@ class Ppo:
 
     def __init__(self, config: PpoConfig, simulator: Simulator, bank: ScenarioBank, iterations: int) -> None:
         self.config, self.simulator = config, simulator
-        scene = jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank)
-        self.spec = group_spec(scene)
+        scene = jax.eval_shape(lambda b: Simulator(simulator.task, simulator.traffic).scene(b, 0, 10), bank)
+        self.spec = group_spec(jax.eval_shape(simulator.observe, bank, scene))
+        self.actions = scene.action.shape[0]
         updates = iterations * config.epochs * config.minibatches
         schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
         self.optimiser = optax.chain(
@@ -96,7 +102,7 @@ class Ppo:
         self.graph = nnx.graphdef(self._network(jax.random.key(0)))
 
     def _network(self, key: Array) -> ActorCritic:
-        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key))
+        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), self.actions)
 
     def init(self, bank: ScenarioBank, key: Array) -> PpoState:
         """The state before the first iteration."""
@@ -110,6 +116,11 @@ class Ppo:
     def network(self, parameters: Any) -> ActorCritic:
         """The network with these parameters."""
         return nnx.merge(self.graph, parameters)
+
+    def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
+        """The policy as a planner; the value network stays behind."""
+        graph, weights = nnx.split(self.network(parameters).policy)
+        return NetworkPlanner(weights, graph, name, samples)
 
     def iterate(self, bank: ScenarioBank, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
         """One iteration: collect, then update. Pure; jit it with the state donated.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -59,11 +60,22 @@ def _weights(window: int, order: int, derivative: int, where: float) -> np.ndarr
 
 @record
 class ComfortSteps:
-    """The last eight steps of a window, oldest first: whether each is comfortable, and what was measured."""
+    """Steps on end, oldest first: whether each is comfortable, and what was measured."""
 
-    comfortable: Bool[Array, " 8"]
-    jerk_mps3: Float[Array, " 8"]
-    lateral_mps2: Float[Array, " 8"]
+    comfortable: Bool[Array, " steps"]
+    jerk_mps3: Float[Array, " steps"]
+    lateral_mps2: Float[Array, " steps"]
+
+
+def judge_trip(motion: Float[Array, "time 4"]) -> ComfortSteps:
+    """Judges every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
+
+    An episode judges the same, step by step; nothing before row 8 can be judged as a centred window asks for.
+    """
+    rows = WINDOW + 1
+    windows = jnp.arange(len(motion) - rows + 1)[:, None] + jnp.arange(rows)
+    judged = jax.vmap(judge_comfort)(motion[windows])
+    return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), judged)
 
 
 def judge_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:

@@ -24,6 +24,8 @@ VMAX_WEIGHTS = {**NUPLAN_WEIGHTS, "lane_keeping": 3.0}
 NUPLAN_GATES = ("at_fault_collision", "offroad")
 VMAX_GATES = (*NUPLAN_GATES, "red_light")
 _PASSES = ("making_progress", "direction")
+NUPLAN_INPUTS = (*NUPLAN_WEIGHTS, *NUPLAN_GATES, *_PASSES)
+VMAX_INPUTS = (*VMAX_WEIGHTS, *VMAX_GATES, *_PASSES)
 
 
 def score(

@@ -10,9 +10,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.networks.distributions import SquashedGaussian
-from drivax.networks.encoders import Groups, GroupSpec, MlpConfig, MlpEncoder
-
-_ACTIONS = 2
+from drivax.networks.encoders import EncoderConfig, Groups, GroupSpec, MlpConfig
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class ActorCriticConfig:
         first_scale: Standard deviation of an untrained policy before squashing.
     """
 
-    encoder: MlpConfig = field(default_factory=MlpConfig)
+    encoder: MlpConfig | EncoderConfig = field(default_factory=MlpConfig)
     head: tuple[int, ...] = (64,)
     first_scale: float = 0.3
 
@@ -46,24 +44,25 @@ class _Head(nnx.Module):
 
 
 class Policy(nnx.Module):
-    """Observation -> distribution over actions."""
+    """Observation -> distribution over actions of so many numbers."""
 
-    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
-        self.encoder = MlpEncoder(config.encoder, spec, rngs)
-        self.head = _Head(self.encoder.width, config.head, 2 * _ACTIONS, 0.01, rngs)
+    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: int = 2) -> None:
+        self.actions = actions
+        self.encoder = config.encoder.build(spec, rngs)
+        self.head = _Head(self.encoder.width, config.head, 2 * actions, 0.01, rngs)
         self.shift = math.log(math.expm1(config.first_scale))
 
     def __call__(self, groups: Groups) -> SquashedGaussian:
         """The action distribution; near zero mean and the first standard deviation before training."""
         raw = self.head(self.encoder(groups))
-        return SquashedGaussian.from_parameters(raw.at[..., _ACTIONS:].add(self.shift))
+        return SquashedGaussian.from_parameters(raw.at[..., self.actions :].add(self.shift))
 
 
 class Value(nnx.Module):
     """Observation -> value."""
 
     def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
-        self.encoder = MlpEncoder(config.encoder, spec, rngs)
+        self.encoder = config.encoder.build(spec, rngs)
         self.head = _Head(self.encoder.width, config.head, 1, 1.0, rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch"]:
@@ -74,6 +73,6 @@ class Value(nnx.Module):
 class ActorCritic(nnx.Module):
     """A policy and a value with an encoder each."""
 
-    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
-        self.policy = Policy(config, spec, rngs)
+    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: int = 2) -> None:
+        self.policy = Policy(config, spec, rngs, actions)
         self.value = Value(config, spec, rngs)

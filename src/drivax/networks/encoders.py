@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,29 @@ Groups = Mapping[str, Array]
 GroupSpec = Mapping[str, tuple[int, ...]]
 
 _ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
+
+
+@runtime_checkable
+class Encoder(Protocol):
+    """An ``nnx.Module`` whose whole state are ``nnx.Param``: it is a function of its parameters and its input."""
+
+    @property
+    def width(self) -> int:
+        """Size of the embedding."""
+        ...
+
+    def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
+        """The embedding of one observation or a batch; masked rows never matter."""
+        ...
+
+
+@runtime_checkable
+class EncoderConfig(Protocol):
+    """Settings of an encoder; own ones are frozen dataclasses, named in YAML as ``kind: package.module:Name``."""
+
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> Encoder:
+        """An encoder of observations with these groups."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -35,13 +58,17 @@ class MlpConfig:
     hidden: tuple[int, ...] = (256, 256)
     activation: Literal["relu", "tanh", "gelu", "silu"] = "relu"
 
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MlpEncoder:
+        """The encoder with fresh parameters."""
+        return MlpEncoder(self, spec, rngs)
+
 
 class MlpEncoder(nnx.Module):
     """Flattens or pools every group (masked rows never matter), then applies dense layers."""
 
     def __init__(self, config: MlpConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         self.pools = bool(config.rows)
-        self.names = tuple(sorted(name for name in spec if not self._is_mask(name, spec)))
+        self.names = group_names(spec)
         self.shapes = {name: tuple(spec[name]) for name in self.names}
         self.activation = config.activation
         width, shared = 0, {}
@@ -57,10 +84,6 @@ class MlpEncoder(nnx.Module):
         self.shared = nnx.Dict(shared)
         self.layers = _layers(width, config.hidden, rngs)
         self.width = config.hidden[-1]
-
-    @staticmethod
-    def _is_mask(name: str, spec: GroupSpec) -> bool:
-        return name.endswith("_mask") and name.removesuffix("_mask") in spec
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Encodes one observation or a batch of them."""
@@ -102,3 +125,8 @@ def _layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
 def group_spec(observation: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     """Shapes of the groups of one (unbatched) observation."""
     return {name: tuple(value.shape) for name, value in observation.items()}
+
+
+def group_names(spec: GroupSpec) -> tuple[str, ...]:
+    """The groups that are no mask of another, in alphabetical order."""
+    return tuple(sorted(n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec)))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from drivax.errors import UsageError
+from drivax.named import find_named, is_dotted
 from drivax.planners.idm import IdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.search import SearchPlanner
@@ -22,7 +24,19 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
 def make_planner(name: str) -> Planner:
     """The planner of a name, for the default action space.
 
+    Args:
+        name: One of :data:`PLANNERS`, or ``package.module:name`` of a planner of your own, or of what makes one.
+
     Raises:
         KeyError: If there is none.
+        UsageError: If a dotted name leads to no planner.
     """
-    return PLANNERS[name]()
+    if not is_dotted(name):
+        return PLANNERS[name]()
+    found = find_named(name)
+    made = found if isinstance(found, Planner) and not isinstance(found, type) else None
+    if made is None and callable(found):
+        made = found()
+    if not isinstance(made, Planner):
+        raise UsageError(f"{name!r} makes no planner", cure="see drivax.planners.planner.Planner")
+    return made

@@ -44,7 +44,7 @@ class Planner(Protocol):
         situation: Situation,
         observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:
         """An action of the task's action space, and the carry for the next step."""
         ...
 

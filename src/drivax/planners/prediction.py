@@ -65,16 +65,15 @@ class Trend:
         known = (now[:, AGENT_VALID] > 0) & (before[:, AGENT_VALID] > 0) & (scene.step >= _PAST)
         turn = _turn(before[:, AGENT_COS : AGENT_SIN + 1], now[:, AGENT_COS : AGENT_SIN + 1])
         faster = _length(now[:, 5:7]) - _length(before[:, 5:7])
-        still = jnp.zeros(bank.parked.shape[1])
+        parked = bank.agent_box.shape[1] - len(now)
 
         def whole(moving: Array) -> Array:
-            return jnp.concatenate([moving, still])
+            return jnp.pad(moving, ((0, parked), *((0, 0),) * (moving.ndim - 1)))
 
-        ahead = jnp.concatenate([now[:, AGENT_COS : AGENT_SIN + 1], bank.parked[scene.index, :, 2:4]])
         return cls(
-            ahead,
+            whole(now[:, AGENT_COS : AGENT_SIN + 1]),
             whole(_length(now[:, 5:7])),
-            jnp.concatenate([now[:, AGENT_VALID] > 0, still > 1.0]),
+            whole(now[:, AGENT_VALID] > 0),
             whole(jnp.where(known, turn, 0.0) / (_PAST * DT_S)),
             whole(jnp.where(known, faster, 0.0) / (_PAST * DT_S)),
             whole(jnp.zeros(now.shape[0])),

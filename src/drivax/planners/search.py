@@ -26,7 +26,7 @@ from drivax.scenario.record import record, static
 from drivax.simulator.dynamics import GRIP_MPS2
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import SimState, Situation
-from drivax.tasks.actions import ActionSpace
+from drivax.tasks.actions import ActionSpace, Physical
 
 #: Lateral offsets from the route to go to, m, and accelerations that are not exceeded on the way, m/s2.
 _SHIFTS = (0.0, -1.2, 1.2, -2.4, 2.4, -3.5, 3.5)
@@ -68,7 +68,7 @@ class SearchPlanner:
     lanes, by passing closely, by losing way and by braking.
     """
 
-    actions: ActionSpace = static(default=ActionSpace())
+    actions: ActionSpace = static(default=Physical())
     parameters: IdmParameters = static(
         default=IdmParameters(headway_s=1.2, acceleration_mps2=2.0, comfortable_braking_mps2=2.5)
     )
@@ -87,14 +87,14 @@ class SearchPlanner:
         situation: Situation,
         observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:
         """The first step of the cheapest manoeuvre."""
         scene, frame = situation.scene, situation.surroundings.frame
         me, speed = frame.box[scene.slot], scene.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
         wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
-        stop = stop_line_m(bank, situation, path, there, offsets)
+        stop = stop_line_m(bank, situation)
         trend = carry.updated(frame)
         others = Others.near(bank, scene, frame, trend, (path, there, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
@@ -115,13 +115,16 @@ class SearchPlanner:
 
         costs, firsts, _ = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
         best = firsts.reshape(-1, 2)[jnp.argmin(costs)]
-        return jnp.clip(self.actions.action(best[0], best[1], me[LENGTH]), -1.0, 1.0), trend
+        motion = scene.history[-1]
+        action = self.actions.action(motion, best[0], best[1], me[LENGTH])
+        return self.actions.actuated(motion, action, scene.action), trend
 
     def _driven(
         self, line: Array, there: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
     ) -> tuple[Float[Array, "C H 4"], Float[Array, " C"], Float[Array, "C 2"]]:
         """Poses along a line under each cap, the way made, and the first acceleration and curvature."""
         me, start, wanted, stop = ego
+        sharpest = self.actions.sharpest(me[LENGTH])
         rear, leader_speed = jax.vmap(lambda now: _corridor(line, there, offsets, others, now, me))(
             (others.box, others.speed)
         )
@@ -142,7 +145,7 @@ class SearchPlanner:
                 a = jnp.minimum(idm_acceleration(v, hurried, gap, leader_v, self.parameters), cap)
                 aim = jnp.minimum(way + jnp.clip(0.5 * v + 2.5, 3.0, 14.0), left_m)
                 k = pursuit(pose, at(line, offsets, aim)[:2] - pose[:2])
-                grip = jnp.minimum(GRIP_MPS2 / jnp.maximum(v * v, 1e-3), self.actions.steering)
+                grip = jnp.minimum(GRIP_MPS2 / jnp.maximum(v * v, 1e-3), sharpest)
                 k = jnp.clip(k, -grip, grip)
                 slower = jnp.maximum(v + a * STEP_S, 0.0)
                 moved = (v + slower) / 2 * STEP_S

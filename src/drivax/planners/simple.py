@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 from drivax.planners.planner import Memoryless
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record, static
-from drivax.simulator.dynamics import follow
 from drivax.simulator.types import Scene, SimState, Situation
-from drivax.tasks.actions import ActionSpace
+from drivax.tasks.actions import ActionSpace, Physical
 
 
 def logged_motion(bank: ScenarioBank, scene: Scene, ahead: int) -> Float[Array, "4"]:
@@ -30,17 +29,17 @@ def logged_motion(bank: ScenarioBank, scene: Scene, ahead: int) -> Float[Array, 
     return jnp.where(row[AGENT_VALID] > 0, motion, scene.history[-1])
 
 
-def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Float[Array, "2"]:
-    """The action that follows the log from here; what lies outside [-1, 1] would be clipped by the dynamics."""
-    command = follow(scene.history[-1], logged_motion(bank, scene, 1), logged_motion(bank, scene, 2))
-    return actions.action(*command, bank.agent_box[scene.index, scene.slot, 0])
+def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Float[Array, " D"]:
+    """The action that follows the log from here; not clipped, so that ``actions.clipped`` can say what would be."""
+    ahead, beyond = logged_motion(bank, scene, 1), logged_motion(bank, scene, 2)
+    return actions.expert(scene.history[-1], ahead, beyond, bank.agent_box[scene.index, scene.slot, 0])
 
 
 @record
 class Expert(Memoryless):
     """The log. ``expert`` replays it exactly; ``expert_actions`` drives it through the dynamics."""
 
-    actions: ActionSpace = static(default=ActionSpace())
+    actions: ActionSpace = static(default=Physical())
     replays: bool = static(default=True)
 
     @property
@@ -56,15 +55,17 @@ class Expert(Memoryless):
         situation: Situation,
         observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:
         """Follows the log."""
-        return jnp.clip(expert_action(bank, state.scene, self.actions), -1.0, 1.0), carry
+        action, scene = expert_action(bank, state.scene, self.actions), state.scene
+        return self.actions.actuated(scene.history[-1], action, scene.action), carry
 
 
 @record
 class ConstantVelocity(Memoryless):
     """Keeps speed and heading."""
 
+    actions: ActionSpace = static(default=Physical())
     name: str = static(default="constant_velocity")
     replays: bool = static(default=False)
 
@@ -76,9 +77,11 @@ class ConstantVelocity(Memoryless):
         situation: Situation,
         observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
+    ) -> tuple[Float[Array, " D"], Any]:
         """No acceleration, no curvature."""
-        return jnp.zeros(2), carry
+        scene, zero = state.scene, jnp.zeros(())
+        length_m = bank.agent_box[scene.index, scene.slot, 0]
+        return self.actions.action(scene.history[-1], zero, zero, length_m), carry
 
 
 @record
@@ -96,6 +99,6 @@ class RandomActions(Memoryless):
         situation: Situation,
         observation: Any,
         key: Array,
-    ) -> tuple[Float[Array, "2"], Any]:
-        """Two independent numbers in [-1, 1)."""
-        return jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0), carry
+    ) -> tuple[Float[Array, " D"], Any]:
+        """Independent numbers in [-1, 1)."""
+        return jax.random.uniform(key, state.scene.action.shape, minval=-1.0, maxval=1.0), carry

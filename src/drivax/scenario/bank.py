@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError, DrivaxError
+from drivax.geometry.angles import wrap
 from drivax.scenario.record import record, static
-from drivax.scenario.schema import Flag, RoadKind, Scenario
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
 
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
@@ -26,41 +27,59 @@ CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE):
 
 AGENT_X, AGENT_Y, AGENT_Z, AGENT_COS, AGENT_SIN, AGENT_VX, AGENT_VY, AGENT_VALID = range(8)
 ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range(7)
-ROAD_X, ROAD_Y, ROAD_DX, ROAD_DY, ROAD_LENGTH, ROAD_KIND, ROAD_LIMIT, ROAD_CURVATURE = range(8)
+#: A stop line: middle, direction of its lane there, half length, height, direction of the lane's end, whether that end
+#: is more than 45 deg to the right, arc length along route 0 where a lane of that leads over it (else very large).
+(
+    LIGHT_X, LIGHT_Y, LIGHT_COS, LIGHT_SIN, LIGHT_HALF, LIGHT_Z, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, LIGHT_ARC,
+) = range(10)  # fmt: skip
+NEVER_M = 1e6
+#: Steps in a word of ``parked_when``.
+WORD = 32
+#: Layers of observed pieces of road; rows that hold none are on no layer.
+ROAD_LANE, ROAD_EDGE, ROAD_AREA, ROAD_NONE = range(4)
 
 
 @record
 class ScenarioBank:
-    """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, P parked ones, G grid cells a side.
+    """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, S slots of a frame, G grid cells a side.
+
+    In a frame the parked agents of a scenario come right behind its own moving ones, so that the slots of a frame are
+    as many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
 
     Attributes:
         agents: x, y, z, cos, sin, vx, vy, valid of moving agents; slot 0 is ego.
-        agent_box: Length, width, height, kind.
-        parked: x, y, cos, sin, length, width, z, kind.
-        light_line: Stop line x, y, x, y, height, lane heading, exit heading, on-route flag.
+        agent_box: Length, width, height, kind of everyone.
+        parked: Rows like those of ``agents``, for the slots of parked ones.
+        parked_when: When each of them is there: bit ``t % 32`` of word ``t // 32``; never for slots of moving agents.
+        light_line: Stop lines, see ``LIGHT_X`` to ``LIGHT_ARC``.
         edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
-        lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index, corridor flag of car-lane segments,
-            sorted by cell. The corridor is the route's lanes and their same-direction neighbours.
+        lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
+            added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.sides.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
         log_progress: Arc length of the logged ego along route 0.
         log_ahead: Distance that the logged ego still drives.
-        road: Observation pieces in order of rank: x, y, direction, length, kind, limit (-1), curvature.
+        road: Observation pieces in order of rank: x, y, direction, length, layer (``ROAD_LANE``, ...), limit (-1).
+        road_at: What decides which of them are seen: x, y, layer.
         flags: ``scenario.schema.Flag`` bits.
+        extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
+        paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
+        given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
+        trimmed: Whether padding that no scenario uses was cut (static).
     """
 
     agents: Float[Array, "N T A 8"]
-    agent_box: Float[Array, "N A 4"]
-    parked: Float[Array, "N P 8"]
-    parked_valid: Bool[Array, "N T P"]
-    light_line: Float[Array, "N L 8"]
+    agent_box: Float[Array, "N S 4"]
+    parked: Float[Array, "N S 8"]
+    parked_when: UInt[Array, "N W S"]
+    light_line: Float[Array, "N 10 L"]
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
-    lanes: Float[Array, "N 9 C"]
+    lanes: Float[Array, "N 8 C"]
     grid_edge: Int[Array, "N cells1"]
     grid_lane: Int[Array, "N cells1"]
     grid_side: Int[Array, "N cells"]
@@ -71,13 +90,17 @@ class ScenarioBank:
     goal: Float[Array, "N 2"]
     log_progress: Float[Array, "N T"]
     log_ahead: Float[Array, "N T"]
-    road: Float[Array, "N O 8"]
-    road_rows: Int[Array, " N"]
+    road: Float[Array, "N O 7"]
+    road_at: Float[Array, "N 3 O"]
     flags: UInt[Array, " N"]
+    extension: Float[Array, "N A X 2"]
     cell_m: float = static()
     edge_run: int = static()
     lane_run: int = static()
     long_ego: bool = static()
+    trimmed: bool = static()
+    paths: Any = None
+    given: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -141,19 +164,21 @@ def _used(mask: Any, trim: bool, multiple: int = 8) -> int:
 def _stack(
     scenarios: Sequence[Scenario], trim: bool
 ) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
-    arrays = _stack_agents(scenarios, trim) | _stack_routes(scenarios) | _stack_lights(scenarios, trim)
+    arrays = _stack_agents(scenarios, trim) | _stack_routes(scenarios)
+    arrays |= _stack_lights(scenarios, trim) | _stack_road(scenarios, trim)
     maps, static = _stack_maps(scenarios, trim)
     reach = np.hypot(arrays["agent_box"][:, 0, 0], arrays["agent_box"][:, 0, 1]) / 2
     capacity = scenarios[0].capacity
     # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
     static |= {"cell_m": capacity.cell_m, "long_ego": bool((reach + 3.0 > capacity.cell_m - 2.0).any())}
+    static["trimmed"] = trim
     return arrays | maps, static
 
 
 def _stack_agents(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     valid = _column(scenarios, "agent_valid")
-    slots = max(1, _used(valid.any(1), trim))
-    heading = _column(scenarios, "agent_heading")
+    count = max(1, _used(valid.any(1), trim))
+    heading, size = _column(scenarios, "agent_heading"), _column(scenarios, "agent_size")
     agents = np.concatenate(
         [
             _column(scenarios, "agent_xy"),
@@ -165,30 +190,52 @@ def _stack_agents(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.nda
         ],
         -1,
         dtype=np.float32,
-    )[:, :, :slots]
-    size, kind = _column(scenarios, "agent_size"), _column(scenarios, "agent_kind")
-    parked_valid = _column(scenarios, "parked_valid")
-    places = _used(parked_valid.any(1), trim)
-    parked_heading = _column(scenarios, "parked_heading")[..., None]
-    parked = np.concatenate(
-        [
-            _column(scenarios, "parked_xy"),
-            np.cos(parked_heading),
-            np.sin(parked_heading),
-            _column(scenarios, "parked_size")[..., :2],
-            _column(scenarios, "parked_z")[..., None],
-            _column(scenarios, "parked_kind")[..., None],
-        ],
-        -1,
-        dtype=np.float32,
-    )
+    )[:, :, :count]
+    box = np.concatenate([size, _column(scenarios, "agent_kind")[..., None]], -1, dtype=np.float32)[:, :count]
     return {
         "agents": agents,
-        "agent_box": np.concatenate([size, kind[..., None]], -1, dtype=np.float32)[:, :slots],
-        "parked": parked[:, :places],
-        "parked_valid": parked_valid[:, :, :places],
+        "extension": _column(scenarios, "agent_extension")[:, :count],
         "flags": _column(scenarios, "flags"),
+        **_stack_parked(scenarios, trim, _ends(valid.any(1)), box),
     }
+
+
+def _stack_parked(
+    scenarios: Sequence[Scenario], trim: bool, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
+) -> dict[str, np.ndarray[Any, Any]]:
+    """Parked agents, each scenario's from its slot ``first`` on, and everyone's box."""
+    valid, heading = _column(scenarios, "parked_valid"), _column(scenarios, "parked_heading")
+    count = _ends(valid.any(1))
+    slots = -(-int((first + count).max()) // 8) * 8 if trim else box.shape[1] + valid.shape[2]
+    slots = max(slots, box.shape[1])
+    scenario, place = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
+    at = scenario, first[scenario] + place
+    rows = np.zeros((len(scenarios), slots, 8), np.float32)
+    heading, z = heading[scenario, place], _column(scenarios, "parked_z")[scenario, place]
+    xy = _column(scenarios, "parked_xy")[scenario, place]
+    still, there = np.zeros((len(z), 2)), np.ones((len(z), 1))
+    pose = [xy, z[:, None], np.cos(heading)[:, None], np.sin(heading)[:, None]]
+    rows[at] = np.concatenate([*pose, still, there], axis=1)
+    boxes = np.zeros((len(scenarios), slots, 4), np.float32)
+    boxes[:, : box.shape[1]] = box
+    size, kind = _column(scenarios, "parked_size"), _column(scenarios, "parked_kind")
+    boxes[at] = np.concatenate([size, kind[..., None]], -1)[scenario, place]
+    when = np.zeros((len(scenarios), valid.shape[1], slots), bool)
+    when[scenario, :, at[1]] = valid[scenario, :, place]
+    return {"agent_box": boxes, "parked": rows, "parked_when": as_words(when)}
+
+
+def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
+    """Steps as bits of words, see ``ScenarioBank.parked_when``."""
+    steps = when.shape[1]
+    padded = np.pad(when, ((0, 0), (0, -steps % WORD), (0, 0)))
+    bits = padded.reshape(len(when), -1, WORD, when.shape[2]).astype(np.uint32)
+    return (bits << np.arange(WORD, dtype=np.uint32)[:, None]).sum(axis=2, dtype=np.uint32)
+
+
+def _ends(mask: Any) -> np.ndarray[Any, Any]:
+    """One more than the last column that each row of ``mask [N, columns]`` uses."""
+    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
 
 def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
@@ -223,15 +270,37 @@ def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
 
 
 def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
-    line, lane, state = (_column(scenarios, f"light_{name}") for name in ("line", "lane", "state"))
-    route_lane = _column(scenarios, "route_lane")[:, 0]
-    on_route = ((lane[:, :, None] == route_lane[:, None, :]) & (lane[:, :, None] >= 0)).any(-1)
-    light = np.concatenate(
-        [line, *(_column(scenarios, f"light_{n}")[..., None] for n in ("z", "heading", "exit_heading"))], -1
+    line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
+    z, heading, exits = (_column(scenarios, f"light_{name}") for name in ("z", "heading", "exit_heading"))
+    middle, half = (
+        (line[..., :2] + line[..., 2:]) / 2,
+        np.hypot(*np.moveaxis(line[..., 2:] - line[..., :2], -1, 0)) / 2,
     )
-    light = np.concatenate([light, on_route[..., None]], -1, dtype=np.float32)
+    x, y = np.moveaxis(middle, -1, 0)
+    right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
+    arc = np.stack([_stop_arcs(scenario, at) for scenario, at in zip(scenarios, middle, strict=True)])
+    rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exits), np.sin(exits), right, arc]
     used = max(1, _used((state >= 0).any(1), trim))
-    return {"light_line": light[:, :used], "light_state": state[:, :, :used]}
+    return {
+        "light_line": np.stack(rows, axis=1, dtype=np.float32)[:, :, :used],
+        "light_state": state[:, :, :used],
+    }
+
+
+def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Arc length along the route to the goal of the stop lines of its lanes, where it first comes nearest to each."""
+    count = int(scenario.route_points[0])
+    lanes = scenario.light_lane
+    mine = np.flatnonzero((lanes >= 0) & np.isin(lanes, scenario.route_lane[0]))
+    arcs = np.full(len(lanes), NEVER_M)
+    if count and len(mine):
+        x, y = scenario.route_xy[0, :count].T.astype(np.float64)
+        heading = scenario.route_heading[0, :count].astype(np.float64)
+        dx, dy = middle[mine, 0, None] - x, middle[mine, 1, None] - y
+        near = np.argmin(dx * dx + dy * dy, axis=1)
+        row = np.arange(len(mine))
+        arcs[mine] = near + dx[row, near] * np.cos(heading[near]) + dy[row, near] * np.sin(heading[near])
+    return arcs
 
 
 def _stack_maps(
@@ -249,7 +318,7 @@ def _stack_maps(
     lane_rows = int(lane_count.max()) if trim else capacity.segments
     # A run is read whole, so every start must leave room for one behind it.
     edges = np.full((len(scenarios), 5, edge_rows + edge_run), 1e6, np.float32)
-    lanes = np.full((len(scenarios), 9, lane_rows + lane_run), 1e6, np.float32)
+    lanes = np.full((len(scenarios), 8, lane_rows + lane_run), 1e6, np.float32)
     box = np.zeros((len(scenarios), 4), np.float32)
     for row, scenario in enumerate(scenarios):
         e, n = int(edge_count[row]), int(lane_count[row])
@@ -259,10 +328,6 @@ def _stack_maps(
         points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
-    rows = _column(scenarios, "road_rows").astype(np.int32)
-    used = max(1, int(rows.max())) if trim else capacity.road_rows
-    road = [_column(scenarios, "road_xy"), _column(scenarios, "road_direction")]
-    road += [_column(scenarios, f"road_{n}")[..., None] for n in ("length", "kind", "limit", "curvature")]
     arrays = {
         "edges": edges,
         "lanes": lanes,
@@ -271,10 +336,25 @@ def _stack_maps(
         "grid_side": _column(scenarios, "grid_side"),
         "grid_origin": _column(scenarios, "grid_origin"),
         "map_box": box,
-        "road": np.concatenate(road, -1, dtype=np.float32)[:, :used],
-        "road_rows": rows,
     }
     return arrays, {"edge_run": edge_run, "lane_run": lane_run}
+
+
+def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
+    rows = _column(scenarios, "road_rows").astype(np.int32)
+    used = max(1, int(rows.max())) if trim else scenarios[0].capacity.road_rows
+    xy, direction, length, kind, limit = (
+        _column(scenarios, f"road_{name}")[:, :used]
+        for name in ("xy", "direction", "length", "kind", "limit")
+    )
+    layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
+    there = np.arange(used) < rows[:, None]
+    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), ROAD_NONE)
+    columns = [xy, direction, length[..., None], layer[..., None], limit[..., None]]
+    return {
+        "road": np.concatenate(columns, -1, dtype=np.float32),
+        "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1, dtype=np.float32),
+    }
 
 
 def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
@@ -293,9 +373,9 @@ def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
     limit = scenario.lane_limit[lane].astype(np.float32)
     for kind, fallback in CLASS_LIMIT_MPS.items():
         limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
-    corridor = _corridor(scenario)[lane]
+    number = lane + 0.5 * _corridor(scenario)[lane]
     return np.stack(
-        [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, lane, corridor]
+        [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, number]
     ).astype(np.float32)
 
 

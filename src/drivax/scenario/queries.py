@@ -7,12 +7,23 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
-from drivax.scenario.bank import ScenarioBank
+from drivax.geometry.vectors import first_smallest, root
+from drivax.scenario.bank import (
+    LIGHT_COS,
+    LIGHT_HALF,
+    LIGHT_SIN,
+    LIGHT_X,
+    LIGHT_Y,
+    LIGHT_Z,
+    ROUTE_LIMIT,
+    ScenarioBank,
+)
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
 
@@ -54,20 +65,15 @@ def _runs(
     for below in (-1, 0, 1):
         first = (cell[1] + below) * grid + cell[0] - 1
         bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
-        block = jax.lax.dynamic_slice(rows, (index, 0, bounds[0]), (1, rows.shape[1], run))[0]
+        block = jax.lax.dynamic_slice(rows, (index, jnp.int32(0), bounds[0]), (1, rows.shape[1], run))[0]
         features.append(block)
         inside.append(jnp.arange(run) < bounds[3] - bounds[0])
     # Read once: without the barrier XLA repeats the reads in every operation that uses them.
     return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
 
 
-def _first_smallest(values: Float[Array, " K"]) -> Int[Array, ""]:
-    """``argmin`` as two reductions that vectorise; XLA's own compares pairs one by one on a CPU."""
-    return jnp.min(jnp.where(values == values.min(), jnp.arange(values.shape[0]), values.shape[0] - 1))
-
-
 def _to_segments(
-    rows: Float[Array, "F K"], points: Float[Array, "P 2"]
+    rows: Float[Array, "F K"] | Sequence[Float[Array, " K"]], points: Float[Array, "P 2"]
 ) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
     """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
     ax, ay, bx, by = rows[0], rows[1], rows[2], rows[3]
@@ -99,7 +105,7 @@ def left_of_edges(
     tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
     left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
     right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
-    distance = jnp.sqrt(nearest)
+    distance = root(nearest)
     return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
 
 
@@ -157,9 +163,9 @@ def around_lanes(
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
     reachable = own <= LANE_CUTOFF_M**2
-    best = _first_smallest(jnp.where(aligned, own, _FAR))
+    best = first_smallest(jnp.where(aligned, own, _FAR))
     has_lane = aligned[best] & reachable[best]
-    nearest = _first_smallest(own)
+    nearest = first_smallest(own)
     opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
     friendly = jnp.where(aligned, own, _FAR).min()
     if bank.long_ego:
@@ -172,12 +178,12 @@ def around_lanes(
     return LaneHits(
         near=near,
         points_near=points_near,
-        on_corridor=((rows[8] == 1.0) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
+        on_corridor=((rows[7] > jnp.floor(rows[7])) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
         leaving_lane=has_lane & leaving.any(),
         limit=jnp.where(has_lane, limit[best], -1.0),
-        lane=jnp.where(has_lane, rows[7, best], -1.0).astype(jnp.int32),
+        lane=jnp.where(has_lane, jnp.floor(rows[7, best]), -1.0).astype(jnp.int32),
         offset=jnp.where(has_lane, side[0, best], 0.0),
         z=jnp.where(near, rows[4, nearest], z),
     )
@@ -281,16 +287,18 @@ def project_on_route(
     count = bank.routes.shape[2]
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
     size = min(_WINDOW, count)
-    window = jax.lax.dynamic_slice(bank.routes, (index, route, first, 0), (1, 1, size, 5))[0, 0]
+    window = jax.lax.dynamic_slice(
+        bank.routes, (index, jnp.int32(route), first, jnp.int32(0)), (1, 1, size, 5)
+    )[0, 0]
     a, b = window[:-1], window[1:]
     place = first + jnp.arange(size - 1)
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
-    rows = jnp.stack([a[:, 0], a[:, 1], b[:, 0], b[:, 1]])
+    rows = [a[:, 0], a[:, 1], b[:, 0], b[:, 1]]
     squared, side = _to_segments(rows, xy[None])
-    k = _first_smallest(jnp.where(real, squared[0], _FAR))
+    k = first_smallest(jnp.where(real, squared[0], _FAR))
     u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
-    distance = jnp.sqrt(squared[0, k])
+    distance = root(squared[0, k])
     return RouteHit(
         along_m=(first + k).astype(jnp.float32) + part,
         lateral_m=jnp.where(side[0, k] >= 0, distance, -distance),
@@ -307,10 +315,9 @@ def route_ahead(
     at = jnp.maximum(along_m + offsets_m, 0.0)
     last = bank.route_points[index, route] - 1
     low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
-    part = (at - low)[:, None]
-    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
     # Lanes and limits are not numbers to blend.
-    rows = rows.at[:, 5:].set(bank.routes[index, route, low, 5:])
+    part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < ROUTE_LIMIT)
+    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
     return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
 
 
@@ -327,26 +334,18 @@ def light_crossing(
     finite segment. The distance is infinite for lines of other lanes (more than 2 m beside the segment) and levels.
     """
     line = bank.light_line[index]
-    middle = (line[:, 0:2] + line[:, 2:4]) / 2
-    half = jnp.sqrt(jnp.sum((line[:, 2:4] - line[:, 0:2]) ** 2, -1)) / 2
-    cos, sin = jnp.cos(line[:, 5]), jnp.sin(line[:, 5])
+    cos, sin, half = line[LIGHT_COS], line[LIGHT_SIN], line[LIGHT_HALF]
 
     def split(point: Float[Array, " 2"]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
-        d = point - middle
-        return d[:, 0] * cos + d[:, 1] * sin, d[:, 1] * cos - d[:, 0] * sin
+        dx, dy = point[0] - line[LIGHT_X], point[1] - line[LIGHT_Y]
+        return dx * cos + dy * sin, dy * cos - dx * sin
 
     (s0, t0), (s1, t1) = split(before), split(now)
     share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
     through = jnp.abs(t0 + (t1 - t0) * share) <= half
-    level = jnp.abs(line[:, 4] - z) <= LEVEL_M
+    level = jnp.abs(line[LIGHT_Z] - z) <= LEVEL_M
     before_m = jnp.where(level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
     return (s0 < 0.0) & (s1 >= 0.0) & through & level, before_m
-
-
-def turns_right(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, " L"]:
-    """Whether the lane behind each stop line ends more than 45 deg to the right of its start."""
-    line = bank.light_line[index]
-    return wrap(line[:, 6] - line[:, 5]) < -jnp.pi / 4
 
 
 def lane_course(
@@ -369,6 +368,6 @@ def lane_course(
     cos = (ux * heading[0] + uy * heading[1]) / length
     sin = (ux * heading[1] - uy * heading[0]) / length
     fits = inside & (jnp.abs(rows[4] - z) <= LEVEL_M) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
-    best = _first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
+    best = first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
     direction = jnp.stack([ux[best], uy[best]]) / length[best]
     return direction, side[0, best], fits[best]

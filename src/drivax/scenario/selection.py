@@ -54,6 +54,13 @@ FINDINGS: Mapping[str, Quantity] = {
     "ignored_overlaps": Quantity(
         "number", "most agents at once that overlapped ego at first and are ignored"
     ),
+    "clipped_physical": Quantity(
+        "number",
+        "share of steps at which following the log asks for more than `physical` and `discrete` allow",
+    ),
+    "clipped_published": Quantity(
+        "number", "share of steps at which following the log asks for more than `published` allows"
+    ),
     "default_sizes": Quantity("truth", "some box sizes are those of the class"),
     "velocity": Quantity("word", "where velocities come from", ("measured", "differentiated")),
     "dt_jitter": Quantity("truth", "some step differs from the median step by more than 2 ms"),

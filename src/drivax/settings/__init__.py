@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drivax.errors import UsageError
-from drivax.settings.structure import Flag, kind_of, nearest, plain, structure
+from drivax.named import nearest
+from drivax.settings.structure import Flag, kind_of, plain, structure
 from drivax.settings.text import parse_yaml, write_yaml
 
 __all__ = ["dump", "kind_of", "load", "parse_yaml", "plain", "preset", "presets"]

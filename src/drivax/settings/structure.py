@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import re
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -17,6 +16,14 @@ from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError, Iterabl
 from cattrs.gen import make_dict_structure_fn
 
 from drivax.errors import DrivaxError, UsageError
+from drivax.named import (
+    dotted_name,
+    find_named,
+    is_dotted,
+    nearest,
+    refuse_arguments,
+    refuse_missing,
+)
 from drivax.settings.text import parse_yaml
 
 _UNIONS = (Union, types.UnionType)
@@ -61,14 +68,6 @@ def kind_of(cls: type) -> str:
         if field.name == "kind":
             return str(field.default)
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", cls.__name__).lower()
-
-
-def nearest(name: str, names: Sequence[str]) -> str:
-    """A cure for a misspelt name: the nearest valid one, else all of them."""
-    near = difflib.get_close_matches(name, names, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"use one of {', '.join(names)}" if names else "there are none"
 
 
 def _value(value: Any) -> Any:
@@ -155,6 +154,9 @@ def _to_union(value: Any, cls: Any) -> Any:
     members = get_args(cls)
     records = {kind_of(member): member for member in members if _is_record(member)}
     value = _value(value) if isinstance(value, Flag) and records else value
+    for member in members:
+        if _is_open(member) and is_dotted(_kind(value)):
+            return _to_own(value, member)
     if isinstance(value, str) and value in records:
         return _converter().structure({}, records[value])
     if isinstance(value, Mapping) and records:
@@ -170,6 +172,36 @@ def _to_union(value: Any, cls: Any) -> Any:
     if records:
         raise ValueError(f"{value!r} is no section with a kind ({', '.join(records)})")
     raise ValueError(" and ".join(problems))
+
+
+def _kind(value: Any) -> Any:
+    return value.get("kind") if isinstance(value, Mapping) else value
+
+
+def _to_own(value: Any, cls: Any) -> Any:
+    """Something of the user's own: a dotted name, or a section whose kind is one.
+
+    A record class is built from the rest of the section; anything else is taken as it is found.
+    """
+    value = _value(value)
+    name = _kind(value)
+    if not isinstance(name, str):
+        raise ValueError(f"{value!r} is no dotted name (package.module:name) and no section with such a kind")
+    found = find_named(name)
+    if _is_record(found):
+        rest = {key: one for key, one in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
+        found = _converter().structure(rest, found)
+    elif isinstance(value, Mapping) and len(value) > 1:
+        raise ValueError(f"{name!r} has no settings; make it a frozen dataclass that has")
+    if _is_protocol(cls):
+        refuse_missing(found, name, cls)
+        return found
+    if not callable(found):
+        raise ValueError(f"{name!r} cannot be called; name a function")
+    arguments = get_args(cls)[0] if get_args(cls) else ...
+    if arguments is not ...:
+        refuse_arguments(found, name, tuple(arguments))
+    return found
 
 
 def _specific(member: Any) -> int:
@@ -198,6 +230,11 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
 
     def hook(value: Any, _: Any) -> Any:
         value = {} if value is None else _value(value)
+        if is_dotted(value):
+            found = find_named(value)
+            if not isinstance(found, cls):
+                raise ValueError(f"{value!r} is no {cls.__name__}")
+            return found
         if not isinstance(value, Mapping):
             raise _refuse(
                 value, f"a section of settings ({', '.join(f.name for f in dataclasses.fields(cls))})"
@@ -238,6 +275,19 @@ def _is_record(cls: Any) -> bool:
     return isinstance(cls, type) and dataclasses.is_dataclass(cls)
 
 
+def _is_protocol(cls: Any) -> bool:
+    return isinstance(cls, type) and bool(getattr(cls, "_is_protocol", False))
+
+
+def _is_callable(cls: Any) -> bool:
+    return cls is Callable or get_origin(cls) is Callable
+
+
+def _is_open(cls: Any) -> bool:
+    """Whether users may put something of their own here."""
+    return _is_protocol(cls) or _is_callable(cls)
+
+
 @functools.cache
 def _converter() -> cattrs.Converter:
     converter = cattrs.Converter()
@@ -247,6 +297,7 @@ def _converter() -> cattrs.Converter:
     converter.register_structure_hook_func(lambda cls: get_origin(cls) is Literal, _to_literal)
     converter.register_structure_hook_func(lambda cls: cls is tuple or get_origin(cls) is tuple, _to_tuple)
     converter.register_structure_hook_func(lambda cls: get_origin(cls) in _UNIONS, _to_union)
+    converter.register_structure_hook_func(_is_open, _to_own)
     converter.register_structure_hook_factory(_is_record, _record_hook)
     return converter
 
@@ -284,6 +335,8 @@ def _plain(value: Any, declared: Any) -> Any:
     if _is_record(type(value)):
         hints = typing.get_type_hints(type(value))
         inside = {f.name: _plain(getattr(value, f.name), hints[f.name]) for f in dataclasses.fields(value)}
+        if any(map(_is_open, (declared, *_members(declared)))) and type(value) not in _members(declared):
+            return {"kind": dotted_name(type(value))} | {k: v for k, v in inside.items() if k != "kind"}
         tagged = "kind" not in inside and any(_is_record(member) for member in _members(declared))
         return {"kind": kind_of(type(value))} | inside if tagged else inside
     if isinstance(value, Mapping):
@@ -291,6 +344,8 @@ def _plain(value: Any, declared: Any) -> Any:
         return {str(key): _plain(item, member) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item, _item_type(declared, number)) for number, item in enumerate(value)]
+    if callable(value):
+        return dotted_name(value)
     return str(value) if isinstance(value, Path) else value
 
 

@@ -63,7 +63,7 @@ def difference(run: Evaluation, other: Evaluation, metric: str) -> Difference:
         CONFIDENCE,
         seed=SEED,
     )
-    return Difference(metric, other.name, interval, _verdict(interval, note(metric).better))
+    return Difference(metric, other.name, interval, _verdict(interval, note(metric, [run]).better))
 
 
 def metric_names(runs: Sequence[Evaluation]) -> list[str]:

@@ -8,7 +8,8 @@ from types import MappingProxyType
 from typing import Literal
 
 from drivax.evaluation.results import NOT_SUMMARISED, RATES
-from drivax.metrics.episode import METRICS
+from drivax.metrics.catalogue import METRICS
+from drivax.show.runs import Evaluation
 
 Direction = Literal["up", "down", "none"]
 
@@ -43,6 +44,7 @@ _LABELS = MappingProxyType(
         "progress": "progress along the route",
         "reached_goal": "goal reached",
         "ttc_ok": "TTC ok",
+        "wrong_way_worst": "wrong way within 1 s",
         "min_ttc": "least TTC",
         "average_ttc": "mean TTC",
         "vmax_score": "V-Max score",
@@ -64,10 +66,16 @@ ARROWS = MappingProxyType({"up": "↑", "down": "↓", "none": ""})
 _DIRECTIONS: dict[str, Direction] = {"high": "up", "low": "down", "-": "none"}
 
 
-def note(name: str) -> Note:
-    """How to show a metric; one that is not known gets its own name and no direction."""
+def note(name: str, runs: Sequence[Evaluation] = ()) -> Note:
+    """How to show a metric.
+
+    Args:
+        name: Of the metric.
+        runs: Evaluations, which say what metrics of the user's own are; one that nobody knows gets its own name and no
+            direction.
+    """
     label = _LABELS.get(name, name.replace("_", " "))
-    metric = METRICS.get(name)
+    metric = METRICS.get(name) or next((r.own_metrics[name] for r in runs if name in r.own_metrics), None)
     if metric is None:
         return Note(label, "none", "", "")
     plain = metric.unit == "-"

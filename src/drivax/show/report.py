@@ -271,7 +271,9 @@ def legend_item(name: str, words: str) -> str:
 
 
 def _meaning(runs: Sequence[Evaluation]) -> str:
-    return f"<section><h2>What the metrics mean</h2>{explanations(ordered(metric_names(runs)))}</section>"
+    return (
+        f"<section><h2>What the metrics mean</h2>{explanations(ordered(metric_names(runs)), runs)}</section>"
+    )
 
 
 def _origin(runs: Sequence[Evaluation | Training]) -> str:

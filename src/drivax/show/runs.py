@@ -42,6 +42,15 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
+class OwnMetric:
+    """A metric that drivax does not know: unit, direction (``high``, ``low``, ``-``) and one line of text."""
+
+    unit: str
+    better: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """One planner driven through one scenario set.
 
@@ -70,6 +79,12 @@ class Evaluation:
     def traffic(self) -> str:
         """How the other agents moved: ``log`` or ``idm``."""
         return str(self.about.get("traffic", "log"))
+
+    @property
+    def own_metrics(self) -> Mapping[str, OwnMetric]:
+        """What the run says about metrics of the user's own."""
+        told = self.about.get("own_metrics") or {}
+        return {name: OwnMetric(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in told.items()}
 
     @property
     def data(self) -> Mapping[str, Any]:

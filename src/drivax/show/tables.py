@@ -23,11 +23,12 @@ _VERDICTS = {
 def planner_table(runs: Sequence[Evaluation], metrics: Sequence[str]) -> str:
     """Planners in rows, metrics in columns: mean, interval and number of episodes in each cell."""
     cells = {(run.name, metric): summarise(run, metric) for run in runs for metric in metrics}
-    best = {metric: _best([cells[run.name, metric] for run in runs], note(metric)) for metric in metrics}
-    head = "".join(_heading(metric) for metric in metrics)
+    notes = {metric: note(metric, runs) for metric in metrics}
+    best = {metric: _best([cells[run.name, metric] for run in runs], notes[metric]) for metric in metrics}
+    head = "".join(_heading(metric, notes[metric]) for metric in metrics)
     rows = []
     for run in runs:
-        row = "".join(_cell(cells[run.name, m], note(m), best[m]) for m in metrics)
+        row = "".join(_cell(cells[run.name, m], notes[m], best[m]) for m in metrics)
         rows.append(f"<tr>{_planner(run)}{row}</tr>")
     return _scrolling(f"<thead><tr><th scope=col>planner</th>{head}</tr></thead>", "".join(rows), "planners")
 
@@ -38,18 +39,18 @@ def difference_table(policy: Evaluation, others: Sequence[Evaluation], metrics: 
     rows = []
     for metric in metrics:
         cells = "".join(_difference_cell(policy, other, metric) for other in others)
-        rows.append(f"<tr>{_heading(metric, scope='row')}{cells}</tr>")
+        rows.append(f"<tr>{_heading(metric, note(metric, [policy]), scope='row')}{cells}</tr>")
     return _scrolling(
         f"<thead><tr><th scope=col>metric</th>{head}</tr></thead>", "".join(rows), "differences"
     )
 
 
-def explanations(metrics: Sequence[str]) -> str:
+def explanations(metrics: Sequence[str], runs: Sequence[Evaluation]) -> str:
     """A list that explains each metric in one line; metrics without an explanation are left out."""
-    known = [(note(metric), metric) for metric in metrics if note(metric).explanation]
+    known = [entry for metric in metrics if (entry := note(metric, runs)).explanation]
     items = "".join(
         f"<div><dt>{escape(entry.label)} {ARROWS[entry.better]}</dt><dd>{escape(entry.explanation)}</dd></div>"
-        for entry, _ in known
+        for entry in known
     )
     return f"<dl class=metrics>{items}</dl>"
 
@@ -95,8 +96,7 @@ def _planner(run: Evaluation) -> str:
     return f"<th scope=row>{name}<small>{run.episodes} episodes, {escape(run.traffic)} traffic</small></th>"
 
 
-def _heading(metric: str, scope: str = "col") -> str:
-    entry = note(metric)
+def _heading(metric: str, entry: Note, scope: str = "col") -> str:
     title = escape(entry.explanation or metric)
     arrow = {"up": "more is better", "down": "less is better", "none": ""}[entry.better]
     mark = f'<abbr title="{arrow}">{ARROWS[entry.better]}</abbr>' if arrow else ""
@@ -125,7 +125,7 @@ def _difference_cell(policy: Evaluation, other: Evaluation, metric: str) -> str:
     found: Difference = difference(policy, other, metric)
     if found.interval.mean is None:
         return '<td class=undefined title="no scenario where both are defined">–<small>n 0</small></td>'
-    unit = note(metric).unit
+    unit = note(metric, [policy]).unit
     points = " points" if unit == "rate" else ""
     sign, words = _VERDICTS[found.verdict]
     return (

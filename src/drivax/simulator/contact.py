@@ -23,7 +23,8 @@ class Contact(enum.IntEnum):
     """What there is between the judged agent and another.
 
     ``IGNORED`` overlapped when it appeared and counts for nothing until it parts; ``HIT`` touches without the judged
-    agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, its fault decided once and for all.
+    agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, its fault decided once and for all; ``GONE``, of
+    these three, is absent.
     """
 
     ABSENT = 0
@@ -32,10 +33,17 @@ class Contact(enum.IntEnum):
     IGNORED = 3
     AT_FAULT = 4
     PARTED = 5
+    GONE = 6
 
 
 class CollisionType(enum.IntEnum):
-    """Kind of the first collision, seen from the judged agent."""
+    """Kind of the first collision, seen from the judged agent.
+
+    The first that fits, in this order: ``VULNERABLE``: a pedestrian or cyclist; ``STOPPED_OBJECT``: the agent's front
+    hits somebody who stands; ``HEAD_ON``: headings differ by more than 135 deg, unless it touches from behind;
+    ``REAR_END``: the front hits somebody whose heading differs by less than 45 deg; ``REAR_ENDED``: hit from behind;
+    ``SIDE_SWIPE``: everything else, crossing traffic included.
+    """
 
     NONE = 0
     REAR_END = 1
@@ -70,14 +78,14 @@ def next_contacts(
         fault: For those whose first contact is now: whether it is the judged agent's fault.
     """
     c = Contact
-    appears = (before == c.IGNORED) | (before == c.ABSENT)
+    appears = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
     known = jnp.where(
         before == c.APART, jnp.where(fault, c.AT_FAULT, c.HIT), jnp.where(before == c.PARTED, c.HIT, before)
     )
     contact = jnp.where(appears, c.IGNORED, known)
-    judged = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED)
-    apart = jnp.where(judged, c.PARTED, c.APART)
-    return jnp.where(valid, jnp.where(touching, contact, apart), c.ABSENT).astype(jnp.int8)
+    judged = (before == c.HIT) | (before == c.AT_FAULT) | (before == c.PARTED) | (before == c.GONE)
+    apart, absent = jnp.where(judged, c.PARTED, c.APART), jnp.where(judged, c.GONE, c.ABSENT)
+    return jnp.where(valid, jnp.where(touching, contact, apart), absent).astype(jnp.int8)
 
 
 def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, Array]:
@@ -122,7 +130,7 @@ def judge_contacts(
     stopped, other_stopped = speed < STOPPED_MPS, others_speed < STOPPED_MPS
     fault = ~stopped & (other_stopped | (~behind & (front | unlawful)))
     vulnerable = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
-    head_on = cos < -(0.5**0.5)
+    head_on, same_way = cos < -(0.5**0.5), cos > 0.5**0.5
     kind = jnp.where(
         vulnerable,
         CollisionType.VULNERABLE,
@@ -133,7 +141,7 @@ def judge_contacts(
                 head_on & (front | ~behind),
                 CollisionType.HEAD_ON,
                 jnp.where(
-                    front,
+                    front & same_way,
                     CollisionType.REAR_END,
                     jnp.where(behind, CollisionType.REAR_ENDED, CollisionType.SIDE_SWIPE),
                 ),

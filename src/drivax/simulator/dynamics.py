@@ -1,11 +1,17 @@
-"""Ego dynamics: the kinematic bicycle at the box centre, and its inverse. Motions are (x, y, heading, speed)."""
+"""How a driven agent moves in one step of 0.1 s. Motions are (x, y, heading, speed); speed is never negative.
+
+:func:`bicycle` is the default; :func:`displace` moves by a displacement in the agent's own frame (``delta_local``);
+a state that is given outright (``direct_state``) needs no function. Everything is differentiable, with gradients that
+are finite at a standstill, at the turn of the circle and at every limit.
+"""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.angles import rotate, wrap
+from drivax.geometry.vectors import norm
 from drivax.scenario.schema import DT_S
 
 #: Grip limit |curvature| v^2, m/s2.
@@ -42,6 +48,40 @@ def bicycle(
     return jnp.stack(
         [x + distance * jnp.cos(mean), y + distance * jnp.sin(mean), wrap(heading + turn), after]
     )
+
+
+def displace(
+    motion: Float[Array, " 4"], shift: Float[Array, " 2"], turn: Float[Array, ""]
+) -> Float[Array, " 4"]:
+    """Moves by ``shift`` metres (ahead, left) in the agent's own frame, then turns by ``turn`` rad.
+
+    The new speed is the distance over the step, so that a chain of displacements has the speed of its path. Nothing
+    limits it: there is no grip, and an agent may slide sideways.
+    """
+    step = rotate(shift, jnp.cos(motion[2]), jnp.sin(motion[2]))
+    place = motion[:2] + step
+    return jnp.stack([place[0], place[1], wrap(motion[2] + turn), norm(shift) / DT_S])
+
+
+def displacement(
+    motion: Float[Array, " 4"], target: Float[Array, " 4"]
+) -> tuple[Float[Array, " 2"], Float[Array, ""]]:
+    """The inverse of :func:`displace`: shift (ahead, left, m) and turn (rad) from a motion to another."""
+    shift = rotate(target[:2] - motion[:2], jnp.cos(motion[2]), -jnp.sin(motion[2]))
+    return shift, wrap(target[2] - motion[2])
+
+
+def command_between(
+    before: Float[Array, " 4"], now: Float[Array, " 4"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The acceleration and curvature that :func:`bicycle` was driven with, from the motions around a step.
+
+    Moves under 0.1 m say nothing about curvature and count as straight.
+    """
+    distance = (before[3] + now[3]) / 2.0 * DT_S
+    turn = wrap(now[2] - before[2])
+    curvature = jnp.where(distance > _STILL_M, turn / jnp.maximum(distance, _STILL_M), 0.0)
+    return (now[3] - before[3]) / DT_S, curvature
 
 
 def follow(

@@ -17,7 +17,7 @@ class IdmParameters:
     headway_s: Any = 1.5
     acceleration_mps2: Any = 1.5
     comfortable_braking_mps2: Any = 3.0
-    exponent: float = 4.0
+    exponent: Any = 4.0
     max_braking_mps2: Any = 6.0
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import light_crossing, turns_right
+from drivax.scenario.bank import LIGHT_ARC, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, NEVER_M, ScenarioBank
+from drivax.scenario.queries import light_crossing
 from drivax.scenario.schema import LightState
 from drivax.simulator.types import HISTORY, MOTION_SPEED, LightMemory, Scene
 
@@ -27,7 +27,7 @@ def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
     """The memory that a scene's recent motion implies, as if it had been driven."""
     length = bank.agent_box[scene.index, scene.slot, 0]
     ground = scene.z - bank.agent_box[scene.index, scene.slot, 2] / 2
-    pause = jnp.full(bank.light_line.shape[1], PAUSE_STEPS + 1, jnp.int32)
+    pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
     fronts = _fronts(scene, length)
     for age in range(HISTORY - 1, -1, -1):
         front = fronts[HISTORY - 1 - age]
@@ -37,6 +37,11 @@ def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 
 
+def nothing_crossed(memory: LightMemory) -> LightMemory:
+    """As an episode begins: lines that were crossed before it are not charged to it."""
+    return LightMemory(memory.pause, jnp.zeros_like(memory.crossed))
+
+
 def judge_lights(
     bank: ScenarioBank, scene: Scene, me: Float[Array, " 6"], ground: Float[Array, ""], on_route: Bool[Array, ""],
     memory: LightMemory,
@@ -44,7 +49,7 @@ def judge_lights(
     """Whether a red light was run, found out at this step, and what to remember.
 
     On the route only its own lights count, at once. Off it, of the lines that were crossed together the one counts
-    whose lane ends most nearly in the heading that the agent has two seconds later.
+    whose lane ends most nearly in the heading that the agent has two seconds later, or at the end of the log.
     """
     front_before, front = _fronts(scene, me[4])[-2:]
     crossed, before_m = light_crossing(bank, scene.index, front_before, front, ground)
@@ -54,16 +59,17 @@ def judge_lights(
     is_red = _red(now) & _red(then)
     # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
     arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
-    is_red &= ~(turns_right(bank, scene.index) & (memory.pause < PAUSE_STEPS) & ~arrow)
     line = bank.light_line[scene.index]
-    ran = (crossed & is_red & (line[:, 7] > 0)).any() & on_route
+    is_red &= ~((line[LIGHT_RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
+    ran = (crossed & is_red & (line[LIGHT_ARC] < NEVER_M)).any() & on_route
 
-    age = memory.crossed + jnp.sign(memory.crossed)
-    due = jnp.abs(age) > JUDGED_AFTER
-    fit = jnp.where(due, jnp.cos(line[:, 6] - jnp.arctan2(me[3], me[2])), -2.0)
-    ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
     begins = crossed & ~on_route
-    age = jnp.where(begins, jnp.where(is_red, 1, -1), jnp.where(due, 0, age))
+    age = jnp.where(begins, jnp.where(is_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
+    # What is still open when the log ends is judged then.
+    due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (scene.step >= last))
+    fit = jnp.where(due, line[LIGHT_EXIT_COS] * me[2] + line[LIGHT_EXIT_SIN] * me[3], -2.0)
+    ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
+    age = jnp.where(due, 0, age)
     stands = (scene.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
     pause = jnp.where(stands, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
     return ran, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))

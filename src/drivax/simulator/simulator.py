@@ -9,20 +9,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.scenario.bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
-from drivax.simulator.lights import remember_lights
-from drivax.simulator.situation import measure
-from drivax.simulator.traffic import LogTraffic, alone, frame_of, logged_history
+from drivax.simulator.lights import nothing_crossed, remember_lights
+from drivax.simulator.situation import measure, surroundings
+from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.together import is_driven
+from drivax.simulator.traffic import LogTraffic, alone, frame_of
 from drivax.simulator.types import Frame, Scene, SimState, Situation, Task, Traffic, Transition
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """A task in a kind of traffic. Holds configuration only; everything computed is an argument or a result.
+    """A task in a kind of traffic, with a kind of start. Holds configuration only; the rest is argument or result.
 
     Functions are unbatched; ``jax.vmap(simulator.step, in_axes=(None, 0, 0))`` steps a batch. ``step`` never resets;
     :meth:`step_or_begin` is for collectors.
@@ -30,55 +32,110 @@ class Simulator:
 
     task: Task
     traffic: Traffic = field(default_factory=LogTraffic)
+    start: Start = field(default_factory=LogStart)
 
-    def reset(self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0) -> SimState:
-        """The state of agent ``slot`` at ``step`` of scenario ``index``, as logged."""
-        scene = self.scene(bank, index, step, slot)
-        cast = alone(scene)
-        now, before = self.frame(bank, scene, cast, 0), self.frame(bank, scene, cast, 1)
-        # Overlaps at the start are ignored until they part, as if everyone had just appeared.
+    def reset(
+        self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
+    ) -> SimState:
+        """The state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws a start other than the log's."""
+        scene = self.scene(bank, index, step, slot, key)
+        return self._begin(bank, scene, alone(scene))
+
+    def _begin(self, bank: ScenarioBank, scene: Scene, cast: Scene) -> SimState:
+        """The state in which an episode begins at a scene."""
+        now = self.frame(bank, scene, cast, 0)
+        # Overlaps at the start are ignored until they part, as if everyone had just appeared; so nobody's fault is
+        # judged, for which alone a frame before this one would be needed.
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
-        found, contacts, lights = measure(bank, scene, now, before, contacts, remember_lights(bank, scene))
-        return SimState(
-            found.scene, found.facts, contacts, lights, self.task.episode_start(), found.scene.step
-        )
+        lights = remember_lights(bank, scene)
+        found, contacts, lights = measure(bank, scene, now, now, contacts, lights, self.task.reads)
+        episode, step = self.task.episode_start(), found.scene.step
+        return SimState(found.scene, found.facts, contacts, nothing_crossed(lights), episode, step)
 
-    def scene(self, bank: ScenarioBank, index: Any, step: Any, slot: Any = 0) -> Scene:
-        """A logged moment as a scene: what offline sampling and resets start from."""
+    def scene(
+        self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
+    ) -> Scene:
+        """A moment as a scene: what offline sampling and resets start from; logged unless ``start`` says otherwise."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
-        return Scene(
+        history, route_m = LogStart().begin(bank, index, step, slot)
+        scene = Scene(
             index=index,
             step=step,
             slot=slot,
-            history=logged_history(bank, index, step, slot),
-            action=jnp.zeros(2),
-            route_m=bank.log_progress[index, step],
+            history=history,
+            action=self.task.first_action(history, bank.agent_box[index, slot, 0]),
+            route_m=route_m,
             z=bank.agents[index, step, slot, AGENT_Z],
             traffic=self.traffic.start(bank, index, step),
         )
+        if isinstance(self.start, LogStart):
+            return scene
+        agents = self.traffic.agents(bank, scene, 0)
+        history, route_m = self.start.begin(bank, index, step, slot, agents, key)
+        action = self.task.first_action(history, bank.agent_box[index, slot, 0])
+        return replace(scene, history=history, route_m=route_m, action=action)
 
     def frame(self, bank: ScenarioBank, scene: Scene, cast: Scene, back: int) -> Frame:
         """Everyone ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
         return frame_of(bank, scene.index, scene.step, self.traffic.agents(bank, scene, back), cast, back)
 
+    def now(self, bank: ScenarioBank, scene: Scene) -> Frame:
+        """Everyone now, around one driven agent."""
+        return self.frame(bank, scene, alone(scene), 0)
+
     def step(
-        self, bank: ScenarioBank, state: SimState, action: Float[Array, " 2"]
+        self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
     ) -> tuple[SimState, Transition]:
         """Drives one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
     def replay(
-        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " 2"]
+        self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " D"]
     ) -> tuple[SimState, Transition]:
         """Puts the agent at ``motion`` one step later, without dynamics (the exact expert); ``action`` is recorded."""
         return self._drive(bank, state, action, motion)
 
+    def reset_together(
+        self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
+    ) -> SimState:
+        """The stack of the states of several agents of one scenario (``simulator.together.slots_of`` chooses them).
+
+        They begin as logged: a noisy start knows of one driven agent only.
+        """
+        scenes = jax.vmap(lambda slot: self.scene(bank, index, step, slot))(slots)
+        return jax.vmap(lambda scene: self._begin(bank, scene, scenes))(scenes)
+
     def step_together(
-        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K 2"]
+        self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
     ) -> tuple[SimState, Transition]:
-        """Drives K agents of one scenario at once; ``states`` is the stack of their states."""
-        moved = jax.vmap(lambda s, a: self._move(bank, s.scene, states.scene, a, None))(states, actions)
-        return jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, a))(states, moved, actions)
+        """Drives K agents of one scenario at once; they see each other, and traffic sees them.
+
+        Args:
+            bank: The scenarios.
+            states: The stack of their states. One whose slot is beyond the moving agents fills up the stack: it is on
+                no road, and is never rewarded nor over; its facts mean nothing.
+            actions: An action each.
+            over: ``[K]`` whose episode has ended at an earlier step: they drive on as they are told, and are neither
+                rewarded nor judged any more. Nobody's by default, which is right for tasks that drive to the end.
+        """
+        first = jax.tree.map(lambda leaf: leaf[0], states.scene)
+        seen = self.frame(bank, first, states.scene, 0)
+        traffic = self.traffic.advance(bank, first, seen)
+        moved = jax.vmap(lambda s, a: self._drive_on(bank, s.scene, a, None, traffic))(states, actions)
+        after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))(
+            states, moved, actions
+        )
+        counts = is_driven(bank, states) & (True if over is None else ~over)
+        choose = jax.vmap(lambda c, new, old: jax.tree.map(partial(jnp.where, c), new, old))
+        after = replace(after, episode=choose(counts, after.episode, states.episode))
+        terms = {name: jnp.where(counts, term, 0.0) for name, term in done.reward_terms.items()}
+        ends = {name: getattr(done, name) & counts for name in ("terminated", "truncated")}
+        reward = jnp.where(counts, done.reward, 0.0)
+        return after, replace(done, after=after, reward=reward, reward_terms=terms, **ends)
+
+    def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
+        """The observation of each of K agents of one scenario, stacked."""
+        return jax.vmap(lambda scene: self.observe(bank, scene, states.scene))(states.scene)
 
     def situation(self, bank: ScenarioBank, state: SimState, cast: Scene | None = None) -> Situation:
         """The state's facts with the surroundings that they were measured in; for planners.
@@ -89,9 +146,8 @@ class Simulator:
             cast: Scenes of all driven agents of the scenario, stacked; the agent alone by default.
         """
         cast = alone(state.scene) if cast is None else cast
-        now, before = self.frame(bank, state.scene, cast, 0), self.frame(bank, state.scene, cast, 1)
-        again, _, _ = measure(bank, state.scene, now, before, state.contacts, state.lights)
-        return Situation(state.scene, state.facts, again.surroundings)
+        around = surroundings(bank, state.scene, self.frame(bank, state.scene, cast, 0))
+        return Situation(state.scene, state.facts, around)
 
     def observe(self, bank: ScenarioBank, scene: Scene, cast: Scene | None = None) -> Mapping[str, Any]:
         """The task's observation of a scene, live or replayed."""
@@ -106,20 +162,27 @@ class Simulator:
         self,
         bank: ScenarioBank,
         state: SimState,
-        action: Float[Array, "2"],
+        action: Float[Array, " D"],
         over: Bool[Array, ""],
-        index: Any,
-        step: Any = CURRENT_STEP,
-        slot: Any = 0,
+        fresh: Scene,
+        seen: Frame | None = None,
     ) -> tuple[SimState, Transition]:
-        """A step, or where the episode is ``over`` the beginning of scenario ``index`` instead.
+        """A step, or where the episode is ``over`` the beginning of another one instead.
 
         For collectors: an episode that ends costs one call that only resets, whose transition means nothing and is to
         be masked; in exchange nothing is measured or observed twice, and every state that a policy sees, final ones
         included, is seen once.
+
+        Args:
+            bank: The scenarios.
+            state: The state.
+            action: What the agent does if its episode goes on.
+            over: Whether it is over.
+            fresh: The :meth:`scene` that begins then.
+            seen: ``now(bank, state.scene)``, from who has it at hand, so that it is not computed again.
         """
-        fresh = self.scene(bank, index, step, slot)
-        moved = self._move(bank, state.scene, alone(state.scene), action, None)
+        seen = self.now(bank, state.scene) if seen is None else seen
+        moved = self._move(bank, state.scene, seen, action, None)
         scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
         before = replace(
             state,
@@ -127,45 +190,55 @@ class Simulator:
             lights=jax.tree.map(partial(jnp.where, over), remember_lights(bank, fresh), state.lights),
             start=jnp.where(over, fresh.step, state.start),
         )
-        after, transition = self._settle(bank, before, scene, alone(scene), action)
+        after, transition = self._settle(bank, before, scene, alone(scene), seen, action)
         first = self.task.episode_start()
         episode = jax.tree.map(lambda new, old: jnp.where(over, new, old), first, after.episode)
-        after = replace(after, episode=episode)
+        lights = jax.tree.map(partial(jnp.where, over), nothing_crossed(after.lights), after.lights)
+        after = replace(after, episode=episode, lights=lights)
         flags = {name: getattr(transition, name) & ~over for name in ("terminated", "truncated")}
         return after, replace(transition, after=after, **flags)
 
     def _drive(
         self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None
     ) -> tuple[SimState, Transition]:
-        moved = self._move(bank, state.scene, alone(state.scene), action, motion)
-        return self._settle(bank, state, moved, alone(moved), action)
+        seen = self.now(bank, state.scene)
+        moved = self._move(bank, state.scene, seen, action, motion)
+        return self._settle(bank, state, moved, alone(moved), seen, action)
 
     def _move(
-        self, bank: ScenarioBank, scene: Scene, cast: Scene, action: Array, motion: Array | None
+        self, bank: ScenarioBank, scene: Scene, seen: Frame, action: Array, motion: Array | None
     ) -> Scene:
-        """Everyone moves one step; nothing is measured yet."""
+        """Everyone moves one step on from a frame; nothing is measured yet."""
+        traffic = self.traffic.advance(bank, scene, seen)
+        return self._drive_on(bank, scene, action, motion, traffic)
+
+    def _drive_on(
+        self, bank: ScenarioBank, scene: Scene, action: Array, motion: Array | None, traffic: Any
+    ) -> Scene:
+        """The agent moves one step, in traffic that has moved."""
         if motion is None:
+            action = self.task.actuated(scene.history[-1], action, scene.action)
             motion = self.task.motion(scene.history[-1], action, bank.agent_box[scene.index, scene.slot, 0])
-        frame = self.frame(bank, scene, cast, 0)
         return replace(
             scene,
             step=scene.step + 1,
             history=jnp.concatenate([scene.history[1:], motion[None]]),
             action=action,
-            traffic=self.traffic.advance(bank, scene, frame),
+            traffic=traffic,
         )
 
     def _settle(
-        self, bank: ScenarioBank, before: SimState, moved: Scene, cast: Scene, action: Array
+        self, bank: ScenarioBank, before: SimState, moved: Scene, cast: Scene, seen: Frame, action: Array
     ) -> tuple[SimState, Transition]:
-        """Measures an agent after everyone has moved, and turns the step into a transition."""
-        now, previous = self.frame(bank, moved, cast, 0), self.frame(bank, moved, cast, 1)
-        found, contacts, lights = measure(bank, moved, now, previous, before.contacts, before.lights)
+        """Measures an agent after everyone has moved on from a frame, and turns the step into a transition."""
+        now = self.frame(bank, moved, cast, 0)
+        found, contacts, lights = measure(
+            bank, moved, now, seen, before.contacts, before.lights, self.task.reads
+        )
         terminated, truncated = self.task.ended(bank, found.scene, found.facts)
         terms = self.task.reward(before.facts, found.facts, found.surroundings)
-        after = SimState(found.scene, found.facts, contacts, lights, before.episode, before.start)
-        final = found.scene.step >= bank.steps - 1
-        episode = self.task.episode_add(before.episode, after, terminated | truncated | final)
-        after = replace(after, episode=episode)
+        final = terminated | truncated | (found.scene.step >= bank.steps - 1)
+        episode = self.task.episode_add(before.episode, found, before.start, final)
+        after = SimState(found.scene, found.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)

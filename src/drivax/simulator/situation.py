@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
+from drivax.geometry.vectors import norm
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.queries import (
     OFFROAD_TOLERANCE_M,
@@ -30,14 +33,27 @@ from drivax.simulator.contact import (
     time_to_collision,
 )
 from drivax.simulator.lights import judge_lights
-from drivax.simulator.types import MOTION_SPEED, Facts, Frame, LightMemory, Scene, Situation, Surroundings
+from drivax.simulator.types import (
+    FACTS,
+    MOTION_SPEED,
+    Facts,
+    Frame,
+    LightMemory,
+    Scene,
+    Situation,
+    Surroundings,
+)
 
 #: Lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
+#: Facts that need to know who touches the agent, and those that need to know whose fault it is.
+_FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
+_CONTACTS = _FAULTS | {"collision", "ignored"}
 
 
 def measure(
-    bank: ScenarioBank, scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], lights: LightMemory
+    bank: ScenarioBank, scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], lights: LightMemory,
+    reads: frozenset[str] = FACTS,
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measures the driven agent of a scene.
 
@@ -48,32 +64,34 @@ def measure(
         previous: Everyone one step ago.
         contacts: Contact codes of the step before.
         lights: What is remembered about stop lines.
+        reads: Names of the facts that are wanted; the others are None, and what only they need is not computed.
 
     Returns:
         The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
     """
-    me, z = frame.box[scene.slot], frame.z[scene.slot]
-    height = bank.agent_box[scene.index, scene.slot, 2]
-    ground = z - height / 2
-    lanes, beyond, left_map, offroad = _on_the_map(bank, scene.index, me, ground)
-    moved = _norm(scene.history[-1, :2] - scene.history[-2, :2])
-    route = project_on_route(bank, scene.index, me[:2], scene.route_m, 1.5 * moved + 2.0)
-    z = jnp.where(lanes.near, lanes.z + height / 2, z)
+    around = surroundings(bank, scene, frame)
+    lanes, route, me = around.lanes, around.route, frame.box[scene.slot]
+    ground = _ground(bank, scene, frame)
+    beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
+    half = bank.agent_box[scene.index, scene.slot, 2] / 2
+    z = jnp.where(lanes.near, lanes.z + half, frame.z[scene.slot])
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
-    codes, fault, collision_type = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad)
+    codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
-    red, lights = judge_lights(bank, scene, me, ground, routed & (route.distance_m <= _ON_ROUTE_M), lights)
+    red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
+    if "red_light" in reads:
+        red, lights = judge_lights(bank, scene, me, ground, on_route, lights)
     now, logged = scene.history[-1], bank.agents[scene.index, scene.step, scene.slot]
     acceleration, jerk, lateral = _rates(scene.history)
     facts = Facts(
         collision=((codes == Contact.HIT) | (codes == Contact.AT_FAULT)).any(),
-        at_fault=fault.any(),
-        collision_type=collision_type,
+        at_fault=fault,
+        collision_type=kind,
         offroad=offroad,
         offroad_m=beyond,
         left_map=left_map,
         red_light=red,
-        ttc_s=time_to_collision(frame, scene.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT)),
+        ttc_s=ttc,
         ttc_defined=now[MOTION_SPEED] >= STOPPED_MPS,
         speed_mps=now[MOTION_SPEED],
         limit_mps=lanes.limit,
@@ -82,48 +100,81 @@ def measure(
         ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
-        moved_m=moved,
+        moved_m=_moved(scene),
         progress_m=scene.route_m,
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
-        log_divergence_m=_norm(now[:2] - logged[:2]),
-        goal_distance_m=_norm(now[:2] - bank.goal[scene.index]),
+        log_divergence_m=norm(now[:2] - logged[:2]),
+        goal_distance_m=norm(now[:2] - bank.goal[scene.index]),
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
     )
-    return Situation(scene, facts, Surroundings(frame, lanes, route)), codes, lights
+    return Situation(scene, _kept(facts, reads), around), codes, lights
+
+
+def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings:
+    """Everyone now, the lanes around the driven agent, and where it is on its route."""
+    me = frame.box[scene.slot]
+    ground = _ground(bank, scene, frame)
+    lanes = around_lanes(bank, scene.index, me[:2], me[2:4], corners(me), ground)
+    ahead_m = 1.5 * _moved(scene) + 2.0
+    return Surroundings(frame, lanes, project_on_route(bank, scene.index, me[:2], scene.route_m, ahead_m))
+
+
+def _ground(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
+    """Height of the ground under the driven agent, m."""
+    return frame.z[scene.slot] - bank.agent_box[scene.index, scene.slot, 2] / 2
+
+
+def _moved(scene: Scene) -> Float[Array, ""]:
+    """How far the driven agent has come in the last step, m."""
+    return norm(scene.history[-1, :2] - scene.history[-2, :2])
 
 
 def _touch(
-    scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""]
-) -> tuple[Int[Array, " S"], Bool[Array, " S"], Int[Array, ""]]:
-    """New contact codes, which contacts that begin now are the agent's fault, and the type of the nearest of them."""
+    scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
+    reads: frozenset[str],
+) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
+    """New contact codes, whether a contact that begins now is the agent's fault, its type, and time to collision.
+
+    What ``reads`` does not ask for is zero, and codes stay as they are where it asks for nothing here.
+    """
+    fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
+    if not reads & _CONTACTS:
+        return contacts, fault.any(), kind, ttc
     touching = overlaps(frame, scene.slot)
-    fresh = first_contacts(contacts, touching)
-    speed = jnp.maximum(scene.history[-1, MOTION_SPEED], scene.history[-2, MOTION_SPEED])
-    others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
-    fault, collision_type = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
-    return next_contacts(contacts, touching, frame.valid, fault), fault, collision_type
+    if reads & _FAULTS:
+        fresh = first_contacts(contacts, touching)
+        speed = jnp.maximum(scene.history[-1, MOTION_SPEED], scene.history[-2, MOTION_SPEED])
+        others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
+        fault, kind = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
+    codes = next_contacts(contacts, touching, frame.valid, fault)
+    if "ttc_s" in reads:
+        ttc = time_to_collision(frame, scene.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT))
+    return codes, fault.any(), kind, ttc
 
 
-def _on_the_map(
-    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""]
-) -> tuple[LaneHits, Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """Lanes around a box, how far its worst corner is off the road (m), whether it left the map, or only the road."""
-    box_corners = corners(me)
-    lanes = around_lanes(bank, index, me[:2], me[2:4], box_corners, ground)
-    beyond = offroad_distance(bank, index, me[:2], box_corners, lanes.points_near, ground).max()
+def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
+    """The facts that are wanted; None in place of the others."""
+
+    def keep(path: tuple[Any, ...], fact: Array) -> Array | None:
+        return fact if path[0].name in reads else None
+
+    return facts if reads == FACTS else jax.tree_util.tree_map_with_path(keep, facts)
+
+
+def _off_the_road(
+    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""], lanes: LaneHits
+) -> tuple[Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
+    """How far a box's worst corner is off the road (m), whether it left the map, or only the road."""
+    beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
     left_map = left_the_map(bank, index, me[:2])
-    return lanes, beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
-
-
-def _norm(vector: Float[Array, "... 2"]) -> Float[Array, ...]:
-    return jnp.sqrt(jnp.sum(vector * vector, axis=-1))
+    return beyond, left_map, (beyond > OFFROAD_TOLERANCE_M) & ~left_map & is_mapped(bank, index)
 
 
 def _speed(frame: Frame) -> Float[Array, " S"]:
-    return _norm(frame.velocity)
+    return norm(frame.velocity)
 
 
 def _rates(

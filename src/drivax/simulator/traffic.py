@@ -1,4 +1,7 @@
-"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded."""
+"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded.
+
+Others: ``simulator.reactive`` (``idm``) and ``simulator.override``; ``simulator.catalogue`` knows them by name.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_Z, WORD, ScenarioBank
 from drivax.simulator.types import HISTORY, Frame, Scene
 
 
@@ -56,33 +59,39 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
 def frame_of(
     bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: Scene, back: int
 ) -> Frame:
-    """Everyone at one step: traffic's rows, the driven agents put in their place, then the parked ones.
+    """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         step: The present step; the frame is that of ``step - back``.
         agents: Rows of the moving slots, from the traffic model.
-        cast: Scenes of all driven agents of the scenario, stacked ``[K]``.
-        back: How many steps ago, 0 to 15.
+        cast: Scenes of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are nobody's.
+        back: How many steps ago, 0 to 15; reactive traffic remembers 9.
     """
     driven = cast.history[:, HISTORY - 1 - back]
     cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
     one = jnp.ones_like(cos)
-    rows = [driven[:, 0], driven[:, 1], cast.z, cos, sin, driven[:, 3] * cos, driven[:, 3] * sin, one]
+    # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
+    rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
+    rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
     # Before the recording nobody else was seen.
     agents = agents.at[:, AGENT_VALID].mul(step >= back)
-    agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1))
-    box, parked = bank.agent_box[index], bank.parked[index]
-    there = bank.parked_valid[index, jnp.clip(step - back, 0, bank.steps - 1)] & (step >= back)
+    z = agents[:, AGENT_Z].at[cast.slot].set(cast.z, mode="drop")
+    agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
+    box = bank.agent_box[index]
+    at = jnp.clip(step - back, 0, bank.steps - 1)
+    bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
+    there = (bit & 1 > 0) & (step >= back)
+    parked, more = bank.parked[index], len(box) - len(agents)
+    z = jnp.where(there, parked[:, AGENT_Z], jnp.pad(z, (0, more)))
+    agents = jnp.where(there[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
     return Frame(
-        box=jnp.concatenate(
-            [jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1), parked[:, :6]]
-        ),
-        velocity=jnp.concatenate([agents[:, 5:7], jnp.zeros((parked.shape[0], 2))]),
-        z=jnp.concatenate([agents[:, 2], parked[:, 6]]),
-        valid=jnp.concatenate([agents[:, 7] > 0, there]),
-        kind=jnp.concatenate([box[:, 3], parked[:, 7]]).astype(jnp.int32),
+        box=jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1),
+        velocity=agents[:, 5:7],
+        z=z,
+        valid=agents[:, 7] > 0,
+        kind=box[:, 3].astype(jnp.int32),
     )
 
 

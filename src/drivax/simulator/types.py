@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import fields
+from typing import Any, Protocol, cast, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Int
 
@@ -25,7 +26,7 @@ class Scene:
         step: Time step t in the log.
         slot: Agent slot that is driven (0: ego).
         history: x, y, heading, speed of the driven agent over the last 16 steps; the last row is now.
-        action: The last action, in the action space's own units ([-1, 1]^2 for the continuous ones).
+        action: The last action as it was carried out, within bounds and actuator rates; D numbers (2 by default).
         route_m: Arc length along the route to the goal, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
         traffic: State of the traffic model; an empty tuple where the others replay the log.
@@ -35,7 +36,7 @@ class Scene:
     step: Int[Array, "*batch"]
     slot: Int[Array, "*batch"]
     history: Float[Array, "*batch 16 4"]
-    action: Float[Array, "*batch 2"]
+    action: Float[Array, "*batch D"]
     route_m: Float[Array, "*batch"]
     z: Float[Array, "*batch"]
     traffic: Any
@@ -43,7 +44,7 @@ class Scene:
 
 @record
 class Frame:
-    """Everyone at one step: the A moving slots of the bank, then its P parked ones.
+    """Everyone at one step: in each of the S slots a moving or a parked agent, or nobody.
 
     Attributes:
         box: x, y, cos, sin, length, width.
@@ -66,7 +67,8 @@ class Facts:
 
     ``ttc_defined`` is false while standing; ``limit_mps`` is -1 where no limit is known; ``routed`` says whether the
     agent has a route of its own (ego, on lanes), without which progress and ``off_route`` mean nothing; ``logged``
-    whether the log has the agent at this step; ``ignored`` counts overlaps that do not count.
+    whether the log has the agent at this step; ``ignored`` counts overlaps that do not count. A fact that the task does
+    not ask for (``Task.reads``) is neither measured nor carried: it is None.
     """
 
     collision: Bool[Array, "*batch"]
@@ -94,6 +96,10 @@ class Facts:
     lateral_acceleration_mps2: Float[Array, "*batch"]
     acceleration_mps2: Float[Array, "*batch"]
     jerk_mps3: Float[Array, "*batch"]
+
+
+#: Names of all facts.
+FACTS = frozenset(field.name for field in fields(cast(Any, Facts)))
 
 
 @record
@@ -155,7 +161,7 @@ class Transition:
 
     Attributes:
         before, after: States on both sides.
-        action: What was done, in the action space.
+        action: What was asked for, in the action space.
         reward: Weighted sum of the reward terms.
         reward_terms: Each weighted term by name.
         terminated: The episode ended for good: bootstrap zero.
@@ -164,7 +170,7 @@ class Transition:
 
     before: SimState
     after: SimState
-    action: Float[Array, "*batch 2"]
+    action: Float[Array, "*batch D"]
     reward: Float[Array, "*batch"]
     reward_terms: dict[str, Float[Array, "*batch"]]
     terminated: Bool[Array, "*batch"]
@@ -173,7 +179,10 @@ class Transition:
 
 @runtime_checkable
 class Traffic(Protocol):
-    """How everyone who is not driven moves; ``name`` is what tables call it."""
+    """How everyone who is not driven moves; ``name`` is what tables call it.
+
+    A model that needs something precomputed also has ``prepare(bank) -> bank``, which evaluation calls.
+    """
 
     @property
     def name(self) -> str:
@@ -197,10 +206,25 @@ class Traffic(Protocol):
 class Task(Protocol):
     """What makes it a learning problem; satisfied by ``tasks.Task``, which the simulator never imports."""
 
+    @property
+    def reads(self) -> frozenset[str]:
+        """Names of the facts that anything here looks at; no others are measured."""
+        ...
+
     def motion(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length: Any
+        self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
     ) -> Float[Array, " 4"]:
         """Next motion of the driven agent for an action of the task's action space."""
+        ...
+
+    def actuated(
+        self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
+    ) -> Float[Array, " D"]:
+        """What is carried out when ``action`` is asked for and ``last`` was carried out a step ago."""
+        ...
+
+    def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
+        """What counts as the last action when an episode begins; its size is that of every action."""
         ...
 
     def observe(self, bank: ScenarioBank, scene: Scene, agents: Any, frame: Frame) -> Mapping[str, Any]:
@@ -221,6 +245,8 @@ class Task(Protocol):
         """Empty metric accumulators."""
         ...
 
-    def episode_add(self, episode: Any, state: SimState, final: Bool[Array, ""]) -> Any:
-        """Accumulators after one more step."""
+    def episode_add(
+        self, episode: Any, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+    ) -> Any:
+        """Accumulators after the step that led to ``found``, in an episode that began at step ``start``."""
         ...

@@ -1,33 +1,48 @@
-"""How fast the simulator steps on this machine, as a whole and by part."""
+"""How fast the simulator steps on this machine: as a whole, by part, and by what is measured.
+
+Every device steps its share of the environments. A CPU is one device unless :func:`use_all_cores` makes each core one,
+which is faster: most operations of a step are too small to be worth dividing between cores.
+"""
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
 
+from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.metrics.episode import episode_add, episode_metrics
+from drivax.metrics.selection import Wanted
+from drivax.planners.idm import IdmPlanner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.exhaustive import without_grid
 from drivax.scenario.queries import around_lanes, left_of_edges, project_on_route
+from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import alone
-from drivax.simulator.types import SimState
+from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.runs import versions
 
-#: Standard deviation of the random actions that drive the benchmark.
-_NOISE = 0.1
+#: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; the best of the last counts.
+METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
+#: Environments of which the compiler counts operations and bytes.
+_COUNTED = 16384
+#: Actions, observations and everyone now; and states, whose episodes are over, what was earned, and the former.
+_Driven = tuple[Array, Mapping[str, Array], Frame]
+_Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
 
 
 @dataclass(frozen=True)
@@ -35,81 +50,238 @@ class BenchConfig:
     """What is timed.
 
     Attributes:
-        batch: Environments side by side.
+        batch: Environments side by side, a multiple of the number of devices.
         steps: Steps per timed call.
         repeats: Timed calls; the median counts.
-        task: Observation and reward.
+        task: Observation, reward, metrics.
+        traffic: How the others move.
     """
 
     batch: int = 256
     steps: int = 80
     repeats: int = 7
     task: Task = field(default_factory=Task)
+    traffic: str = "log"
+
+
+def use_all_cores() -> None:
+    """Makes every core that this process may use a device of its own; without effect once JAX has started."""
+    with suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
 
 def bench(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
-    """Times stepping with resets, observation, reward and all metrics, and each part alone.
+    """Times stepping with resets, observation, reward and metrics, driven by IDM, and each part alone.
 
     Args:
         bank: Distinct scenarios; every episode that ends begins another at random.
         config: Sizes.
 
     Returns:
-        The contract of ``drivax bench --json``: ``by_part`` in microseconds per environment and step.
+        The contract of ``drivax bench --json``: ``by_part`` in microseconds per environment and step, ``cost_by_part``
+        in operations and bytes, by the compiler's own count of the part compiled alone.
     """
     config = config or BenchConfig()
-    simulator = Simulator(config.task)
-    index = jax.random.randint(jax.random.key(1), (config.batch,), 0, len(bank))
-    states = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
-    whole = jax.jit(partial(_run, simulator, config))
-    began = time.perf_counter()
-    compiled = whole.lower(bank, states, jax.random.key(0)).compile()
-    compile_seconds = time.perf_counter() - began
-    seconds = _median(lambda: compiled(bank, states, jax.random.key(2)), config.repeats)
-    parts = {name: _time_part(config, part, bank, states) for name, part in _parts(simulator).items()}
+    simulator, bank = _simulator(bank, config)
+    whole = compiled(bank, config)
+    states = _states(simulator, bank, config.batch)
+    parts = _parts(simulator)
+    seconds = {name: _time_part(config, part, bank, states) for name, part in parts.items()}
     whole_bank = without_grid(bank)
-    brute = sum(
-        _time_part(config, _parts(simulator)[name], whole_bank, states) for name in ("edges", "lanes")
-    )
+    brute = sum(_time_part(config, parts[name], whole_bank, states) for name in ("edges", "lanes"))
     return {
-        "environment_steps_per_second": round(config.batch * config.steps / seconds),
+        "environment_steps_per_second": round(steps_per_second([whole], config.repeats)[0]),
         "batch": config.batch,
+        "devices": jax.device_count(),
         "scenarios": len(bank),
-        "state_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
+        "traffic": simulator.traffic.name,
+        "state_bytes": whole.state_bytes,
         "bank_bytes_per_scenario": bank.nbytes // len(bank),
-        "compile_seconds": round(compile_seconds, 2),
-        "brute_force_ratio": round(brute / (parts["edges"] + parts["lanes"]), 2),
-        "by_part": {name: round(value, 3) for name, value in parts.items()},
+        "compile_seconds": round(whole.compile_seconds, 2),
+        "brute_force_ratio": round(brute / (seconds["edges"] + seconds["lanes"]), 2),
+        "by_part": {name: round(value, 3) for name, value in seconds.items()},
+        "cost_by_part": {name: _cost(part, bank, states) for name, part in parts.items()},
         "versions": versions(),
     }
 
 
+def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict[str, Any]:
+    """Steps per second by set of metrics and batch size, relative to the full set at batch 32 (as the published table).
+
+    Returns:
+        The contract of ``drivax bench --metrics --json``: ``rows`` of ``metrics``, ``batch``, ``best`` (it is the
+        fastest of the larger sizes), ``steps_per_second`` and ``relative``.
+    """
+    config = config or BenchConfig()
+
+    def program(metrics: Wanted, batch: int) -> Program:
+        task = replace(config.task, metrics=metrics)
+        return compiled(bank, replace(config, batch=batch, task=task))
+
+    bank = spread(bank)
+    kinds = [(metrics, batch) for metrics in METRIC_SETS for batch in (*BATCHES, *LARGER)]
+    speeds = dict(
+        zip(kinds, steps_per_second([program(*kind) for kind in kinds], config.repeats), strict=True)
+    )
+    rows = []
+    for metrics in METRIC_SETS:
+        best = max(LARGER, key=lambda batch: speeds[metrics, batch])
+        for batch in (*BATCHES, best):
+            value = speeds[metrics, batch]
+            rows.append(
+                {"metrics": metrics, "batch": batch, "best": batch not in BATCHES, "steps_per_second": value}
+            )
+    base = next(r["steps_per_second"] for r in rows if (r["metrics"], r["batch"]) == ("full", BATCHES[0]))
+    rows = [
+        row
+        | {
+            "steps_per_second": round(row["steps_per_second"]),
+            "relative": round(row["steps_per_second"] / base, 2),
+        }
+        for row in rows
+    ]
+    return {"scenarios": len(bank), "rows": rows, "versions": versions()}
+
+
+@dataclass(frozen=True)
+class Program:
+    """A compiled program that steps a batch.
+
+    Attributes:
+        run: Steps it; what it returns must be waited for.
+        steps: Environment steps of a run that count; those that only begin an episode do not.
+        compile_seconds: From the traced function to the program.
+        state_bytes: State of one environment.
+        temporary_bytes: What the program needs beside bank and states, per environment.
+    """
+
+    run: Callable[[], Any]
+    steps: int
+    compile_seconds: float
+    state_bytes: int
+    temporary_bytes: int
+
+
+def compiled(bank: ScenarioBank, config: BenchConfig) -> Program:
+    """One program that steps, resets, observes, rewards and judges a batch, driven by IDM."""
+    simulator, bank = _simulator(bank, config)
+    states = _states(simulator, bank, config.batch)
+    keys = jax.random.split(jax.random.key(2), jax.device_count())
+    carry = _carry(simulator, config, bank, states)
+    began = time.perf_counter()
+    program = _shared(lambda *args: _run(simulator, config, *args)).lower(bank, carry, keys).compile()
+    seconds = time.perf_counter() - began
+    memory = program.memory_analysis()
+    return Program(
+        run=lambda: program(bank, carry, keys),
+        steps=int(program(bank, carry, keys)[1].sum()),
+        compile_seconds=seconds,
+        state_bytes=sum(leaf.nbytes for leaf in jax.tree.leaves(states)) // config.batch,
+        temporary_bytes=0
+        if memory is None
+        else memory.temp_size_in_bytes * jax.device_count() // config.batch,
+    )
+
+
+def steps_per_second(programs: Sequence[Program], repeats: int) -> list[float]:
+    """Environment steps per second of each program, medians of timings by turns."""
+    times: list[list[float]] = [[] for _ in programs]
+    for turn in range(repeats + 1):
+        for program, seen in zip(programs, times, strict=True):
+            began = time.perf_counter()
+            jax.block_until_ready(program.run())
+            if turn:
+                seen.append(time.perf_counter() - began)
+    return [program.steps / statistics.median(seen) for program, seen in zip(programs, times, strict=True)]
+
+
+def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, ScenarioBank]:
+    """The simulator, and the bank on every device."""
+    if config.batch % jax.device_count():
+        raise UsageError(
+            f"a batch of {config.batch} does not divide among {jax.device_count()} devices",
+            cure="give a multiple",
+        )
+    traffic = make_traffic(config.traffic)
+    return Simulator(config.task, traffic), spread(prepared(traffic, bank))
+
+
+def spread(bank: ScenarioBank) -> ScenarioBank:
+    """The bank on every device; without cost where it is there already."""
+    return jax.device_put(bank, NamedSharding(_mesh(), PartitionSpec()))
+
+
+def _states(simulator: Simulator, bank: ScenarioBank, batch: int) -> SimState:
+    index = jax.random.randint(jax.random.key(1), (batch,), 0, len(bank))
+    states = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
+    return jax.device_put(states, NamedSharding(_mesh(), PartitionSpec("device")))
+
+
+def _mesh() -> Mesh:
+    return jax.make_mesh((jax.device_count(),), ("device",), axis_types=(AxisType.Auto,))
+
+
+def _shared(function: Callable[..., Any]) -> Any:
+    """A program of bank, states and keys in which every device has its share of the states, and a key."""
+    share = PartitionSpec("device")
+    return jax.jit(
+        jax.shard_map(
+            function, mesh=_mesh(), in_specs=(PartitionSpec(), share, share), out_specs=share, check_vma=False
+        )
+    )
+
+
 def _run(
-    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState, key: Array
-) -> Array:
-    """Steps a batch; the sum of everything that was computed, so that nothing is optimised away."""
-    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
-    observe = jax.vmap(simulator.observe, in_axes=(None, 0))
+    simulator: Simulator, config: BenchConfig, bank: ScenarioBank, carry: _Carry, keys: Array
+) -> tuple[Any, Array]:
+    """Steps a batch; what was earned and is seen, so that nothing is optimised away, and how many were steps."""
+    key, batch = keys[0], carry[1].shape[0]
+    begin = jax.vmap(simulator.scene, in_axes=(None, 0))
+    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
 
-    def one(carry: tuple[SimState, Array, Array, Array], _: None) -> tuple[Any, None]:
-        states, over, key, total = carry
-        key, action_key, index_key = jax.random.split(key, 3)
-        action = _NOISE * jax.random.normal(action_key, (config.batch, 2))
-        index = jax.random.randint(index_key, (config.batch,), 0, len(bank))
-        states, transition = step(bank, states, action, over, index)
-        seen = [jnp.sum(value, dtype=jnp.float32) for value in jax.tree.leaves(observe(bank, states.scene))]
-        metrics = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
-        total += sum(seen) + transition.reward.sum() + sum(v.value.sum() for v in metrics.values())
-        return (states, transition.terminated | transition.truncated, key, total), None
+    def judged(states: SimState) -> Array:
+        values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
+        return jnp.sum(jnp.asarray([value.value for value in values.values()], jnp.float32))
 
-    start = (states, jnp.zeros(config.batch, bool), key, jnp.zeros(()))
-    return jax.lax.scan(one, start, None, config.steps)[0][3]
+    def one(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
+        states, over, total, (action, _, seen) = carry
+        states, transition = step(bank, states, action, over, begin(bank, index), seen)
+        done = transition.terminated | transition.truncated
+        # As in training: metrics are computed when some episode of the batch ends.
+        total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
+        total += transition.reward
+        # Here, where everyone is at hand, and not at the beginning of the next round.
+        return (states, done, total, _driven(simulator, config, bank, states)), (~over).sum()
+
+    begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
+    (_, _, total, driven), alive = jax.lax.scan(one, carry, begins)
+    return (total, driven), alive.sum()[None]
+
+
+def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Driven:
+    """The driver's actions, the task's observations and everyone now."""
+    driver = IdmPlanner(config.task.actions)
+
+    def one(state: SimState) -> _Driven:
+        situation = simulator.situation(bank, state)
+        action, _ = driver.act((), bank, state, situation, None, jax.random.key(0))
+        return action, simulator.observe(bank, state.scene), situation.surroundings.frame
+
+    return jax.vmap(one)(states)
+
+
+def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Carry:
+    """Before the first round, in which every episode begins, nothing is driven or seen."""
+    driven = jax.eval_shape(lambda: _driven(simulator, config, bank, states))
+    driven = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), driven)
+    begins = jnp.ones(config.batch, bool), jnp.zeros(config.batch)
+    return states, *jax.device_put((*begins, driven), NamedSharding(_mesh(), PartitionSpec("device")))
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
 
 
-def _parts(simulator: Simulator) -> dict[str, Part]:
+def _parts(simulator: Simulator) -> Mapping[str, Part]:
     """Parts of a step, unbatched; each alone, so what they share is counted in each."""
 
     def frame(bank: ScenarioBank, state: SimState) -> Any:
@@ -120,19 +292,28 @@ def _parts(simulator: Simulator) -> dict[str, Part]:
         size = bank.agent_box[state.scene.index, state.scene.slot]
         return jnp.stack([x, y, jnp.cos(heading), jnp.sin(heading), size[0], size[1]])
 
+    def ground(bank: ScenarioBank, state: SimState) -> Array:
+        return state.scene.z - bank.agent_box[state.scene.index, state.scene.slot, 2] / 2
+
     def edges(bank: ScenarioBank, state: SimState) -> Any:
         me = box(bank, state)
-        return left_of_edges(bank, state.scene.index, me[:2], corners(me), jnp.zeros(()))
+        return left_of_edges(bank, state.scene.index, me[:2], corners(me), ground(bank, state))
 
     def lanes(bank: ScenarioBank, state: SimState) -> Any:
         me = box(bank, state)
-        return around_lanes(bank, state.scene.index, me[:2], me[2:4], corners(me), jnp.zeros(()))
+        return around_lanes(bank, state.scene.index, me[:2], me[2:4], corners(me), ground(bank, state))
 
     def route(bank: ScenarioBank, state: SimState) -> Any:
         return project_on_route(bank, state.scene.index, state.scene.history[-1, :2], state.scene.route_m)
 
     def ttc(bank: ScenarioBank, state: SimState) -> Any:
         return time_to_collision(frame(bank, state), state.scene.slot, state.contacts == Contact.IGNORED)
+
+    def metrics(bank: ScenarioBank, state: SimState) -> Any:
+        found = simulator.situation(
+            bank, state
+        )  # no metric here looks at its surroundings, so they cost nothing
+        return episode_add(state.episode, found, state.start, jnp.zeros((), bool))
 
     return {
         "dynamics": lambda bank, state: bicycle(state.scene.history[-1], jnp.ones(()), jnp.full((), 0.1)),
@@ -142,36 +323,64 @@ def _parts(simulator: Simulator) -> dict[str, Part]:
         "edges": edges,
         "lanes": lanes,
         "route": route,
-        "metrics": lambda bank, state: episode_add(state.episode, state, jnp.zeros((), bool)),
+        "metrics": metrics,
         "observation": lambda bank, state: simulator.observe(bank, state.scene),
         "reset": lambda bank, state: simulator.reset(bank, state.scene.index),
-        "step": lambda bank, state: simulator.step(bank, state, jnp.zeros(2)),
+        "step": lambda bank, state: simulator.step(bank, state, state.scene.action),
     }
+
+
+def _total(part: Part, bank: ScenarioBank, state: SimState) -> Array:
+    leaves = jax.tree.leaves(part(bank, state))
+    return sum((jnp.sum(leaf, dtype=jnp.float32) for leaf in leaves), start=jnp.zeros(()))
+
+
+def _rounds(config: BenchConfig, part: Part) -> Callable[[ScenarioBank, SimState], Array]:
+    """A program that computes one part again and again."""
+
+    def many(bank: ScenarioBank, states: SimState, _: Any) -> Array:
+        def one(shift: Array, _: None) -> tuple[Array, None]:
+            seen = jax.vmap(lambda state, by: _total(part, bank, _shifted(state, by)))(states, shift)
+            # The next round depends on this one, so that nothing is taken out of the loop.
+            return shift + 1e-20 * jnp.where(jnp.isfinite(seen), seen, 0.0), None
+
+        return jax.lax.scan(one, jnp.zeros(states.start.shape), None, config.steps)[0]
+
+    program = _shared(many)
+    return lambda bank, states: program(bank, states, None)
 
 
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
     """Microseconds per environment and step of one part."""
-
-    def total(bank: ScenarioBank, state: SimState) -> Array:
-        leaves = jax.tree.leaves(part(bank, state))
-        return sum((jnp.sum(leaf, dtype=jnp.float32) for leaf in leaves), start=jnp.zeros(()))
-
-    @jax.jit
-    def many(bank: ScenarioBank, states: SimState) -> Array:
-        def one(history: Array, _: None) -> tuple[Array, None]:
-            moved = jax.vmap(lambda s, h: _with_history(s, h))(states, history)
-            seen = jax.vmap(total, in_axes=(None, 0))(bank, moved)
-            # The next round depends on this one, so that nothing is hoisted out of the loop.
-            return history + 1e-9 * seen[:, None, None], None
-
-        return jax.lax.scan(one, states.scene.history, None, config.steps)[0]
-
+    many = _rounds(config, part)
     seconds = _median(lambda: many(bank, states), config.repeats)
     return seconds / config.steps / config.batch * 1e6
 
 
-def _with_history(state: SimState, history: Array) -> SimState:
-    return replace(state, scene=replace(state.scene, history=history))
+def _shifted(state: SimState, by: Array) -> SimState:
+    """The same state, which the compiler cannot know: ``by`` is far too small to move anything."""
+    scene = state.scene
+    moved = replace(scene, history=scene.history + by, index=scene.index + by.astype(jnp.int32))
+    return replace(state, scene=moved)
+
+
+def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:
+    """Operations and bytes read and written of one part, per environment, as the compiler counts them.
+
+    It counts an indexed array as read whole, so it is asked about very many environments in one scenario: what is left
+    per environment are the rows that are taken from the bank, and everything that is made of them.
+    """
+
+    def like(leaf: Array, rows: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((rows, *leaf.shape[1:]), leaf.dtype)
+
+    one = jax.tree.map(lambda leaf: like(leaf, 1), bank)
+    many = jax.tree.map(lambda leaf: like(leaf, _COUNTED), states)
+    counted = jax.jit(jax.vmap(part, in_axes=(None, 0))).lower(one, many).compile().cost_analysis() or {}
+    return {
+        "operations": round(counted.get("flops", 0.0) / _COUNTED),
+        "bytes": round(counted.get("bytes accessed", 0.0) / _COUNTED),
+    }
 
 
 def _median(call: Callable[[], Any], repeats: int) -> float:

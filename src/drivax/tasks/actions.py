@@ -1,51 +1,334 @@
-"""Action spaces: from a policy's action in [-1, 1]^2 to acceleration and curvature, and back. Zero maps to zero."""
+"""Action spaces: what a policy's action means, how it moves the agent, and which action follows a log.
+
+Three drive the kinematic bicycle by acceleration and curvature: :class:`Physical` (default), :class:`Published` and
+:class:`Discrete`. :class:`DeltaLocal` displaces the agent, :class:`DirectState` puts it somewhere. Actions lie in
+[-1, 1] in every dimension and zero means zero, :class:`DirectState` aside.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.geometry.angles import wrap
+from drivax.scenario.schema import DT_S
+from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
 
 #: Wheelbase as a share of the length, for steering angles (semantics, ``published``).
 _WHEELBASE = 0.6
+#: An action may be this far outside [-1, 1], by rounding, without being clipped.
+_ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
-class ActionSpace:
-    """Bounds of an action space.
+class Physical:
+    """Acceleration and curvature of the bicycle.
 
     Attributes:
-        kind: ``physical``: acceleration and curvature; ``published``: acceleration and steering angle.
         braking_mps2, acceleration_mps2: What -1 and +1 mean for the first action.
-        steering: What 1 means for the second action: curvature in 1/m, or angle in rad.
+        steering: What 1 means for the second action: curvature, 1/m.
+        jerk_mps3: Largest change of the acceleration per second; none by default.
+        steering_rate: Largest change of the second action's quantity per second, 1/m/s; none by default.
     """
 
-    kind: Literal["physical", "published"] = "physical"
     braking_mps2: float = 6.0
     acceleration_mps2: float = 6.0
     steering: float = 0.3
+    jerk_mps3: float | None = None
+    steering_rate: float | None = None
+
+    @property
+    def size(self) -> int:
+        """Numbers in an action."""
+        return 2
 
     def command(self, action: Float[Array, " 2"], length_m: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Acceleration (m/s2) and curvature (1/m) of an action; actions beyond [-1, 1] are clipped."""
-        action = jnp.clip(action, -1.0, 1.0)
-        scale = jnp.where(action[0] < 0, self.braking_mps2, self.acceleration_mps2)
-        steering = action[1] * self.steering
-        if self.kind == "published":
-            steering = jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, 1.0))
-        return action[0] * scale, steering
+        acceleration, steering = self._quantities(jnp.clip(action, -1.0, 1.0))
+        return acceleration, self._curvature(steering, length_m)
 
     def action(
-        self, acceleration: Float[Array, ""], curvature: Float[Array, ""], length_m: Any
-    ) -> Float[Array, " 2"]:
+        self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
+        length_m: Any,
+    ) -> Float[Array, " 2"]:  # fmt: skip
         """The action that commands this; not clipped, so that what lies outside [-1, 1] can be seen."""
+        return self._action(acceleration, self._steering(curvature, length_m))
+
+    def expert(
+        self,
+        motion: Float[Array, " 4"],
+        target: Float[Array, " 4"],
+        beyond: Float[Array, " 4"],
+        length_m: Any,
+    ) -> Float[Array, " 2"]:
+        """The action that follows a log, given its motions one and two steps ahead; not clipped."""
+        return self.action(motion, *follow(motion, target, beyond), length_m)
+
+    def clipped(self, action: Float[Array, " 2"]) -> Bool[Array, ""]:
+        """Whether an action lies outside the bounds, so that driving it would do something else."""
+        return (jnp.abs(action) > 1.0 + _ROUNDING).any()
+
+    def actuated(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], last: Float[Array, " 2"]
+    ) -> Float[Array, " 2"]:
+        """What is carried out when ``action`` is asked for and ``last`` was carried out a step ago.
+
+        Clips to the bounds and to the actuators' rates. A car that stands has let go of its last braking: its
+        acceleration is zero, whatever the brake was asked for.
+        """
+        action = jnp.clip(action, -1.0, 1.0)
+        if self.jerk_mps3 is None and self.steering_rate is None:
+            return action
+        acceleration, steering = self._quantities(action)
+        had, steered = self._quantities(last)
+        had = jnp.where(motion[3] > 0.0, had, jnp.maximum(had, 0.0))
+        if self.jerk_mps3 is not None:
+            acceleration = jnp.clip(acceleration, had - self.jerk_mps3 * DT_S, had + self.jerk_mps3 * DT_S)
+        if self.steering_rate is not None:
+            reach = self.steering_rate * DT_S
+            steering = jnp.clip(steering, steered - reach, steered + reach)
+        return self._action(acceleration, steering)
+
+    def move(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length_m: Any
+    ) -> Float[Array, " 4"]:
+        """The motion one step later."""
+        return bicycle(motion, *self.command(action, length_m))
+
+    def sharpest(self, length_m: Any) -> Any:
+        """The largest curvature that can be asked for, 1/m."""
+        return self._curvature(jnp.asarray(self.steering), length_m)
+
+    def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 2"]:
+        """What counts as the last action when an episode begins: none, or what the actuators did in the log."""
+        if self.jerk_mps3 is None and self.steering_rate is None:
+            return jnp.zeros(2)
+        command = command_between(history[-2], history[-1])
+        return jnp.clip(self.action(history[-1], *command, length_m), -1.0, 1.0)
+
+    def _quantities(self, action: Float[Array, " 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        scale = jnp.where(action[0] < 0, self.braking_mps2, self.acceleration_mps2)
+        return action[0] * scale, action[1] * self.steering
+
+    def _action(self, acceleration: Float[Array, ""], steering: Float[Array, ""]) -> Float[Array, " 2"]:
         scale = jnp.where(acceleration < 0, self.braking_mps2, self.acceleration_mps2)
-        steering = curvature
-        if self.kind == "published":
-            steering = jnp.arctan(curvature * _WHEELBASE * jnp.maximum(length_m, 1.0))
         return jnp.stack([acceleration / scale, steering / self.steering])
 
+    def _curvature(self, steering: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+        return steering
 
-PHYSICAL = ActionSpace()
-PUBLISHED = ActionSpace(kind="published", braking_mps2=4.0, acceleration_mps2=2.0, steering=0.3)
+    def _steering(self, curvature: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+        return curvature
+
+
+@dataclass(frozen=True)
+class Published(Physical):
+    """Acceleration and steering angle, as published: k = tan(angle) / (0.6 length).
+
+    Attributes:
+        braking_mps2, acceleration_mps2: What -1 and +1 mean for the first action.
+        steering: What 1 means for the second action: steering angle, rad.
+        jerk_mps3: Largest change of the acceleration per second; none by default.
+        steering_rate: Largest change of the steering angle per second, rad/s; none by default.
+    """
+
+    braking_mps2: float = 4.0
+    acceleration_mps2: float = 2.0
+
+    def _curvature(self, steering: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+        return jnp.tan(steering) / (_WHEELBASE * jnp.maximum(length_m, 1.0))
+
+    def _steering(self, curvature: Float[Array, ""], length_m: Any) -> Float[Array, ""]:
+        return jnp.arctan(curvature * _WHEELBASE * jnp.maximum(length_m, 1.0))
+
+
+@dataclass(frozen=True)
+class Discrete(Physical):
+    """``physical``, of which only some levels can be chosen: the nearest one is carried out.
+
+    Level i of n, counted from the middle, is ``sign(i) (|i| / ((n - 1) / 2)) ** density`` of the bound.
+
+    Attributes:
+        accelerations, curvatures: Number of levels of either action; odd, so that zero is one of them.
+        density: How much denser levels lie near zero; 1 is evenly spaced.
+    """
+
+    accelerations: int = 7
+    curvatures: int = 13
+    density: float = 2.0
+
+    def __post_init__(self) -> None:
+        counts = (self.accelerations, self.curvatures)
+        if min(counts) < 3 or any(count % 2 == 0 for count in counts):
+            raise UsageError(
+                f"{self.accelerations} x {self.curvatures} levels", cure="use odd numbers, at least 3"
+            )
+        if self.density < 1.0:
+            raise UsageError(f"density is {self.density:g}", cure="use 1 (even) or more (denser near zero)")
+
+    @property
+    def choices(self) -> int:
+        """Number of different actions."""
+        return self.accelerations * self.curvatures
+
+    def levels(self) -> tuple[Float[Array, " A"], Float[Array, " C"]]:
+        """The levels of both actions in [-1, 1], ascending."""
+        return _levels(self.accelerations, self.density), _levels(self.curvatures, self.density)
+
+    def of_index(self, index: Int[Array, ""]) -> Float[Array, " 2"]:
+        """The action of choice ``index``: acceleration level ``index // curvatures``, curvature level the rest."""
+        accelerations, curvatures = self.levels()
+        return jnp.stack([accelerations[index // self.curvatures], curvatures[index % self.curvatures]])
+
+    def index(self, action: Float[Array, " 2"]) -> Int[Array, ""]:
+        """The choice nearest to an action."""
+        accelerations, curvatures = self.levels()
+        row = jnp.argmin(jnp.abs(accelerations - action[0]))
+        return row * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
+
+    def actuated(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], last: Float[Array, " 2"]
+    ) -> Float[Array, " 2"]:
+        """The nearest level, then as :class:`Physical`."""
+        return super().actuated(motion, self.of_index(self.index(action)), last)
+
+
+def _levels(count: int, density: float) -> Float[Array, " count"]:
+    half = count // 2
+    return jnp.array([math.copysign((abs(i) / half) ** density, i) for i in range(-half, half + 1)])
+
+
+@dataclass(frozen=True)
+class DeltaLocal:
+    """A displacement in the agent's own frame: ahead, left, turn. Never backwards; without grip.
+
+    Attributes:
+        ahead_m, left_m: What 1 means for the first two actions.
+        turn_rad: What 1 means for the third.
+    """
+
+    ahead_m: float = 6.0
+    left_m: float = 6.0
+    turn_rad: float = math.pi
+
+    @property
+    def size(self) -> int:
+        """Numbers in an action."""
+        return 3
+
+    def action(
+        self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
+        length_m: Any,
+    ) -> Float[Array, " 3"]:  # fmt: skip
+        """The displacement along an arc after which the speed is what the acceleration makes of it; not clipped."""
+        distance = jnp.maximum(motion[3] + acceleration * DT_S, 0.0) * DT_S
+        turn = curvature * distance
+        return self._action(distance * jnp.stack([jnp.cos(turn / 2), jnp.sin(turn / 2)]), turn)
+
+    def expert(
+        self,
+        motion: Float[Array, " 4"],
+        target: Float[Array, " 4"],
+        beyond: Float[Array, " 4"],
+        length_m: Any,
+    ) -> Float[Array, " 3"]:
+        """The displacement to the logged motion one step ahead; not clipped."""
+        return self._action(*displacement(motion, target))
+
+    def clipped(self, action: Float[Array, " 3"]) -> Bool[Array, ""]:
+        """Whether an action lies outside the bounds, or leads backwards by more than a millimetre."""
+        return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
+
+    def actuated(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 3"], last: Float[Array, " 3"]
+    ) -> Float[Array, " 3"]:
+        """The action within its bounds."""
+        return jnp.clip(action, jnp.array([0.0, -1.0, -1.0]), 1.0)
+
+    def move(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 3"], length_m: Any
+    ) -> Float[Array, " 4"]:
+        """The motion one step later."""
+        action = self.actuated(motion, action, action)
+        return displace(
+            motion, action[:2] * jnp.array([self.ahead_m, self.left_m]), action[2] * self.turn_rad
+        )
+
+    def sharpest(self, length_m: Any) -> Any:
+        """The largest curvature that can be asked for: any, 1/m."""
+        return jnp.inf
+
+    def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 3"]:
+        """Nothing."""
+        return jnp.zeros(3)
+
+    def _action(self, shift: Float[Array, " 2"], turn: Float[Array, ""]) -> Float[Array, " 3"]:
+        return jnp.stack([shift[0] / self.ahead_m, shift[1] / self.left_m, turn / self.turn_rad])
+
+
+@dataclass(frozen=True)
+class DirectState:
+    """The next motion itself, in the scenario's frame: x, y (m), heading (rad), speed (m/s, negative counts as 0).
+
+    For drivers that have computed a trajectory and for optimising one; policies do not learn in it.
+    """
+
+    @property
+    def size(self) -> int:
+        """Numbers in an action."""
+        return 4
+
+    def action(
+        self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
+        length_m: Any,
+    ) -> Float[Array, " 4"]:  # fmt: skip
+        """Where the bicycle would get to."""
+        return bicycle(motion, acceleration, curvature)
+
+    def expert(
+        self,
+        motion: Float[Array, " 4"],
+        target: Float[Array, " 4"],
+        beyond: Float[Array, " 4"],
+        length_m: Any,
+    ) -> Float[Array, " 4"]:
+        """The logged motion one step ahead."""
+        return target
+
+    def clipped(self, action: Float[Array, " 4"]) -> Bool[Array, ""]:
+        """Never."""
+        return jnp.zeros((), bool)
+
+    def actuated(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 4"], last: Float[Array, " 4"]
+    ) -> Float[Array, " 4"]:
+        """The motion with its heading in [-pi, pi) and no negative speed."""
+        return jnp.stack([action[0], action[1], wrap(action[2]), jnp.maximum(action[3], 0.0)])
+
+    def move(
+        self, motion: Float[Array, " 4"], action: Float[Array, " 4"], length_m: Any
+    ) -> Float[Array, " 4"]:
+        """The motion one step later."""
+        return self.actuated(motion, action, action)
+
+    def sharpest(self, length_m: Any) -> Any:
+        """The largest curvature that can be asked for: any, 1/m."""
+        return jnp.inf
+
+    def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 4"]:
+        """Where the agent is."""
+        return history[-1]
+
+
+#: What ``task.actions`` can be; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local`` or
+#: ``direct_state``.
+ActionSpace = Physical | Published | Discrete | DeltaLocal | DirectState
+
+PHYSICAL, PUBLISHED, DISCRETE, DELTA_LOCAL, DIRECT_STATE = (
+    Physical(), Published(), Discrete(), DeltaLocal(), DirectState()
+)  # fmt: skip

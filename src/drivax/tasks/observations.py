@@ -8,17 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.angles import rotate
-from drivax.scenario.bank import ROUTE_LIMIT, ScenarioBank
+from drivax.scenario.bank import (
+    LIGHT_ARC,
+    LIGHT_COS,
+    LIGHT_SIN,
+    LIGHT_X,
+    LIGHT_Y,
+    NEVER_M,
+    ROAD_AREA,
+    ROAD_EDGE,
+    ROAD_LANE,
+    ROAD_NONE,
+    ROUTE_LIMIT,
+    ScenarioBank,
+)
 from drivax.scenario.queries import route_ahead
 from drivax.scenario.record import record
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, LightState
+from drivax.scenario.schema import Flag, LightState
 from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.tasks.own import own_name, refuse_taken
 
 POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
 #: Reach of the road group ahead, behind and to each side, m.
@@ -26,6 +41,62 @@ ROAD_AHEAD_M, ROAD_BEHIND_M, ROAD_SIDE_M = 70.0, 10.0, 25.0
 #: A stop line so far behind the ego is passed, m.
 _PASSED_M = 5.0
 Observation = dict[str, Array]
+#: Names of the groups of this module.
+GROUPS = ("ego", "ego_static", "agents", "road", "lights", "route")
+
+
+@record
+class View:
+    """The ego frame: x ahead, y to the left."""
+
+    xy: Float[Array, " 2"]
+    cos: Float[Array, ""]
+    sin: Float[Array, ""]
+
+    @classmethod
+    def of(cls, scene: Scene) -> View:
+        """The frame of the driven agent now."""
+        now = scene.history[-1]
+        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
+
+    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """A place of the world, m."""
+        return rotate(xy - self.xy, self.cos, -self.sin)
+
+    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """A direction or velocity of the world."""
+        return rotate(xy, self.cos, -self.sin)
+
+
+#: Everyone's frame so many steps ago, 0 to 15; the number is a plain one, known when the program is compiled.
+Frames = Callable[[int], Frame]
+#: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
+Feature = Callable[[ScenarioBank, Scene, Frames], Any]
+
+
+@dataclass(frozen=True)
+class OwnGroup:
+    """A group of features of the user's own.
+
+    Attributes:
+        feature: From bank, scene and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
+            boolean mask ``[...]`` of the rows that are there; ``testing.check_feature`` tells whether it keeps to the
+            rules.
+        name: Of the group; by default the function's own.
+    """
+
+    feature: Feature
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", own_name(self.feature, self.name))
+        if self.name.endswith("_mask"):
+            raise ValueError(f"a group cannot be called {self.name!r}; masks are named so")
+
+    def observe(self, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
+        """The group, and its mask where it has one."""
+        found = self.feature(bank, scene, frames)
+        return _masked(self.name, *found) if isinstance(found, tuple) else {self.name: found}
 
 
 @dataclass(frozen=True)
@@ -39,6 +110,7 @@ class ObservationConfig:
         edges: Whether the road group shows road edges beside lanes and crosswalks.
         lights: How many of the nearest lights on or near the route.
         route: Points of the route, ``route_step_m`` apart.
+        own: Groups beside those of this module.
     """
 
     agents: int = 16
@@ -48,8 +120,10 @@ class ObservationConfig:
     lights: int = 5
     route: int = 10
     route_step_m: float = 5.0
+    own: tuple[OwnGroup, ...] = ()
 
     def __post_init__(self) -> None:
+        refuse_taken("observation.own", [group.name for group in self.own], GROUPS)
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
 
@@ -62,9 +136,7 @@ PRESETS = {
 }
 
 
-def observe(
-    config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Callable[[int], Frame]
-) -> Observation:
+def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
     """The observation of a scene.
 
     Args:
@@ -75,41 +147,24 @@ def observe(
 
     Returns:
         ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last action.
-        ``agents [agents, steps, 12]`` with ``agents_mask [agents,
-        steps]``, ``road [road, 10]``, ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``.
+        ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
+        ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's own groups.
     """
-    view = _View.of(scene)
+    view = View.of(scene)
     result = _ego(config, bank, scene, view) | _agents(config, scene, view, frames)
     if config.road:
         result |= _road(config, bank, scene, view)
-    return result | _lights(config, bank, scene, view) | _route(config, bank, scene, view)
-
-
-@record
-class _View:
-    """The ego frame."""
-
-    xy: Float[Array, " 2"]
-    cos: Float[Array, ""]
-    sin: Float[Array, ""]
-
-    @classmethod
-    def of(cls, scene: Scene) -> _View:
-        now = scene.history[-1]
-        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
-
-    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        return rotate(xy - self.xy, self.cos, -self.sin)
-
-    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        return rotate(xy, self.cos, -self.sin)
+    result |= _lights(config, bank, scene, view) | _route(config, bank, scene, view)
+    for group in config.own:
+        result |= group.observe(bank, scene, frames)
+    return result
 
 
 def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> Observation:
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
-def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     past = scene.history[HISTORY - config.steps :]
     direction = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
     turned = view.vector(direction)
@@ -127,14 +182,12 @@ def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
     return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
 
 
-def _agents(
-    config: ObservationConfig, scene: Scene, view: _View, frames: Callable[[int], Frame]
-) -> Observation:
+def _agents(config: ObservationConfig, scene: Scene, view: View, frames: Frames) -> Observation:
     now = frames(0)
     slots = now.valid.shape[0]
     seen = now.valid & (jnp.arange(slots) != scene.slot)
-    offset = now.box[:, :2] - view.xy
-    distance = jnp.where(seen, jnp.sum(offset * offset, axis=-1), jnp.inf)
+    dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
+    distance = jnp.where(seen, dx * dx + dy * dy, jnp.inf)
     chosen = _nearest(distance, config.agents)
     there = seen[chosen] & (jnp.arange(config.agents) < slots)
 
@@ -157,46 +210,42 @@ def _agents(
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
-def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
-    rows = bank.road[scene.index]
-    count = rows.shape[0]
-    kind = rows[:, 5]
-    lane, edge, area = (_is_one_of(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS))
-    xy = view.point(rows[:, :2])
-    inside = (xy[:, 0] < ROAD_AHEAD_M) & (xy[:, 0] > -ROAD_BEHIND_M) & (jnp.abs(xy[:, 1]) < ROAD_SIDE_M)
-    wanted = lane | area | (edge if config.edges else jnp.zeros_like(edge))
-    inside &= wanted & (jnp.arange(count) < bank.road_rows[scene.index])
+def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+    x, y, layer = bank.road_at[scene.index]
+    dx, dy = x - view.xy[0], y - view.xy[1]
+    ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
+    inside = (ahead < ROAD_AHEAD_M) & (ahead > -ROAD_BEHIND_M) & (jnp.abs(left) < ROAD_SIDE_M)
+    inside &= (layer != ROAD_NONE) if config.edges else (layer != ROAD_NONE) & (layer != ROAD_EDGE)
     # Compact without sorting: the running count says where each row inside goes.
     running = jnp.cumsum(inside.astype(jnp.int32))
     place = jnp.where(inside, running - 1, config.road)
-    take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(count), mode="drop")
-    mask = jnp.arange(config.road) < running[-1]
-    types = jnp.stack([lane, edge, area], axis=-1).astype(jnp.float32)[take]
-    chosen = rows[take]
-    limit = jnp.where(chosen[:, 6:7] > 0, chosen[:, 6:7] / SPEED_MPS, 0.0)
-    parts = [xy[take] / POSITION_M, view.vector(chosen[:, 2:4]), chosen[:, 4:5] / PIECE_M, types, limit]
-    parts.append((chosen[:, 6:7] > 0).astype(jnp.float32))
-    return _masked("road", jnp.concatenate(parts, axis=-1), mask)
+    take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
+    rows = bank.road[scene.index, take]
+    parts = [view.point(rows[:, :2]) / POSITION_M, view.vector(rows[:, 2:4])]
+    types = (rows[:, 5:6] == jnp.asarray([ROAD_LANE, ROAD_EDGE, ROAD_AREA])).astype(jnp.float32)
+    limit = rows[:, 6:7]
+    parts += [
+        rows[:, 4:5] / PIECE_M,
+        types,
+        jnp.maximum(limit, 0.0) / SPEED_MPS,
+        (limit > 0).astype(jnp.float32),
+    ]
+    return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
-def _is_one_of(kind: Float[Array, " R"], kinds: tuple[int, ...]) -> Bool[Array, " R"]:
-    return (kind >= min(kinds)) & (kind <= max(kinds))
-
-
-def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     line = bank.light_line[scene.index]
     state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
-    middle = (line[:, 0:2] + line[:, 2:4]) / 2
-    offset = middle - view.xy
-    distance = jnp.sqrt(jnp.sum(offset * offset, axis=-1))
+    dx, dy = line[LIGHT_X] - view.xy[0], line[LIGHT_Y] - view.xy[1]
     # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
-    ahead = offset[:, 0] * jnp.cos(line[:, 5]) + offset[:, 1] * jnp.sin(line[:, 5])
-    seen = (state >= 0) & (ahead > -_PASSED_M)
-    rank = distance + jnp.where(line[:, 7] > 0, 0.0, 1e4)
+    seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
+    on_route = line[LIGHT_ARC] < NEVER_M
+    rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
     colour = _colour(state[chosen])
-    parts = [view.point(middle[chosen]) / POSITION_M, colour, line[chosen, 7:8]]
+    middle = line[LIGHT_X : LIGHT_Y + 1, chosen].T
+    parts = [view.point(middle) / POSITION_M, colour, on_route[chosen, None].astype(jnp.float32)]
     return _masked("lights", jnp.concatenate(parts, axis=-1), there)
 
 
@@ -208,7 +257,7 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
 
 
-def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: _View) -> Observation:
+def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
     # Without a route on lanes the bank holds the log's own path, which nobody may see.

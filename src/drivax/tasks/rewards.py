@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.scenario.schema import DT_S
-from drivax.simulator.types import Facts, Surroundings
+from drivax.simulator.types import FACTS, Facts, Surroundings
+from drivax.tasks.own import own_name, refuse_taken
 
 Term = Callable[[Facts, Facts, Surroundings], Float[Array, ""]]
 
@@ -69,6 +70,16 @@ TERMS: dict[str, Term] = {
     "discomfort": discomfort,
     "speeding": speeding,
 }
+#: Facts that each term looks at; no others are measured for it.
+READS: dict[str, frozenset[str]] = {
+    "collision": frozenset({"collision"}),
+    "offroad": frozenset({"offroad"}),
+    "red_light": frozenset({"red_light"}),
+    "off_route": frozenset({"off_route"}),
+    "progress": frozenset({"routed", "progress_m"}),
+    "discomfort": frozenset({"acceleration_mps2", "lateral_acceleration_mps2", "jerk_mps3"}),
+    "speeding": frozenset({"limit_mps", "speed_mps"}),
+}
 
 SAFETY = {"collision": -1.0, "offroad": -1.0, "red_light": -1.0}
 NAVIGATION = SAFETY | {"off_route": -0.2, "progress": 0.2}
@@ -77,11 +88,31 @@ PRESETS = {"safety": SAFETY, "navigation": NAVIGATION, "behaviour": BEHAVIOUR}
 
 
 @dataclass(frozen=True)
+class OwnTerm:
+    """A reward term of the user's own.
+
+    Attributes:
+        term: From the facts before, the facts now and the surroundings to a number, as the terms of this module;
+            ``testing.check_reward`` tells whether it keeps to the rules.
+        weight: What it is multiplied by.
+        name: As logged; by default the function's own.
+    """
+
+    term: Term
+    weight: float
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", own_name(self.term, self.name))
+
+
+@dataclass(frozen=True)
 class RewardConfig:
     """A preset and what differs from it: a weight that is not None replaces the preset's.
 
     Attributes:
         preset: Each preset includes those before it: safety, navigation, behaviour.
+        own: Terms beside those of this module.
     """
 
     preset: Literal["safety", "navigation", "behaviour"] = "navigation"
@@ -92,8 +123,23 @@ class RewardConfig:
     progress: float | None = None
     discomfort: float | None = None
     speeding: float | None = None
+    own: tuple[OwnTerm, ...] = ()
+
+    def __post_init__(self) -> None:
+        refuse_taken("rewards.own", [term.name for term in self.own], tuple(TERMS))
 
     def weights(self) -> dict[str, float]:
         """The weight of every term that counts."""
-        own = {name: getattr(self, name) for name in TERMS}
-        return PRESETS[self.preset] | {name: weight for name, weight in own.items() if weight is not None}
+        changed = {name: getattr(self, name) for name in TERMS}
+        given = {name: weight for name, weight in changed.items() if weight is not None}
+        return PRESETS[self.preset] | given | {term.name: term.weight for term in self.own}
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """Facts that the terms look at: all of them where some term is the user's own."""
+        return frozenset[str]().union(*(READS.get(name, FACTS) for name in self.weights()))
+
+    def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
+        """Weighted terms by name."""
+        terms = TERMS | {term.name: term.term for term in self.own}
+        return {name: weight * terms[name](before, now, around) for name, weight in self.weights().items()}

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.episode import Episode, episode_add, episode_start
+from drivax.metrics.selection import Wanted, selected
 from drivax.scenario.bank import ScenarioBank
-from drivax.simulator.dynamics import bicycle
-from drivax.simulator.types import Facts, Frame, Scene, SimState, Surroundings
-from drivax.tasks.actions import ActionSpace
+from drivax.simulator.types import Facts, Frame, Scene, Situation, Surroundings
+from drivax.tasks.actions import ActionSpace, Physical
 from drivax.tasks.observations import Observation, ObservationConfig, observe
-from drivax.tasks.rewards import TERMS, RewardConfig
+from drivax.tasks.rewards import RewardConfig
 
 Failure = Literal["collision", "offroad", "red_light"]
 
@@ -25,24 +25,46 @@ class Task:
     """What makes driving a learning problem.
 
     Attributes:
-        actions: The action space.
+        actions: The action space, and with it the dynamics.
         observation: Groups and sizes.
-        reward: Preset and weights.
+        rewards: Preset, weights, and terms of one's own.
+        metrics: What an episode is judged by: ``none``, ``training``, ``full``, or a list of sets, metrics and dotted
+            names of metrics of one's own. What is not named is neither measured nor carried.
         ends: Failures that terminate an episode.
         to_the_end: Whether episodes go on to the end of the log whatever happens, as evaluation does.
     """
 
-    actions: ActionSpace = field(default_factory=ActionSpace)
+    actions: ActionSpace = field(default_factory=Physical)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     rewards: RewardConfig = field(default_factory=RewardConfig)
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
     to_the_end: bool = False
+    metrics: Wanted = "full"
+
+    def __post_init__(self) -> None:
+        selected(self.metrics)
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """Facts that rewards, ends and metrics look at."""
+        ends = frozenset() if self.to_the_end else frozenset({*self.ends, "left_map"})
+        return selected(self.metrics).reads | self.rewards.reads | ends
 
     def motion(
-        self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length: Any
+        self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
     ) -> Float[Array, " 4"]:
-        """Next motion for an action: the kinematic bicycle."""
-        return bicycle(motion, *self.actions.command(action, length))
+        """Next motion for an action, by the dynamics of the action space."""
+        return self.actions.move(motion, action, length)
+
+    def actuated(
+        self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
+    ) -> Float[Array, " D"]:
+        """What is carried out of an action, within its bounds and the actuators' rates."""
+        return self.actions.actuated(motion, action, last)
+
+    def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
+        """What counts as the last action when an episode begins."""
+        return self.actions.first(history, length)
 
     def observe(
         self, bank: ScenarioBank, scene: Scene, agents: Callable[[int], Frame], frame: Frame
@@ -52,25 +74,25 @@ class Task:
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Weighted terms by name."""
-        weights = self.rewards.weights()
-        return {name: weight * TERMS[name](before, now, around) for name, weight in weights.items()}
+        return self.rewards.weigh(before, now, around)
 
     def ended(
         self, bank: ScenarioBank, scene: Scene, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Terminated by a failure; truncated where the log or the map ends."""
-        failed = {"collision": facts.collision, "offroad": facts.offroad, "red_light": facts.red_light}
         log_ends, terminated = scene.step >= bank.steps - 1, jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends
         for name in self.ends:
-            terminated = terminated | failed[name]
+            terminated = terminated | getattr(facts, name)
         return terminated, (log_ends | facts.left_map) & ~terminated
 
     def episode_start(self) -> Episode:
         """Empty accumulators."""
-        return episode_start()
+        return episode_start(self.metrics)
 
-    def episode_add(self, episode: Any, state: SimState, final: Bool[Array, ""]) -> Episode:
-        """Accumulators after the step that led to ``state``."""
-        return episode_add(episode, state, final)
+    def episode_add(
+        self, episode: Any, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+    ) -> Episode:
+        """Accumulators after the step that led to ``found``."""
+        return episode_add(episode, found, start, final)

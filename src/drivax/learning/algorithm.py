@@ -1,0 +1,61 @@
+"""What an algorithm is to the training loop, so that one of the user's own takes its place beside PPO."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Array
+
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+
+
+@runtime_checkable
+class LearnerState(Protocol):
+    """A pytree with all that a run needs to continue; a frozen ``scenario.record.record``, so that it has names."""
+
+    @property
+    def parameters(self) -> Any:
+        """What the planner is made of; an evaluation restores nothing else."""
+        ...
+
+    @property
+    def iteration(self) -> Array:
+        """Iterations done, an integer."""
+        ...
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """An algorithm on one simulator. Holds configuration; everything computed is in the state."""
+
+    def init(self, bank: ScenarioBank, key: Array) -> Any:
+        """The state (:class:`LearnerState`) before the first iteration. Pure."""
+        ...
+
+    def iterate(self, bank: ScenarioBank, state: Any) -> tuple[Any, dict[str, Array]]:
+        """The state after one iteration, and numbers to log by name.
+
+        Pure; compiled with the state donated. Names are logged as they are, but for the sums that
+        ``collector.collect`` returns: passed on as ``rollout/<name>``, they are logged as means.
+        """
+        ...
+
+    def planner(self, parameters: Any, name: str, samples: bool) -> Planner:
+        """The driver that these parameters make; it samples its actions, or acts by the mode."""
+        ...
+
+
+@runtime_checkable
+class AlgorithmConfig(Protocol):
+    """Settings of an algorithm; own ones are frozen dataclasses, named in YAML as ``kind: package.module:Name``."""
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps that one iteration counts as."""
+        ...
+
+    def build(self, simulator: Simulator, bank: ScenarioBank, iterations: int) -> Learner:
+        """The learner; of the bank only shapes may be looked at, ``iterations`` is the length of the whole run."""
+        ...

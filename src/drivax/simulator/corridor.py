@@ -1,0 +1,283 @@
+"""Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
+
+All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
+leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima
+(a sort costs several times as much), and only these are measured against the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
+from drivax.geometry.vectors import first_smallest
+from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_SPEED, AgentPaths
+from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.record import record
+from drivax.simulator.types import Frame
+
+#: How many things C are measured against a path. Six would do (docs/log), but eight fill a vector.
+CLOSEST = 8
+#: Free space that a corridor has beside the vehicle, m.
+SIDE_M = 0.1
+#: Pieces that stand for the path ahead, and rectangles around as many of them each.
+PIECES, RECTANGLES = 12, 3
+#: How far the path may run beside its pieces, m: rectangles are so much wider.
+_BULGE_M = 0.5
+#: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
+BEHIND_M = 1.0
+#: How far a vehicle looks: this, what it drives in so many seconds, what it needs to stop with 3 m/s2; at most so far.
+_LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
+#: Gap of a free road, m; a number, so that gradients stay finite.
+FREE_M = 1e4
+#: So many low bits of a squared distance hold the thing or piece; what is left is exact to 0.03 % (of 1 m2 at least).
+_SLOT_BITS, _PIECE_BITS = 10, 4
+
+
+@record
+class Movers:
+    """R vehicles on their paths.
+
+    Attributes:
+        box: x, y, cos, sin, length, width.
+        z: Height of the box centre, m.
+        arc: Place along the path, m.
+        speed: m/s.
+        slot: Slot of the frame.
+        ignored: Slots of things that do not count, -1 for none.
+    """
+
+    box: Float[Array, "R 6"]
+    z: Float[Array, " R"]
+    arc: Float[Array, " R"]
+    speed: Float[Array, " R"]
+    slot: Int[Array, " R"]
+    ignored: Int[Array, "R 2"]
+
+
+@record
+class Leaders:
+    """What R vehicles have ahead of them.
+
+    Attributes:
+        gap: Free path up to the nearest thing in the corridor, bumper to bumper, m; 10 km where there is none.
+        speed: Speed of that thing along the path, m/s.
+        things: Slots of the closest things around the corridor.
+        real: Whether there is one.
+    """
+
+    gap: Float[Array, " R"]
+    speed: Float[Array, " R"]
+    things: Int[Array, "R C"]
+    real: Bool[Array, "R C"]
+
+
+def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]) -> Float[Array, "R 8"]:
+    """Rows at arc lengths of a scenario's paths, as those of ``AgentPaths.points``."""
+    at = arc / paths.spacing[index]
+    low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
+    part = jnp.clip(at - low, 0.0, 1.0)[:, None]
+
+    def both(row: Array, low: Array) -> Float[Array, "2 8"]:
+        return jax.lax.dynamic_slice(paths.points, (index, row, low, jnp.int32(0)), (1, 1, 2, 8))[0, 0]
+
+    ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
+    here = ends[:, 0] * (1 - part) + ends[:, 1] * part
+    unit = jax.lax.rsqrt(jnp.maximum(here[:, PATH_COS] ** 2 + here[:, PATH_SIN] ** 2, 1e-9))
+    column = jnp.arange(here.shape[1])
+    return here * jnp.where((column >= PATH_COS) & (column < PATH_SPEED), unit[:, None], 1.0)
+
+
+def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
+    """The nearest thing in the corridor of each vehicle.
+
+    The corridor is as wide as the vehicle and 0.1 m more on either side. A thing is in it when its box, as wide as it
+    is across the path, reaches into it and its centre is ahead of the vehicle's; things on another level are not.
+
+    Args:
+        paths: Paths of the bank.
+        index: Row of the bank.
+        movers: The vehicles.
+        frame: Everyone now.
+    """
+    look = _look(movers.speed)
+    nodes, tangents, arcs = _path_ahead(paths, index, movers, look)
+    things, real = _closest(movers, frame, nodes)
+    box, velocity = frame.box[things], frame.velocity[things]
+    # Coordinates one by one: pairs of numbers at the end of an array do not vectorise.
+    x, y = nodes[..., X, None], nodes[..., Y, None]
+    keys = []
+    for number in range(PIECES):
+        ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
+        keys.append(_numbered(_from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
+    best = _number(reduce(jnp.minimum, keys), _PIECE_BITS)
+    # Written out once: XLA would compute it anew for each of the columns that are read.
+    best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
+    # Everything about a piece in one row, so that it is read once.
+    last = jnp.broadcast_to(jnp.arange(PIECES) == PIECES - 1, (len(nodes), PIECES)).astype(nodes.dtype)
+    columns = [part[:, at : at + PIECES] for part in (nodes, tangents, arcs[..., None]) for at in (0, 1)]
+    rows = jnp.concatenate([*columns, last[..., None]], axis=-1)
+    piece = jnp.moveaxis(rows[jnp.arange(len(things))[:, None], best], -1, 0)
+    x0, y0, x1, y1, *slopes, arc, end, last = piece
+    part, distance = _from_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
+    long = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
+    ux, uy = (x1 - x0) / long, (y1 - y0) / long
+    beside = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), slopes) * long
+    distance = jnp.where((part > 0.0) & (part < 1.0), beside * beside, distance)
+    along = arc + part * (end - arc) - movers.arc[:, None]
+    cos = jnp.abs(box[..., COS] * ux + box[..., SIN] * uy)
+    sin = jnp.abs(box[..., SIN] * ux - box[..., COS] * uy)
+    half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
+    half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
+    room = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
+    beyond = (along >= look[:, None]) | ((last > 0) & (part >= 1.0))
+    inside = real & (distance < room * room) & (along > 0.0) & ~beyond
+    gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
+    nearest = first_smallest(gap)[:, None] == jnp.arange(CLOSEST)
+    speed = jnp.sum(jnp.where(nearest, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
+    return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
+
+
+def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Where on a piece, as a share of it, the point nearest to another one lies, and their squared distance."""
+    ux, uy, wx, wy = x1 - x0, y1 - y0, x - x0, y - y0
+    part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
+    dx, dy = wx - part * ux, wy - part * uy
+    return part, dx * dx + dy * dy
+
+
+def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
+    """How far to the left of a straight piece the path runs, as a share of its length: the cubic with both tangents.
+
+    Args:
+        part: Where on the piece, as a share of it.
+        way: Direction of the piece: cosine, sine.
+        tangents: Directions of the path at its beginning and end: cosine, sine, cosine, sine.
+    """
+    (ux, uy), slopes = way, []
+    for cos, sin in (tangents[:2], tangents[2:]):
+        slopes.append(jnp.clip((ux * sin - uy * cos) / jnp.maximum(ux * cos + uy * sin, 0.1), -1.0, 1.0))
+    return part * (1 - part) * ((1 - part) * slopes[0] - part * slopes[1])
+
+
+def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
+    """How far a vehicle looks along its path, m."""
+    return jnp.minimum(_LOOK_M + _LOOK_S * speed + speed * speed / (2 * _LOOK_MPS2), _LOOK_MOST_M)
+
+
+def _path_ahead(
+    paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
+) -> tuple[Float[Array, "R K 2"], Float[Array, "R K 2"], Float[Array, "R K"]]:
+    """Points of the path from the one behind the vehicle to as far as it looks, directions and arc lengths."""
+    spacing = paths.spacing[index]
+    # One point more than it takes, since the first one lies behind.
+    stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
+    first = (movers.arc / spacing).astype(jnp.int32)
+    place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
+    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place, : PATH_SIN + 1]
+    return rows[..., :2], rows[..., PATH_COS : PATH_SIN + 1], place * spacing[:, None]
+
+
+def _closest(
+    movers: Movers, frame: Frame, nodes: Float[Array, "R K 2"]
+) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
+    """The closest things whose box reaches into one of the rectangles around the corridor."""
+    me = movers.box[:, None]
+    behind = me[..., LENGTH] / 2 + BEHIND_M
+    near = reaching(frame.box[None], nodes, me[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
+    slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
+    near &= frame.valid & (slot != movers.slot[:, None])
+    near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
+    near &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
+    return closest(near, movers.box, frame.box)
+
+
+def closest(
+    near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "S 6"]
+) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
+    """Of the boxes that are near the C whose centres are the closest; and whether there are as many."""
+    dx, dy = box[:, X] - me[:, X : X + 1], box[:, Y] - me[:, Y : Y + 1]
+    key = jnp.where(near, _numbered(dx * dx + dy * dy, jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
+    # Computed once: without the barrier XLA computes it anew for each of the minima.
+    key = jax.lax.optimization_barrier(key)
+    found = [jnp.min(key, axis=1, keepdims=True)]
+    for _ in range(CLOSEST - 1):
+        found.append(jnp.min(jnp.where(key > found[-1], key, jnp.inf), axis=1, keepdims=True))
+    chosen = jnp.concatenate(found, axis=1)
+    real = jnp.isfinite(chosen)
+    return jnp.where(real, _number(chosen, _SLOT_BITS), 0), real
+
+
+def _numbered(square: Float[Array, "..."], number: Any, bits: int) -> Float[Array, "..."]:
+    """Squared distances with a number in place of the low bits, so that the smallest one says which it is.
+
+    They stay floats, whose minima vectorise, of at least one, since what is below the smallest normal float may count
+    as zero.
+    """
+    key = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(1.0 + square).astype(jnp.float32), jnp.int32)
+    return jax.lax.bitcast_convert_type(
+        (key & ~((1 << bits) - 1)) | jnp.asarray(number, jnp.int32), jnp.float32
+    )
+
+
+def _number(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
+    return jax.lax.bitcast_convert_type(key, jnp.int32) & ((1 << bits) - 1)
+
+
+def reaching(
+    box: Float[Array, "1 S 6"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
+    rectangles: int,
+) -> Bool[Array, "R S"]:  # fmt: skip
+    """Which boxes reach into one of the rectangles along the chords of K points on a path.
+
+    Args:
+        box: Boxes.
+        nodes: Points on the path.
+        half: Half the width of the corridor, m.
+        behind: How much further back the first rectangle reaches, m.
+        beyond: How much further on the last one reaches, m.
+        rectangles: How many; K - 1 is a multiple of it.
+    """
+    around = _rectangles(nodes, half, behind, beyond, rectangles)
+    deep, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
+    found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
+    for number in range(rectangles):
+        x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
+        turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
+        turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
+        ahead = jnp.abs(box[..., X] * cos + (box[..., Y] * sin - (x * cos + y * sin)))
+        left = jnp.abs(box[..., Y] * cos - (box[..., X] * sin + (y * cos - x * sin)))
+        found |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
+            left < width + turn_sin * deep + turn_cos * wide
+        )
+    return found
+
+
+def _rectangles(
+    nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any, count: int
+) -> tuple[Float[Array, "R Q"], ...]:
+    """Rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
+    long = (nodes.shape[1] - 1) // count
+    # All points but the last, by stretches; the end of each is (chord, 0) in its own frame.
+    x, y = (nodes[:, :-1, axis].reshape(len(nodes), count, long) for axis in (X, Y))
+    rest_x, rest_y = x - x[..., :1], y - y[..., :1]
+    chord_x, chord_y = nodes[:, long::long, X] - x[..., 0], nodes[:, long::long, Y] - y[..., 0]
+    chord = jnp.sqrt(jnp.maximum(chord_x * chord_x + chord_y * chord_y, 1e-6))
+    # Beyond its end a path is one point; there any direction will do.
+    cos, sin = jnp.where(chord > 1e-2, chord_x / chord, 1.0), jnp.where(chord > 1e-2, chord_y / chord, 0.0)
+    ahead = rest_x * cos[..., None] + rest_y * sin[..., None]
+    left = rest_y * cos[..., None] - rest_x * sin[..., None]
+    number = jnp.arange(count)
+    near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind, 0.0)
+    far = jnp.maximum(ahead.max(axis=-1), chord) + half + jnp.where(number == count - 1, beyond, 0.0)
+    right, left = left.min(axis=-1) - half, left.max(axis=-1) + half
+    on, aside = (near + far) / 2, (right + left) / 2
+    centre_x, centre_y = x[..., 0] + on * cos - aside * sin, y[..., 0] + on * sin + aside * cos
+    # Once, not for every box.
+    return jax.lax.optimization_barrier((centre_x, centre_y, cos, sin, (far - near) / 2, (left - right) / 2))

@@ -1,0 +1,170 @@
+"""How an episode begins: as logged, or after a moment of wrong driving.
+
+Any step of the log can be the first one (``Simulator.reset(..., step=...)``); what a start adds is the motion that led
+there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.geometry.boxes import corners
+from drivax.scenario.bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.queries import (
+    OFFROAD_TOLERANCE_M,
+    around_lanes,
+    is_mapped,
+    left_the_map,
+    offroad_distance,
+    project_on_route,
+)
+from drivax.simulator.contact import overlaps
+from drivax.simulator.dynamics import bicycle
+from drivax.simulator.traffic import alone, frame_of, logged_history
+from drivax.simulator.types import HISTORY, MOTION_SPEED, Scene
+
+#: What 1 means for acceleration (m/s2) and curvature (1/m) in the published description, which is in action units.
+_ACCELERATION, _CURVATURE = 6.0, 0.3
+#: Share of the acceleration when strong; mild is anything from 0 to the upper end.
+_STRONG_ACCELERATION = (0.54, 0.6)
+#: Share of the curvature's bound when strong; mild is anything from 0 to 1.
+_STRONG_CURVATURE = (0.9, 1.0)
+#: The curvature's bound falls linearly from the first at 0 m/s to the second at this speed.
+_BOUND, _BOUND_MPS = (0.4, 0.03), 40.0 / 3.6
+
+
+@runtime_checkable
+class Start(Protocol):
+    """How the driven agent came to the first step of an episode."""
+
+    def begin(
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        agents: Float[Array, "A 8"], key: Any,
+    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+        """Motions of the last 16 steps up to ``step``, and the arc length along the route at ``step``.
+
+        ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class LogStart:
+    """As logged."""
+
+    def begin(
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        agents: Any = None, key: Any = None,
+    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+        """The log's own, whatever the others do; needs no key."""
+        return logged_history(bank, index, step, slot), bank.log_progress[index, step]
+
+
+@dataclass(frozen=True)
+class NoisyStart:
+    """The last second before the start was driven with one wrong action; how does the planner recover?
+
+    Three quarters of the draws are strong (acceleration 3.24 to 3.6 m/s2, nearly the sharpest curvature), the others
+    mild (anything from nothing to that), to the left or right with equal odds. The sharpest curvature is 0.12 1/m at
+    a standstill and 0.009 1/m from 40 km/h on. A draw that ends in a collision, off the road or off the map is drawn
+    again; when all tries do, the episode begins as logged. As published (V-Max, ``noisy_init``), except that nothing
+    but the start differs from other episodes: the steps before it count for no metric.
+
+    Attributes:
+        steps: How many steps are driven so; fewer where the log does not reach back as far.
+        strong: Share of strong draws.
+        scale: What accelerations and curvatures are multiplied by.
+        tries: Draws per start.
+    """
+
+    steps: int = 10
+    strong: float = 0.75
+    scale: float = 1.0
+    tries: int = 8
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps < HISTORY:
+            raise UsageError(f"a noisy start of {self.steps} steps", cure=f"use 1 to {HISTORY - 1}")
+        if not (0.0 <= self.strong <= 1.0 and self.scale >= 0.0 and self.tries >= 1):
+            raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
+
+    def begin(
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        agents: Float[Array, "A 8"], key: Any,
+    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+        """The first acceptable draw of ``tries``.
+
+        Raises:
+            UsageError: Without a key.
+        """
+        if key is None:
+            raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
+        # Only steps at which the log has the agent can be driven anew.
+        back = jnp.arange(1, self.steps + 1)
+        known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AGENT_VALID] > 0) & (back <= step)
+        count = jnp.cumprod(known.astype(jnp.int32)).sum()
+        base = logged_history(bank, index, step - count, slot)
+
+        def one(key: Array) -> tuple[Float[Array, "16 4"], Bool[Array, ""]]:
+            history = self._driven(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
+            return history, _acceptable(bank, index, step, slot, agents, history)
+
+        histories, good = jax.vmap(one)(jax.random.split(key, self.tries))
+        logged, logged_m = LogStart().begin(bank, index, step, slot)
+        history = jnp.where(good.any(), histories[jnp.argmax(good)], logged)
+        near_m = bank.log_progress[index, step - count]
+        along_m = project_on_route(bank, index, history[-1, :2], near_m).along_m
+        return history, jnp.where(good.any(), jnp.maximum(along_m, near_m), logged_m)
+
+    def draw(self, key: Array, speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """An acceleration (m/s2) and a curvature (1/m) for a car of this speed."""
+        keys = jax.random.split(key, 4)
+        strong = jax.random.bernoulli(keys[0], self.strong)
+        side = jnp.where(jax.random.bernoulli(keys[1]), 1.0, -1.0)
+        low = jnp.where(strong, _STRONG_ACCELERATION[0], 0.0)
+        share = jax.random.uniform(keys[2], minval=low, maxval=_STRONG_ACCELERATION[1])
+        low = jnp.where(strong, _STRONG_CURVATURE[0], 0.0)
+        turn = side * jax.random.uniform(keys[3], minval=low, maxval=_STRONG_CURVATURE[1])
+        bound = _BOUND[0] + (_BOUND[1] - _BOUND[0]) * jnp.minimum(speed / _BOUND_MPS, 1.0)
+        return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
+
+    def _driven(
+        self,
+        history: Float[Array, "16 4"],
+        count: Int[Array, ""],
+        acceleration: Float[Array, ""],
+        curvature: Float[Array, ""],
+    ) -> Float[Array, "16 4"]:
+        """A history, ``count`` steps of one action later."""
+
+        def one(history: Array, place: Array) -> tuple[Array, None]:
+            later = jnp.concatenate([history[1:], bicycle(history[-1], acceleration, curvature)[None]])
+            return jnp.where(place < count, later, history), None
+
+        return jax.lax.scan(one, history, jnp.arange(self.steps))[0]
+
+
+def _acceptable(
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    step: Int[Array, ""],
+    slot: Int[Array, ""],
+    agents: Float[Array, "A 8"],
+    history: Float[Array, "16 4"],
+) -> Bool[Array, ""]:
+    """Whether an agent with this history touches none of the others and is on the road at ``step``."""
+    zero, z = jnp.zeros(()), bank.agents[index, step, slot, AGENT_Z]
+    scene = Scene(index, step, slot, history, jnp.zeros(2), zero, z, ())
+    frame = frame_of(bank, index, step, agents, alone(scene), 0)
+    box, ground = frame.box[slot], z - bank.agent_box[index, slot, 2] / 2
+    points = corners(box)
+    near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
+    beyond = offroad_distance(bank, index, box[:2], points, near, ground).max()
+    off = (beyond > OFFROAD_TOLERANCE_M) & is_mapped(bank, index)
+    return ~(overlaps(frame, slot).any() | off | left_the_map(bank, index, box[:2]))

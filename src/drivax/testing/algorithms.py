@@ -1,0 +1,154 @@
+"""Checks of algorithms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState
+from drivax.named import find_named
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from drivax.testing import worlds
+from drivax.testing.contract import check_numbers, expect, same
+
+#: A small observation: compiling is what a check takes.
+_TASK = Task(
+    observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3),
+)
+_ITERATIONS = 4
+
+
+def check_algorithm(config: AlgorithmConfig | str) -> None:
+    """Whether an algorithm keeps to the rules.
+
+    It builds a learner whose state is a pytree with ``parameters`` and ``iteration`` that keeps structure, shapes and
+    types; iterations are pure functions that give the same bit for bit, also when the state was stored in between;
+    they change the parameters and log finite numbers; and the planner drives within [-1, 1], by the mode always alike.
+    Give it small sizes: the check runs three iterations.
+
+    Args:
+        config: The algorithm's settings, or the dotted name of such a class or instance.
+
+    Raises:
+        BrokenContract: It does not; the message says which rule and what to do.
+    """
+    found: Any = find_named(config) if isinstance(config, str) else config
+    found = found() if isinstance(found, type) else found
+    what = f"algorithm {type(found).__name__}"
+    expect(
+        isinstance(found, AlgorithmConfig),
+        f"{what} lacks build or steps_per_iteration",
+        "see AlgorithmConfig",
+    )
+    expect(
+        isinstance(found.steps_per_iteration, int) and found.steps_per_iteration > 0,
+        f"{what} counts {found.steps_per_iteration!r} steps per iteration",
+        "count environment steps as a whole number",
+    )
+    bank, simulator = worlds.worlds(), Simulator(_TASK)
+    learner = found.build(simulator, bank, _ITERATIONS)
+    expect(isinstance(learner, Learner), f"{what} builds no Learner", "give it init, iterate and planner")
+    state = _check_iterations(what, learner, bank)
+    _check_planner(what, learner, bank, simulator, state.parameters)
+
+
+def _check_iterations(what: str, learner: Learner, bank: ScenarioBank) -> Any:
+    init, iterate = jax.jit(learner.init), jax.jit(learner.iterate, donate_argnums=1)
+    first = init(bank, jax.random.key(0))
+    expect(
+        isinstance(first, LearnerState), f"{what} has a state without parameters or iteration", "name them so"
+    )
+    expect(
+        _forms(jax.eval_shape(learner.init, bank, jax.random.key(1))) == _forms(first),
+        f"{what} has a state whose form depends on the key",
+        "let shapes follow from the configuration only",
+    )
+    following, _ = jax.eval_shape(learner.iterate, bank, first)
+    expect(
+        _forms(following) == _forms(first),
+        f"{what} changes the form of its state in an iteration",
+        "return the same record with the same shapes and types",
+    )
+    stored = _stored(first)
+    second, logs = iterate(bank, first)
+    expect(
+        int(second.iteration) == int(stored.iteration) + 1,
+        f"{what} counts from iteration {int(stored.iteration)} to {int(second.iteration)}",
+        "add one",
+    )
+    expect(
+        not same(jax.device_get(second.parameters), jax.device_get(stored.parameters), 0.0),
+        f"{what} learns nothing in an iteration",
+        "return the new parameters",
+    )
+    _check_logs(what, logs)
+    again, _ = iterate(bank, jax.tree.map(jnp.copy, stored))
+    expect(
+        same(_numbers(again), _numbers(second), 0.0),
+        f"{what} does not repeat an iteration bit for bit",
+        "keep keys and everything else that an iteration needs in the state",
+    )
+    third, logs = iterate(bank, second)
+    _check_logs(what, logs)
+    check_numbers(what, [np.atleast_1d(leaf) for leaf in jax.tree.leaves(_numbers(third.parameters))])
+    return third
+
+
+def _check_logs(what: str, logs: dict[str, Any]) -> None:
+    for name, value in logs.items():
+        expect(
+            np.shape(value) == () and np.isfinite(value),
+            f"{what} logs {name!r} as {np.asarray(value)}",
+            "log finite numbers without axes",
+        )
+
+
+def _check_planner(
+    what: str, learner: Learner, bank: ScenarioBank, simulator: Simulator, parameters: Any
+) -> None:
+    @jax.jit
+    def act(planner: Any, bank: ScenarioBank, key: Any) -> Any:
+        state = simulator.reset(bank, 0)
+        carry = planner.init(bank, state, key)
+        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.scene)
+        return planner.act(carry, bank, state, situation, seen, key)[0]
+
+    keys = jax.random.key(0), jax.random.key(1)
+    for samples in (False, True):
+        planner = learner.planner(parameters, "checked", samples)
+        expect(isinstance(planner, Planner), f"{what} makes no Planner", "see planners.planner.Planner")
+        one, other = (np.asarray(act(planner, bank, key)) for key in keys)
+        expect(
+            one.shape == (2,) and np.isfinite(one).all() and (np.abs(one) <= 1.0).all(),
+            f"{what} acts by {one}",
+            "give two numbers in [-1, 1]",
+        )
+        if not samples:
+            expect((one == other).all(), f"{what} acts at random by the mode", "use the key only to sample")
+
+
+def _forms(tree: Any) -> Any:
+    leaves = [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
+    return jax.tree.structure(tree), leaves
+
+
+def _stored(tree: Any) -> Any:
+    """A copy that a donated state does not take along."""
+    return jax.tree.map(jnp.copy, tree)
+
+
+def _numbers(tree: Any) -> Any:
+    """Random keys as numbers, everything on the host."""
+
+    def number(leaf: Any) -> Any:
+        key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if key else leaf)
+
+    return jax.tree.map(number, tree)

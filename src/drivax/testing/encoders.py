@@ -1,0 +1,131 @@
+"""Checks of encoders."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from drivax.named import find_named
+from drivax.networks.encoders import EncoderConfig
+from drivax.testing.contract import CLOSE, check_numbers, compiled, expect, same
+from drivax.testing.worlds import GARBAGE
+
+#: Groups with one and two axes of rows, with and without masks; the second set lacks some.
+_SPECS = (
+    {
+        "agents": (4, 2, 3), "agents_mask": (4, 2), "ego": (2, 6), "ego_static": (4,), "route": (5, 5),
+        "route_mask": (5,),
+    },
+    {"ego": (1, 6), "lights": (2, 7), "lights_mask": (2,)},
+)  # fmt: skip
+_BATCH = 6
+
+
+def check_encoder(config: EncoderConfig | str) -> None:
+    """Whether an encoder keeps to the rules.
+
+    It builds for any groups; embeds one observation or a batch as ``[..., width]`` float32, the same compiled or not;
+    its parameters follow from the key and are all that it keeps; values and gradients are finite, also where every row
+    is masked; what masked rows hold does not matter, and what the others hold does.
+
+    Args:
+        config: The encoder's settings, or the dotted name of such a class or instance.
+
+    Raises:
+        BrokenContract: It does not; the message says which rule and what to do.
+    """
+    found: Any = find_named(config) if isinstance(config, str) else config
+    found = found() if isinstance(found, type) else found
+    what = f"encoder {type(found).__name__}"
+    expect(isinstance(found, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
+    for number, spec in enumerate(_SPECS):
+        encoder: Any = found.build(spec, nnx.Rngs(0))
+        batch = _observations(spec, number)
+        embedding = compiled(what, encoder, batch)
+        width = getattr(encoder, "width", None)
+        expect(
+            embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32,
+            f"{what} embeds {_BATCH} observations as {embedding.dtype}{list(embedding.shape)}, its width being {width}",
+            "give [*batch, width] float32, and say width",
+        )
+        check_numbers(what, embedding)
+        _check_state(what, found, spec, encoder)
+        _check_rows(what, encoder, batch, embedding)
+        _check_masks(what, encoder, spec, batch, embedding)
+        _check_gradients(what, encoder, batch)
+
+
+def _observations(spec: Any, seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    groups: dict[str, Any] = {}
+    for name, shape in spec.items():
+        if name.endswith("_mask"):
+            groups[name] = jnp.asarray(rng.random((_BATCH, *shape)) < 0.6)
+        else:
+            groups[name] = jnp.asarray(rng.normal(size=(_BATCH, *shape)), jnp.float32)
+    return groups
+
+
+def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> None:
+    kept, parameters = (jax.tree.leaves(nnx.state(encoder, *only)) for only in ((), (nnx.Param,)))
+    expect(
+        len(kept) == len(parameters) > 0,
+        f"{what} keeps {len(kept) - len(parameters)} variables that are no parameters, of {len(kept)}",
+        "keep nnx.Param only: no dropout, no running means",
+    )
+    again = jax.tree.leaves(nnx.state(config.build(spec, nnx.Rngs(0)), nnx.Param))
+    expect(
+        same(jax.device_get(parameters), jax.device_get(again), 0.0),
+        f"{what} begins with other parameters every time",
+        "draw them from rngs",
+    )
+
+
+def _check_rows(what: str, encoder: Any, batch: Any, embedding: Any) -> None:
+    one = jax.tree.map(lambda leaf: leaf[0], batch)
+    for result in (encoder(one), jax.tree.map(lambda leaf: leaf[None, None], one)):
+        result = encoder(result)[0, 0] if isinstance(result, dict) else result
+        expect(
+            same(embedding[0], jax.device_get(result), CLOSE),
+            f"{what} embeds an observation differently alone and in a batch",
+            "work on the last axes, whatever axes lead",
+        )
+    spread = np.abs(embedding - embedding[:1]).max()
+    expect(spread > 0, f"{what} embeds all observations alike", "let it read the groups")
+
+
+def _check_masks(what: str, encoder: Any, spec: Any, batch: Any, embedding: Any) -> None:
+    masked = [name for name in spec if f"{name}_mask" in spec]
+    littered, nobody = dict(batch), dict(batch)
+    for name in masked:
+        there = batch[f"{name}_mask"][..., None]
+        littered[name] = jnp.where(there, batch[name], GARBAGE)
+        nobody[f"{name}_mask"] = jnp.zeros_like(batch[f"{name}_mask"])
+    other = compiled(what, encoder, littered)
+    expect(
+        same(embedding, other, CLOSE),
+        f"{what} changes with what masked rows hold",
+        "use jnp.where(mask[..., None], rows, 0) first, and mask after every bias",
+    )
+    check_numbers(
+        f"{what} without any row", compiled(what, encoder, nobody), "a mean or softmax over no rows"
+    )
+
+
+def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
+    graph, parameters = nnx.split(encoder)
+    nobody = {n: jnp.zeros_like(v) if n.endswith("_mask") else v for n, v in batch.items()}
+
+    def loss(parameters: Any, batch: Any) -> Any:
+        return jnp.mean(nnx.merge(graph, parameters)(batch) ** 2)
+
+    for groups in (batch, nobody):
+        gradient = compiled(what, jax.grad(loss), parameters, groups)
+        finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        expect(
+            finite, f"{what} has gradients that are not finite", "guard roots and divisions on their input"
+        )

@@ -1,0 +1,119 @@
+"""The same seed gives the same bits; batch size, neighbours and automatic resets change no episode.
+
+Bits are equal where one compiled program runs. Programs of other batch sizes round differently (vectorised and scalar
+tails), so between them truths and counts are equal and numbers agree to rounding. The quick run compares single steps
+(``tests/simulator/test_simulator.py``).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.evaluation.rollout import drive, judging
+from drivax.metrics.episode import episode_metrics
+from drivax.planners.simple import RandomActions
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.task import Task
+
+COUNT, LATE = 6, 60
+#: Some of every kind: truths, sums, means, filters over the history.
+METRICS = ("accuracy", "offroad", "progress_ratio", "ade", "max_jerk", "distance")
+
+
+@pytest.fixture(scope="module")
+def world():
+    return ScenarioBank.from_scenarios([assemble(generate_recording(23, i)) for i in range(COUNT)])
+
+
+def episodes(simulator, bank, rows, **options):
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(4), jnp.asarray(rows))
+    return drive(simulator, RandomActions(), bank, jnp.asarray(rows), keys, **options)
+
+
+def same_bits(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def same_but_rounding(one, other):
+    def same(a, b):
+        if np.asarray(a).dtype.kind == "f":
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+        else:
+            np.testing.assert_array_equal(a, b)
+
+    jax.tree.map(same, one, other)
+
+
+def check_batches(simulator, bank):
+    rows = np.arange(COUNT)
+    whole = episodes(simulator, bank, rows, start_step=LATE)
+    same_bits(whole, episodes(simulator, bank, rows, start_step=LATE))
+    backwards = episodes(simulator, bank, rows[::-1], start_step=LATE)
+    same_bits(whole, jax.tree.map(lambda leaf: leaf[::-1], backwards))
+    pairs = [episodes(simulator, bank, rows[i : i + 2], start_step=LATE) for i in range(0, COUNT, 2)]
+    same_but_rounding(whole, jax.tree.map(lambda *leaf: np.concatenate(leaf), *pairs))
+
+
+@pytest.mark.slow
+def test_neither_batch_size_nor_neighbours_matter(world):
+    check_batches(Simulator(Task(metrics=METRICS, to_the_end=True)), world)
+
+
+@pytest.mark.slow
+def test_neither_batch_size_nor_neighbours_matter_to_any_metric(world):
+    check_batches(Simulator(judging(Task())), world)
+
+
+@pytest.mark.slow
+def test_automatic_resets_change_no_episode(world):
+    """Three environments drive six scenarios one after the other; each episode is what it is by itself."""
+    simulator = Simulator(Task(metrics=METRICS))
+
+    def action(scene):
+        # Anything that depends on scenario and step only; some of them end off the road.
+        phase = 1.7 * scene.index + 0.4 * scene.step
+        return 0.5 * jnp.stack([jnp.sin(phase), jnp.cos(1.3 * phase)])
+
+    @jax.jit
+    def alone(bank, states):
+        def one(state):
+            after, transition = simulator.step(bank, state, action(state.scene))
+            return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
+
+        return jax.vmap(one)(states)
+
+    @jax.jit
+    def or_begin(bank, states, over, following):
+        def one(state, over, row):
+            taken = action(state.scene)
+            after, transition = simulator.step_or_begin(
+                bank, state, taken, over, simulator.scene(bank, row, LATE)
+            )
+            return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
+
+        return jax.vmap(one)(states, over, following)
+
+    begin = jax.jit(jax.vmap(lambda bank, row: simulator.reset(bank, row, LATE), in_axes=(None, 0)))
+    expected, states, live = {}, begin(world, jnp.arange(COUNT)), set(range(COUNT))
+    while live:
+        states, done, metrics = alone(world, states)
+        for row in [row for row in live if done[row]]:
+            expected[row] = jax.tree.map(lambda leaf, row=row: np.asarray(leaf[row]), (states, metrics))
+            live.remove(row)
+    found, over, rows = {}, jnp.zeros(3, bool), np.arange(3)
+    states = begin(world, jnp.arange(COUNT))
+    states = jax.tree.map(lambda leaf: leaf[:3], states)
+    while len(found) < COUNT:
+        rows = np.where(over, rows + 3, rows) % COUNT
+        states, over, metrics = or_begin(world, states, over, jnp.asarray(rows))
+        for place in np.flatnonzero(over):
+            row = int(states.scene.index[place])
+            assert row == rows[place]
+            found[row] = jax.tree.map(lambda leaf, at=place: np.asarray(leaf[at]), (states, metrics))
+    assert len({int(state.scene.step) for state, _ in expected.values()}) > 1, "some end early"
+    for row in range(COUNT):
+        same_but_rounding(expected[row], found[row])

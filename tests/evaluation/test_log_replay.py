@@ -1,0 +1,63 @@
+"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays beside it.
+
+Six generated logs do so in every quick run (``tests/simulator/test_simulator.py``).
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from drivax.datasets.formats import detect, find_files
+from drivax.evaluation.audit import audit, scenario_names
+from drivax.evaluation.runner import evaluate
+from drivax.planners.simple import Expert
+from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.bank import ScenarioBank
+from drivax.synthetic.world import generate_recording
+
+EXACT, DRIVEN = Expert(), Expert(replays=False)
+
+
+def driven_by(planner, scenarios):
+    bank = ScenarioBank.from_scenarios(scenarios, trim=False)
+    return evaluate(planner, bank, scenario_names(scenarios)).metrics
+
+
+def check_exact(scenarios):
+    metrics = driven_by(EXACT, scenarios)
+    # Heights and headings are stored as float32 and headings as an angle: nothing is added to them.
+    assert np.nanmax(metrics["ade"]) == 0.0 and np.nanmax(metrics["fde"]) == 0.0
+    for name in ("collision", "at_fault_collision", "offroad"):
+        assert np.nansum(metrics[name]) == 0.0, name
+
+
+def generated(seed, count):
+    return [assemble(generate_recording(seed, index)) for index in range(count)]
+
+
+@cache
+def real_windows(folder):
+    """The ego's windows of every real file, and what the audit finds in them."""
+    scenarios = []
+    for file in find_files(folder)[0]:
+        for recording in detect(file).read(file):
+            scenarios += [assemble(window) for window in windows(recording)]
+    return scenarios, audit(scenarios)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(4))
+def test_a_thousand_generated_logs_replay_exactly_and_can_be_driven(part):
+    scenarios = generated(1000 + part, 250)
+    check_exact(scenarios)
+    assert (driven_by(DRIVEN, scenarios)["fde"] <= 0.2).mean() >= 0.95
+
+
+@pytest.mark.slow
+def test_every_real_file_replays_exactly_and_can_be_driven(real_data):
+    scenarios, findings = real_windows(real_data)
+    clean = [one for one, found in zip(scenarios, findings, strict=True) if found["clean"]]
+    assert len(clean) == len(scenarios) >= 19
+    check_exact(clean)
+    assert np.nanmax(driven_by(DRIVEN, clean)["fde"]) <= 0.3

@@ -1,0 +1,48 @@
+"""A metric of the user's own in results, run folder, table and report."""
+
+import csv
+import json
+from dataclasses import replace
+
+import pytest
+
+from drivax.errors import UsageError
+from drivax.evaluation.runs import EvaluationConfig, run_evaluation
+from drivax.metrics.selection import selected
+from drivax.planners.catalogue import make_planner
+from drivax.scenario.assemble import assemble
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.show.runs import read_runs
+from drivax.show.tables import explanations, planner_table
+from scenes import SMALL, car, straight_road
+
+
+def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
+    """Row 0: a car stands 30 m ahead of a standing ego. Row 1: nobody else, so it is undefined."""
+    worlds = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        for world in worlds:
+            writer.add(assemble(world, SMALL))
+    config = EvaluationConfig("constant_velocity", metrics=("own_terms:nearest_other",))
+    results = run_evaluation(
+        config, make_planner("constant_velocity"), ScenarioSet.open(tmp_path / "set"), tmp_path / "run"
+    )
+    assert results.metrics["nearest_other"][0] == pytest.approx(30.0, abs=1e-4)
+    assert results.summary()["metrics"]["nearest_other"]["n"] == 1
+    with (tmp_path / "run" / "episodes.csv").open() as file:
+        assert [row["nearest_other"] for row in csv.DictReader(file)] == ["30", ""]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["metrics"]["nearest_other"]["mean"] == pytest.approx(30.0, abs=1e-4)
+    runs, _ = read_runs([tmp_path / "run"])
+    table = planner_table(runs, ["nearest_other"])
+    assert "nearest other [m]" in table and "more is better" in table and "30.0" in table
+    assert "Smallest distance between centres." in explanations(["nearest_other"], runs)
+
+
+def test_what_is_no_metric_is_refused():
+    for name, words in (
+        ("own_terms:hurry", "'own_terms:hurry' is no metric"),
+        ("own_terms:nearest", "did you mean 'nearest_other'"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            selected(("full", name))

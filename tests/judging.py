@@ -1,0 +1,80 @@
+"""Puts ego where a test says, step by step, and returns every metric and step value. One compiled program for all."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drivax.evaluation.rollout import judging
+from drivax.metrics.episode import episode_metrics, first_steps
+from drivax.metrics.steps import step_metrics
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import logged_history
+from drivax.tasks.task import Task
+from scenes import bank_of
+
+#: Scenarios of one call; fewer are filled up.
+BATCH = 16
+START = 10
+
+
+@cache
+def _program():
+    simulator = Simulator(judging(Task()))
+
+    def one(bank, row, motion):
+        def step(state, here):
+            state, _ = simulator.replay(bank, state, here, jnp.zeros(2))
+            return state, step_metrics(simulator.situation(bank, state))
+
+        begin = simulator.reset(bank, row, START)
+        state, series = jax.lax.scan(step, begin, motion)
+        return episode_metrics(bank, state), first_steps(state.episode), series
+
+    def log(bank, row):
+        return jax.vmap(lambda t: logged_history(bank, row, t, 0)[-1])(jnp.arange(bank.steps))
+
+    return jax.jit(jax.vmap(one, (None, 0, 0))), jax.jit(jax.vmap(log, (None, 0)))
+
+
+def judge(recordings, motions=None):
+    """Metrics of ego's logs, or of other motions.
+
+    Args:
+        recordings: Any number of them, of hand-made size.
+        motions: For each None (the log is driven exactly), or a function from the logged motion ``[91, 4]`` in the
+            scenario's frame (x, y, heading, speed) to the driven one, of which the rows after ``START`` count.
+
+    Returns:
+        A dict by name for each: numbers, None where undefined, ``<event>_step`` of the first events; and under
+        ``series`` each step value as an array ``[80]``, NaN where undefined.
+    """
+    results = []
+    judge_all, logs = _program()
+    for first in range(0, len(recordings), BATCH):
+        part = list(recordings[first : first + BATCH])
+        count = len(part)
+        bank = bank_of(*part, *[part[-1]] * (BATCH - count))
+        log = np.asarray(logs(bank, jnp.arange(BATCH)), np.float64)
+        for row in range(count):
+            if motions is not None and motions[first + row] is not None:
+                log[row] = motions[first + row](log[row])
+        driven = jnp.asarray(log[:, START + 1 :], jnp.float32)
+        found = jax.tree.map(np.asarray, judge_all(bank, jnp.arange(BATCH), driven))
+        results += [_named(jax.tree.map(partial(_row, row), found)) for row in range(count)]
+    return results
+
+
+def _row(row, leaf):
+    return leaf[row]
+
+
+def _named(found):
+    metrics, events, series = found
+    named = {name: float(v.value) if v.defined else None for name, v in metrics.items()}
+    named |= {f"{name}_step": int(step) for name, step in events.items()}
+    named["series"] = {name: np.where(v.defined, v.value, np.nan) for name, v in series.items()}
+    return named

@@ -1,0 +1,328 @@
+"""Metrics once more by other means: float64, shapely, marching in 1 ms steps, SciPy's filter, plain loops.
+
+For the straight roads of :mod:`scenes` and :mod:`metric_scenes`, whose lanes run along y = 0 and y = 3.7. Written from
+the definitions alone; shares no code with the package.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import savgol_filter
+from shapely.geometry import LineString, Point, Polygon
+
+START, END, DT = 10, 90, 0.1
+LANES_Y, HALF, EDGE = (0.0, 3.7), 1.85, 1e-3
+VULNERABLE_KINDS = (2, 3)
+#: Metrics that depend on lines along the road.
+LINES = (
+    "lane_straddle", "wrong_way", "wrong_way_worst", "speeding_mean", "speeding_max", "off_route",
+    "route_deviation_mean", "route_deviation_max", "progress", "progress_ratio",
+)  # fmt: skip
+
+
+def corners(x, y, heading, length, width):
+    """Front left, rear left, rear right, front right."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    local = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length / 2, width / 2]
+    return local @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
+
+
+def marched_ttc(me, velocity, boxes, velocities, step_s=1e-3, horizon_s=5.0):
+    """First of the moments 0, 1 ms, 2 ms, ... at which boxes overlap (separating axes on corners); 5 for none.
+
+    Boxes are x, y, heading, length, width; ``me [5]``, ``boxes [N, 5]``. Returns ``[N]``.
+    """
+    moments = np.arange(0.0, horizon_s, step_s)
+    result = np.full(len(boxes), horizon_s)
+    mine = corners(*me)
+    for number, (box, moving) in enumerate(zip(boxes, velocities, strict=True)):
+        theirs = corners(*box)
+        apart = np.zeros(len(moments), bool)
+        relative = np.outer(moments, moving - velocity)
+        for shape in (mine, theirs):
+            for one, other in ((0, 1), (1, 2)):
+                edge = shape[other] - shape[one]
+                axis = np.array([-edge[1], edge[0]]) / np.hypot(*edge)
+                shift = relative @ axis
+                low, high = (theirs @ axis).min() + shift, (theirs @ axis).max() + shift
+                apart |= (high <= (mine @ axis).min()) | (low >= (mine @ axis).max())
+        if not apart.all():
+            result[number] = moments[np.argmin(apart)]
+    return result
+
+
+class Judge:
+    """Drives ego along ``motion [91, 4]`` through a recording and judges every step."""
+
+    def __init__(self, recording, motion, two_way):
+        self.tracks, self.motion, self.two_way = recording.tracks, motion, two_way
+        self.recording = recording
+        edge = next(f for f in recording.features if f.feature_id == 4)
+        self.ring = Polygon(edge.points[:, :2])
+        self.size = self.tracks.size[:, 0]
+        self.ambiguous = False
+
+    def ego(self, t):
+        return (*self.motion[t, :3], *self.size[0, :2])
+
+    def other(self, a, t):
+        return (*self.tracks.xy[a, t], self.tracks.heading[a, t], *self.size[a, :2])
+
+    def near(self, value, threshold, margin=EDGE):
+        """Notes a decision that float32 may take the other way."""
+        if abs(value - threshold) < margin:
+            self.ambiguous = True
+
+    def overlap(self, a, t):
+        mine, theirs = Polygon(corners(*self.ego(t))), Polygon(corners(*self.other(a, t)))
+        if mine.distance(theirs) > EDGE:
+            return False
+        if not mine.buffer(-EDGE).intersects(theirs):
+            self.ambiguous = True
+        return mine.intersection(theirs).area > 0
+
+    def aligned(self, t):
+        """Centre lines of lanes that run ego's way, and of those that run against it."""
+        cos = np.cos(self.motion[t, 2])
+        direction = (1.0, -1.0 if self.two_way else 1.0)
+        same = [y for y, d in zip(LANES_Y, direction, strict=True) if d * cos > 0]
+        against = [y for y, d in zip(LANES_Y, direction, strict=True) if d * cos < -np.sqrt(0.5)]
+        return same, against
+
+    def place(self, t):
+        """Off the road, off the map, straddling, in several lanes, against traffic, limit."""
+        x, y = self.motion[t, :2]
+        box = corners(*self.ego(t))
+        same, against = self.aligned(t)
+        west, south, east, north = self.ring.bounds
+        left_map = not (west <= x <= east and south <= y <= north)
+        beyond = [self.ring.exterior.distance(Point(c)) for c in box if not self.ring.contains(Point(c))]
+        for value in beyond:
+            self.near(value, 0.3)
+        for low in (south, north):
+            self.near(y, low)
+        self.near(x, east)
+        offroad = any(value > 0.3 for value in beyond) and not left_map
+        outside = [all(abs(c[1] - lane) > HALF + 0.2 for lane in same) for c in box]
+        own = min((abs(y - lane), lane) for lane in same) if same else (9.0, 0.0)
+        for c in box:
+            for lane in LANES_Y:
+                self.near(abs(c[1] - lane), HALF + 0.2)
+        self.near(own[0], 4.0)
+        several = own[0] <= 4.0 and any(abs(c[1] - own[1]) > HALF + 0.2 for c in box)
+        opposed = min((abs(y - lane) for lane in against if abs(y - lane) <= HALF), default=np.inf)
+        self.near(opposed, HALF)
+        self.near(opposed, own[0])
+        wrong = opposed < own[0]
+        limit = 13.4 if own[0] <= 4.0 else None
+        corridor = abs(y) <= HALF + 0.2 or (not self.two_way and abs(y - LANES_Y[1]) <= HALF + 0.2)
+        self.near(abs(y), HALF + 0.2)
+        return offroad, left_map, any(outside), several, wrong, limit, not corridor
+
+    def fault_and_kind(self, a, t, unlawful):
+        x, y, heading, length, width = self.ego(t)
+        theirs = Polygon(corners(*self.other(a, t)))
+        stands = max(self.motion[t - 1, 3], self.motion[t, 3]) < 0.05
+        before = self.tracks.velocity[a, t - 1] if self.tracks.valid[a, t - 1] else np.zeros(2)
+        other_stands = max(np.hypot(*before), np.hypot(*self.tracks.velocity[a, t])) < 0.05
+        along, left = (
+            np.array([np.cos(heading), np.sin(heading)]),
+            np.array([-np.sin(heading), np.cos(heading)]),
+        )
+        to = self.tracks.xy[a, t] - [x, y]
+        angle = np.degrees(np.arctan2(abs(to @ left), to @ along + length * 1.461 / 5.176))
+        self.near(angle, 150.0, 0.05)
+        tips = [np.array([x, y]) + along * (length / 2 + off) for off in (-0.02, 0.0, 0.02)]
+        hits = [
+            LineString([tip - left * width / 2, tip + left * width / 2]).intersects(theirs) for tip in tips
+        ]
+        if len(set(hits)) > 1:
+            self.ambiguous = True
+        front, behind = hits[1], angle > 150.0
+        if stands:
+            fault = False
+        elif other_stands:
+            fault = True
+        elif behind:
+            fault = False
+        else:
+            fault = front or unlawful
+        turn = np.degrees(np.arccos(np.clip(np.cos(self.tracks.heading[a, t] - heading), -1, 1)))
+        self.near(turn, 135.0, 0.05)
+        self.near(turn, 45.0, 0.05)
+        if self.tracks.kind[a] in VULNERABLE_KINDS:
+            kind = 5
+        elif other_stands and front:
+            kind = 6
+        elif turn > 135 and (front or not behind):
+            kind = 4
+        elif front and turn < 45:
+            kind = 1
+        else:
+            kind = 2 if behind else 3
+        return fault, kind
+
+    def contacts(self, places):
+        """Collision and fault per step, the first one's kind, and how many overlaps were ignored at most."""
+        count = len(self.tracks.valid)
+        code, judged = {}, set()
+        hit, fault, kinds, ignored = np.zeros(91, bool), np.zeros(91, bool), [], 0
+        blameless = [set() for _ in range(91)]
+        for t in range(START, END + 1):
+            fresh = []
+            for a in range(1, count):
+                if not self.tracks.valid[a, t]:
+                    code.pop(a, None)
+                    judged.discard(a)
+                elif not self.overlap(a, t):
+                    code[a] = "apart"
+                elif code.get(a, "ignored") == "ignored":
+                    code[a] = "ignored"
+                elif code[a] == "apart":
+                    code[a] = "hit"
+                    if a not in judged:
+                        fresh.append(a)
+                    judged.add(a)
+            found = {a: self.fault_and_kind(a, t, places[t][0] or places[t][3]) for a in fresh}
+            for a, (own, _) in found.items():
+                if own:
+                    code[a] = "own fault"
+            hit[t] = any(c in ("hit", "own fault") for c in code.values())
+            fault[t] = any(own for own, _ in found.values())
+            if found and not kinds:
+                nearest = min(found, key=lambda a: np.hypot(*(self.tracks.xy[a, t] - self.motion[t, :2])))
+                kinds.append(found[nearest][1])
+            ignored = max(ignored, sum(c == "ignored" for c in code.values())) if t > START else 0
+            blameless[t] = {a for a, c in code.items() if c in ("hit", "ignored")}
+        return hit, fault, (kinds or [0])[0], ignored, blameless
+
+    def ttc(self, t, blameless):
+        x, y, heading, length, _ = self.ego(t)
+        along = np.array([np.cos(heading), np.sin(heading)])
+        rows = []
+        for a in range(1, len(self.tracks.valid)):
+            if not self.tracks.valid[a, t] or a in blameless:
+                continue
+            foremost = ((corners(*self.other(a, t)) - [x, y]) @ along).max()
+            self.near(foremost, -length * 1.461 / 5.176)
+            if foremost > -length * 1.461 / 5.176:
+                rows.append(a)
+        boxes = np.array([self.other(a, t) for a in rows]).reshape(-1, 5)
+        velocities = self.tracks.velocity[rows, t]
+
+        def marched(change):
+            size = np.array([0, 0, 0, change, change])
+            now = self.ego(t) + size
+            return marched_ttc(now, self.motion[t, 3] * along, boxes + size, velocities).min(initial=5.0)
+
+        # A corner may be grazed between two moments of the march: then boxes that are a little smaller never meet.
+        return marched(0.0), lambda: marched(-0.06)
+
+    def red_light(self, t):
+        """Whether the bumper crosses the stop line of the route's light while it is red before and after."""
+        fronts = [
+            self.motion[s, :2]
+            + self.size[0, 0] / 2 * np.array([np.cos(self.motion[s, 2]), np.sin(self.motion[s, 2])])
+            for s in (t - 1, t)
+        ]
+        for light in self.recording.lights:
+            x = light.stop_point[0]
+            red = all(light.states[s] in (1, 4) for s in (t - 1, t))
+            self.near(fronts[1][0], x, 1e-4)
+            if red and fronts[0][0] < x <= fronts[1][0]:
+                share = (x - fronts[0][0]) / (fronts[1][0] - fronts[0][0])
+                y = fronts[0][1] + share * (fronts[1][1] - fronts[0][1])
+                self.near(abs(y), HALF)
+                return abs(y) <= HALF
+        return False
+
+    def comfort(self):
+        """Whether each step 11..90 is comfortable; the largest jerk magnitude and lateral acceleration."""
+        speed, heading = self.motion[:, 3], np.unwrap(self.motion[:, 2])
+        along = np.diff(speed) / DT
+        lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / DT
+        turn = heading[1:]
+        lat = np.abs(savgol_filter(lateral, 8, 2))
+        magnitude = np.abs(savgol_filter(np.hypot(along, lateral), 15, 2, deriv=1, delta=DT))
+        smooth = savgol_filter(along, 8, 2)
+        excess = np.max([
+            smooth / 2.40, smooth / -4.05, lat / 4.89, magnitude / 8.37,
+            np.abs(savgol_filter(along, 15, 2, deriv=1, delta=DT)) / 4.13,
+            np.abs(savgol_filter(turn, 15, 2, deriv=1, delta=DT)) / 0.95,
+            np.abs(savgol_filter(turn, 15, 3, deriv=2, delta=DT)) / 1.93,
+        ], axis=0)[START:]  # fmt: skip
+        if (np.abs(excess - 1) < 2e-3).any():
+            self.ambiguous = True
+        return (excess <= 1).mean(), magnitude[START:].max(), lat[START:].max()
+
+    def episode(self, min_ttc):
+        """Metrics by name, and times to collision at every eighth step.
+
+        Beyond the ends of lanes and route, lines are no longer straight on: what depends on them is left out there.
+        """
+        steps = range(START + 1, END + 1)
+        places = {t: self.place(t) for t in range(START, END + 1)}
+        hit, fault, kind, ignored, blameless = self.contacts(places)
+        moved = np.hypot(*np.diff(self.motion[START:, :2], axis=0).T)
+        over = [max(0.0, self.motion[t, 3] - places[t][5]) for t in steps if places[t][5] is not None]
+        wrong = np.array([moved[t - START - 1] * places[t][4] for t in steps])
+        log = self.tracks.xy[0]
+        apart = np.hypot(*(self.motion[START + 1 :, :2] - log[START + 1 :]).T)
+        ways = np.abs(self.motion[START + 1 :, 1])
+        comfort, jerk, lateral = self.comfort()
+        gained, whole = max(self.motion[START:, 0].max(), 0.0), log[END, 0]
+        ttc = {t: self.ttc(t, blameless[t]) for t in steps if self.motion[t, 3] >= 0.05 and t % 8 == 3}
+        goal = np.hypot(*(self.motion[END, :2] - log[END]))
+        ratio = 1.0 if whole < 0.5 else np.clip(gained / whole, 0, 1)
+        result = {
+            "collision": hit[START + 1 :].any(), "at_fault_collision": fault.any(), "collision_type": kind,
+            "ignored_overlaps": ignored, "offroad": any(places[t][0] for t in steps),
+            "left_map": any(places[t][1] for t in steps), "red_light": any(self.red_light(t) for t in steps),
+            "lane_straddle": DT * sum(places[t][2] for t in steps), "wrong_way": wrong.sum(),
+            "wrong_way_worst": max(wrong[max(0, i - 9) : i + 1].sum() for i in range(80)),
+            "speeding_mean": np.mean(over) if over else None, "speeding_max": max(over) if over else None,
+            "off_route": any(places[t][6] for t in steps), "route_deviation_mean": ways.mean(),
+            "route_deviation_max": ways.max(), "ade": apart.mean(), "fde": apart[-1], "distance": moved.sum(),
+            "progress": gained, "progress_ratio": ratio, "goal_distance": goal, "comfort": comfort, "max_jerk": jerk,
+            "max_lateral_acceleration": lateral,
+        }  # fmt: skip
+        for value, threshold in ((ratio, 0.2), (ratio, 0.95), (goal, 3.0)):
+            self.near(value, threshold)
+        if self.motion[:, 0].max() > min(self.ring.bounds[2] - 5, log[END, 0] + 45):
+            return {name: value for name, value in result.items() if name not in LINES}, ttc
+        return result | scores(result | {"min_ttc": min_ttc}), ttc
+
+
+def scores(found):
+    """The two scores and what they are made of, by their formulas, from the metrics of an episode."""
+    over = found["speeding_mean"]
+    speed = None if over is None else max(0.0, 1 - over / 2.23)
+    worst, straddle = found["wrong_way_worst"], round(found["lane_straddle"], 3)
+    direction = 1.0 if worst <= 2 else 0.5 if worst <= 6 else 0.0
+    lanes = 1.0 if straddle <= 3.4 else 0.5 if straddle <= 5.7 else 0.0
+    least = 5.0 if found["min_ttc"] is None else found["min_ttc"]
+    gates = (
+        (1 - found["at_fault_collision"])
+        * (1 - found["offroad"])
+        * (found["progress_ratio"] >= 0.2)
+        * direction
+    )
+    terms = 5 * (least >= 0.95) + 5 * found["progress_ratio"] + 2 * (found["comfort"] > 1 - 1e-6)
+    red = 1 - found["red_light"]
+    clean = not (found["collision"] or found["offroad"] or found["red_light"])
+    lawful = not (found["at_fault_collision"] or found["offroad"] or found["red_light"])
+    reached = found["goal_distance"] <= 3 or found["progress_ratio"] >= 0.95
+    result = {
+        "accuracy": clean, "accuracy_at_fault": lawful, "reached_goal": reached, "success": clean and reached,
+        "direction": direction, "lane_keeping": lanes, "speed_compliance": speed,
+    }  # fmt: skip
+    if speed is None:
+        nuplan, vmax = gates * terms / 12, gates * red * (terms + 3 * lanes) / 15
+        return result | {
+            "nuplan_score_partial": nuplan,
+            "vmax_score_partial": vmax,
+            "vmax_score": None,
+            "nuplan_score": None,
+        }
+    nuplan, vmax = gates * (terms + 4 * speed) / 16, gates * red * (terms + 4 * speed + 3 * lanes) / 19
+    return result | {"nuplan_score": nuplan, "vmax_score": vmax, "vmax_score_partial": None}

@@ -1,0 +1,103 @@
+"""Metrics on random scenes against an oracle that uses other methods in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from judging import BATCH, judge
+from metric_oracle import Judge
+from metric_scenes import two_way_road
+from scenes import car, straight_road
+
+KINDS = ((1, 4.8, 2.0), (1, 12.0, 2.5), (2, 0.6, 0.6), (3, 1.8, 0.7))
+QUARTER = np.pi / 2
+
+
+def random_car(rng):
+    """Someone near ego's way, at constant velocity, in a quarter of all cases standing, sometimes only for a while."""
+    kind, length, width = KINDS[rng.choice(4, p=[0.6, 0.1, 0.2, 0.1])]
+    heading = rng.choice([0.0, np.pi, QUARTER, -QUARTER]) + rng.normal(0, 0.15)
+    x, y, speed = rng.uniform([-20, -3, 0.0], [70, 8, 12.0])
+    first, last = np.sort(rng.integers(0, 91, 2)) if rng.random() < 0.3 else (0, 91)
+    return car(x, y, heading, speed * (rng.random() > 0.25), length, width, kind, range(first, last))
+
+
+def random_scene(rng):
+    """A road with a light, up to six others, and a way of driving; the log drives straight on."""
+    cars = [
+        car(speed=rng.choice([0.0, 4.0, 10.0, 13.0])),
+        *(random_car(rng) for _ in range(rng.integers(0, 7))),
+    ]
+    states = np.repeat(rng.choice([0, 4, 5, 6, 1], 4), 25)[:91]
+    end = rng.choice([90.0, 350.0])
+    road, two_way = straight_road(cars, light=states, light_x=30.0, end=end), bool(rng.random() < 0.5)
+    if two_way:
+        oncoming = next(f for f in two_way_road(cars, end=end).features if f.feature_id == 2)
+        kept = [replace(f, left_neighbours=()) for f in road.features if f.feature_id != 2]
+        road = replace(road, features=(*kept, oncoming))
+    return road, random_drive(rng), two_way
+
+
+def random_drive(rng):
+    """Continues the log smoothly: a wave of speed, a wave of heading, and a drift to one side."""
+    wave, pace = rng.uniform(0.3, 3), rng.uniform(0.3, 2)
+    gain = rng.uniform(-4, 4) / wave
+    steer, drift = rng.choice([0.0, 0.05, 0.3]) * rng.normal(), rng.choice([0.0, 0.0, 0.05]) * rng.normal()
+    t = (np.arange(91) - 10) * 0.1
+    later = np.maximum(t, 0.0)
+
+    def drive(log):
+        speed = np.maximum(log[10, 3] + gain * (np.cos(wave * later) - 1.0), 0.0)
+        heading = steer * (1 - np.cos(pace * later)) + drift * np.minimum(later, 2.0)
+        middle = (heading[1:] + heading[:-1]) / 2
+        step = (speed[1:] + speed[:-1])[:, None] / 2 * 0.1 * np.stack([np.cos(middle), np.sin(middle)], -1)
+        xy = np.concatenate([np.zeros((1, 2)), step.cumsum(axis=0)])
+        driven = np.stack([*(xy - xy[10]).T, heading, speed], -1)
+        return np.where((t > 0)[:, None], driven, log)
+
+    return drive
+
+
+def same(value, got):
+    if value is None or got is None:
+        return value is got
+    return got == pytest.approx(float(value), rel=2e-3, abs=5e-3)
+
+
+def compare(seed):
+    """Judges ``BATCH`` random scenes twice; how many were compared, the others being too close to call."""
+    rng = np.random.default_rng(seed)
+    cases = [random_scene(rng) for _ in range(BATCH)]
+    found = judge([road for road, _, _ in cases], [drive for _, drive, _ in cases])
+    compared = 0
+    for number, ((road, drive, two_way), got) in enumerate(zip(cases, found, strict=True)):
+        ego = road.tracks
+        log = np.column_stack([ego.xy[0], ego.heading[0], np.hypot(*ego.velocity[0].T)])
+        # What the package was given: the same motion in float32.
+        oracle = Judge(road, drive(log).astype(np.float32).astype(np.float64), two_way)
+        expected, ttc = oracle.episode(got["min_ttc"])
+        if oracle.ambiguous:
+            continue
+        compared += 1
+        for name, value in expected.items():
+            assert same(value, got[name]), (seed, number, name, value, got[name])
+        for t, (value, grazing) in ttc.items():
+            fine = got["series"]["ttc"][t - 11] == pytest.approx(value, abs=4e-3)
+            assert fine or (value == 5.0 and grazing() == 5.0), (seed, number, t, value)
+    return compared
+
+
+@settings(max_examples=2)
+@given(st.integers(0, 2**31))
+def test_random_scenes(seed):
+    compare(seed)
+
+
+@pytest.mark.slow
+def test_many_random_scenes():
+    assert sum(compare(seed) for seed in range(30)) >= 150

@@ -1,0 +1,225 @@
+"""Terms such as a user writes, reached by dotted name; every one keeps to the rules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+
+from drivax.learning.collector import collect, start_environments
+from drivax.metrics.catalogue import Metric
+from drivax.metrics.steps import StepValue
+from drivax.networks.encoders import group_names, group_spec
+from drivax.planners.network import NetworkPlanner
+from drivax.planners.planner import Memoryless
+from drivax.scenario.record import record
+from drivax.tasks.observations import View
+
+
+def hurry(before, now, around):
+    """How much slower than 10 m/s, as a share."""
+    return jnp.clip(1.0 - now.speed_mps / 10.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Crowded:
+    """The number of others within some distance, as a share of ten."""
+
+    within_m: float = 20.0
+
+    def __call__(self, before, now, around):
+        frame = around.frame
+        offset = frame.box[1:, :2] - frame.box[0, :2]
+        near = frame.valid[1:] & (jnp.sum(offset * offset, axis=-1) < self.within_m**2)
+        return near.sum().astype(jnp.float32) / 10.0
+
+
+def goal(bank, scene, frames):
+    """The goal in the ego frame, in units of 50 m, at most 5 of them."""
+    return jnp.clip(View.of(scene).point(bank.goal[scene.index])[None] / 50.0, -5.0, 5.0)
+
+
+def walkers(bank, scene, frames):
+    """The three nearest pedestrians: place and velocity."""
+    now, view = frames(0), View.of(scene)
+    place = view.point(now.box[:, :2])
+    there = now.valid & (now.kind == 2) & (jnp.linalg.norm(place, axis=-1) < 60.0)
+    distance = jnp.where(there, jnp.sum(place * place, axis=-1), jnp.inf)
+    chosen = jnp.argsort(distance)[:3]
+    rows = jnp.concatenate([place / 50.0, view.vector(now.velocity) / 15.0], axis=-1)
+    return rows[chosen], there[chosen]
+
+
+def _gap(moment):
+    frame = moment.found.surroundings.frame
+    offset = frame.box[1:, :2] - frame.box[0, :2]
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(offset * offset, axis=-1), 1e-6))
+    return jnp.min(jnp.where(frame.valid[1:], distance, 1e3)), frame.valid[1:].any()
+
+
+nearest_other = Metric(
+    unit="m",
+    better="high",
+    text="smallest distance between centres",
+    of=StepValue("nearest_other", "m", _gap, frozenset()),
+    operator="min",
+)
+
+
+class _Mean(nnx.Module):
+    def __init__(self, config, spec, rngs):
+        self.names = group_names(spec)
+        self.width = config.width
+        self.layers = nnx.Dict({n: nnx.Linear(spec[n][-1], config.width, rngs=rngs) for n in self.names})
+        self.ranks = {n: len(spec[n]) for n in self.names}
+
+    def __call__(self, groups):
+        total = 0.0
+        for name in self.names:
+            value = groups[name]
+            mask = groups.get(f"{name}_mask", jnp.ones(value.shape[:-1], bool))[..., None]
+            rows = jnp.where(mask, jnp.tanh(self.layers[name](jnp.where(mask, value, 0.0))), 0.0)
+            axes = tuple(range(-self.ranks[name], -1))
+            total += rows.sum(axes) / jnp.maximum(mask.sum(axes), 1)
+        return total
+
+
+@dataclass(frozen=True)
+class MeanConfig:
+    """Every row through one layer per group, then the mean."""
+
+    width: int = 8
+
+    def build(self, spec, rngs):
+        return _Mean(self, spec, rngs)
+
+
+@record
+class ReinforceState:
+    """What REINFORCE needs to continue."""
+
+    parameters: Any
+    optimiser: Any
+    environments: Any
+    key: Any
+    iteration: Any
+
+
+class _Gauss(nnx.Module):
+    def __init__(self, spec, rngs):
+        self.encoder = MeanConfig().build(spec, rngs)
+        self.mean = nnx.Linear(8, 2, rngs=rngs)
+
+    def __call__(self, groups):
+        return _Action(self.mean(self.encoder(groups)))
+
+
+@record
+class _Action:
+    loc: Any
+
+    def sample(self, key):
+        return self.loc + 0.3 * jax.random.normal(key, self.loc.shape)
+
+    def mode(self):
+        return jnp.tanh(self.loc)
+
+
+class Reinforce:
+    """REINFORCE with the reward to go of the next steps."""
+
+    def __init__(self, config, simulator, bank):
+        self.config, self.simulator = config, simulator
+        self.spec = group_spec(
+            jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank)
+        )
+        self.graph, _ = nnx.split(_Gauss(self.spec, nnx.Rngs(0)))
+        self.optimiser = optax.adam(config.learning_rate)
+
+    def init(self, bank, key):
+        key, network, environments = jax.random.split(key, 3)
+        parameters = nnx.state(_Gauss(self.spec, nnx.Rngs(network)), nnx.Param)
+        begun = start_environments(self.simulator, bank, environments, self.config.environments)
+        return ReinforceState(
+            parameters, self.optimiser.init(parameters), begun, key, jnp.zeros((), jnp.int32)
+        )
+
+    def iterate(self, bank, state):
+        key, collecting = jax.random.split(state.key)
+        policy = nnx.merge(self.graph, state.parameters)
+
+        def actor(seen, key):
+            choice = policy(seen).sample(key)
+            return choice, jnp.tanh(choice), {}
+
+        begun, rollout, sums = collect(
+            self.simulator, bank, state.environments, actor, collecting, self.config.unroll
+        )
+        gains = jnp.cumsum(rollout.reward[::-1], axis=0)[::-1]
+
+        def loss(parameters):
+            policy = nnx.merge(self.graph, parameters)
+            error = (rollout.choice - policy(rollout.observation).loc) / 0.3
+            log_prob = -0.5 * jnp.sum(error * error, axis=-1)
+            return -jnp.mean(rollout.alive * (gains - gains.mean()) * log_prob)
+
+        value, gradient = jax.value_and_grad(loss)(state.parameters)
+        change, optimiser = self.optimiser.update(gradient, state.optimiser, state.parameters)
+        parameters = optax.apply_updates(state.parameters, change)
+        logs = {f"rollout/{name}": total for name, total in sums.items()} | {"loss/policy": value}
+        return ReinforceState(parameters, optimiser, begun, key, state.iteration + 1), logs
+
+    def planner(self, parameters, name, samples):
+        return NetworkPlanner(parameters, self.graph, name, samples)
+
+
+@dataclass(frozen=True)
+class ReinforceConfig:
+    """REINFORCE."""
+
+    environments: int = 3
+    unroll: int = 4
+    learning_rate: float = 1e-2
+
+    @property
+    def steps_per_iteration(self):
+        return self.environments * self.unroll
+
+    def build(self, simulator, bank, iterations):
+        return Reinforce(self, simulator, bank)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Traffic: everyone goes on as at the start, straight, at constant velocity."""
+
+    name: str = "drift"
+
+    def start(self, bank, index, step):
+        return bank.agents[index, step]
+
+    def advance(self, bank, scene, frame):
+        rows = scene.traffic
+        return rows.at[:, :2].add(0.1 * rows[:, 5:7])
+
+    def agents(self, bank, scene, back):
+        rows = scene.traffic
+        return rows.at[:, :2].add(-0.1 * back * rows[:, 5:7])
+
+
+@dataclass(frozen=True)
+class FullBrake(Memoryless):
+    """A planner that brakes."""
+
+    name: str = "full_brake"
+    replays: bool = False
+
+    def act(self, carry, bank, state, situation, observation, key):
+        return jnp.array([-1.0, 0.0]), carry
+
+
+jax.tree_util.register_static(FullBrake)

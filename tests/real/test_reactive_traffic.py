@@ -1,0 +1,82 @@
+"""Reactive traffic on the recordings of ``../shared/data``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivax.datasets.conversion import Conversion, convert_file
+from drivax.datasets.reader import BadRecord
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.simulator.reactive import DRIVES, REPLAYS
+from traffic_oracle import TRAFFIC, compare, meetings, runs_of
+from traffic_oracle import Path as Line
+
+pytestmark = pytest.mark.slow
+FILES = (
+    "womd/*", "scenarionet/*.pkl", "gpudrive/*.json", "av2/*/scenario_*.parquet",
+    "av2_sensor/*/annotations*.feather",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bank(real_data: Path) -> ScenarioBank:
+    for package in ("shapely", "pyarrow", "google.protobuf"):
+        pytest.importorskip(package, reason=f"needs {package}")
+    files = [file for pattern in FILES for file in sorted(real_data.glob(pattern))]
+    found = [item for file in files for item in convert_file(file, Conversion())]
+    scenarios = [item for item in found if not isinstance(item, BadRecord)]
+    assert len(scenarios) >= 15
+    return TRAFFIC.prepare(ScenarioBank.from_scenarios(scenarios))
+
+
+@pytest.fixture(scope="module")
+def runs(bank):
+    return runs_of(bank)
+
+
+def test_vehicles_do_what_the_law_says(bank, runs):
+    found = np.concatenate([compare(bank, index, *run, every=20) for index, run in enumerate(runs)])
+    assert len(found) > 400
+    assert np.quantile(found[:, 0], 0.99) < 5e-3
+
+
+def test_paths_follow_the_logs_and_vehicles_their_paths(bank, runs):
+    agents = np.asarray(bank.agents, np.float64)
+    away, left, moves = [], [], []
+    for index, (frames, traffic) in enumerate(runs):
+        for row in np.flatnonzero((traffic.phase == DRIVES).any(0)):
+            slot, path = int(bank.paths.slot[index, row]), Line(bank.paths, index, row)
+            seen = agents[index, :, slot, AGENT_VALID] > 0
+            x, y, _, _ = path.at(np.asarray(bank.paths.log_arc[index, seen, row]))
+            away += np.hypot(x - agents[index, seen, slot, 0], y - agents[index, seen, slot, 1]).tolist()
+            moves += (np.hypot(*agents[index, seen, slot, 5:7].T) > 1.0).tolist()
+            there = np.flatnonzero(frames.valid[1:, slot])[::10] + 1
+            if slot > 0:
+                left += [path.project(frames.box[t, slot, :2].astype(float), 0, np.inf)[1] for t in there]
+    # A standing car's boxes jitter by up to a metre, which shapes no path.
+    assert np.quantile(np.array(away)[moves], 0.99) < 0.1 and max(away) < 1.1
+    assert max(left) < 0.02
+
+
+def test_few_vehicles_meet(bank, runs):
+    found = [meetings(bank, index, *run) for index, run in enumerate(runs)]
+    reacting = sum(len(agents) for _, agents in found)
+    between = sum(len([pair for pair in pairs if set(pair) <= set(agents)]) for pairs, agents in found)
+    print(
+        f"{reacting} react, {sum(len(p) for p, _ in found)} meetings, {between} of them between two that react"
+    )
+    # Merging without a light, and things that appear on top of somebody after they were hidden.
+    assert reacting > 300 and between <= 0.03 * reacting
+
+
+def test_logs_are_driven_about_as_fast_as_they_were(bank, runs):
+    shares = []
+    for index, (_, traffic) in enumerate(runs):
+        for row in np.flatnonzero((traffic.phase != REPLAYS).any(0)):
+            logged = float(bank.paths.log_arc[index, -1, row] - bank.paths.log_arc[index, 10, row])
+            if logged > 20.0:
+                shares.append((traffic.arc[-1, -1, row] - traffic.arc[0, -1, row]) / logged)
+    assert 0.8 < np.median(shares) < 1.3

@@ -1,0 +1,98 @@
+"""What a step costs does not grow with the map, and grows with agents no faster than they do; one compilation each."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from drivax.evaluation.rollout import drive, judging
+from drivax.planners.simple import ConstantVelocity
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.catalogue import make_traffic, prepared
+from drivax.simulator.simulator import Simulator
+from drivax.studies.bench import BenchConfig, _parts, _rounds
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.task import Task
+from drivax.testing.worlds import padded
+
+BATCH = 4096
+
+
+@pytest.fixture(scope="module")
+def bank():
+    """One scenario with all its padding."""
+    return ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))], trim=False)
+
+
+def with_segments(bank, more):
+    pad = ((0, 0), (0, 0), (0, more))
+    return replace(bank, edges=jnp.pad(bank.edges, pad), lanes=jnp.pad(bank.lanes, pad))
+
+
+def operations(bank, simulator=None):
+    """Arithmetic of a step and an observation of one environment, as the compiler counts it before it optimises."""
+    simulator = simulator or Simulator(Task())
+
+    def one(bank, state, action):
+        after, transition = simulator.step(bank, state, action)
+        return transition.reward, after.episode, simulator.observe(bank, after.scene)
+
+    state = jax.eval_shape(jax.vmap(simulator.reset, (None, 0)), bank, jnp.zeros(BATCH, jnp.int32))
+    traced = jax.jit(jax.vmap(one, (None, 0, 0))).lower(bank, state, jnp.zeros((BATCH, 2)))
+    return traced.cost_analysis()["flops"] / BATCH
+
+
+def test_a_step_costs_the_same_on_a_map_of_twice_the_segments(bank):
+    assert operations(with_segments(bank, 4096)) == pytest.approx(operations(bank), rel=1e-3)
+
+
+def test_a_step_costs_at_most_in_proportion_to_agents(bank):
+    few, many = operations(bank), operations(padded(bank, bank.agents.shape[2]))
+    assert few < many < 1.5 * few
+
+
+def test_the_count_would_see_pairs_of_agents(bank):
+    class Pairs(Simulator):
+        def observe(self, bank, scene, cast=None):
+            xy = bank.agents[scene.index, scene.step, :, :2]
+            return {"apart": jnp.sum((xy[:, None] - xy) ** 2)}
+
+    few = operations(bank, Pairs(Task()))
+    many = operations(padded(bank, bank.agents.shape[2]), Pairs(Task()))
+    assert many - few > 3 * 64 * 64 * 2  # differences and squares of pairs, four times as many
+
+
+@pytest.mark.parametrize(("traffic", "most"), [("log", 4096), ("idm", 16384)])
+def test_states_are_small(bank, traffic, most):
+    chosen = make_traffic(traffic)
+    state = jax.eval_shape(Simulator(Task(), chosen).reset, prepared(chosen, bank), jnp.zeros((), jnp.int32))
+    assert sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("traffic", ["log", "idm"])
+def test_one_configuration_is_compiled_once(traffic):
+    model = make_traffic(traffic)
+
+    def driven(scenarios, rows, trim=True):
+        bank = prepared(model, ScenarioBank.from_scenarios(scenarios, trim=trim))
+        keys = jax.random.split(jax.random.key(0), 2)
+        drive(Simulator(judging(Task()), model), ConstantVelocity(), bank, jnp.asarray(rows), keys)
+        return drive._cache_size()
+
+    data = [assemble(generate_recording(7, i)) for i in range(3)]
+    assert driven(data, [0, 1]) == driven(data, [2, 0])
+    # Banks of other scenarios that keep their padding share the program, too.
+    assert driven(data[:1], [0, 0], trim=False) == driven(data[1:2], [0, 0], trim=False)
+
+
+@pytest.mark.parametrize("part", [pytest.param("reset", marks=pytest.mark.slow), "metrics"])
+def test_parts_are_timed_on_states_as_they_are(part):
+    # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
+    bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
+    simulator, config = Simulator(Task()), BenchConfig(batch=2, steps=3)
+    states = jax.vmap(simulator.reset, (None, 0))(bank, jnp.zeros(2, jnp.int32))
+    shift = _rounds(config, _parts(simulator)[part])(bank, states)
+    assert (jnp.abs(shift) < 1e-9).all()

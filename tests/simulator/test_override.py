@@ -1,0 +1,114 @@
+"""Agents that do what they are told, and kinds of traffic by name."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.scenario.schema import AgentKind
+from drivax.simulator.catalogue import make_traffic, prepared
+from drivax.simulator.override import OverrideTraffic, motions_of_actions, with_given
+from drivax.simulator.reactive import IdmTraffic
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import LogTraffic, alone
+from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
+
+TASK = Task()
+SIMULATOR = Simulator(TASK, OverrideTraffic(IdmTraffic()))
+STEPS = 79
+
+
+@pytest.fixture(scope="module")
+def bank():
+    """Ego out of the way; a car (slot 1), one 30 m behind it (slot 2), and a cyclist (slot 3)."""
+    cyclist = car(150, 3.7, 0, 4, kind=AgentKind.CYCLIST)
+    cars = [car(60, 3.7, 0, 0), car(40, 0, 0, 10), car(10, 0, 0, 10), cyclist]
+    bank = IdmTraffic().prepare(bank_of(straight_road(cars)))
+    np.testing.assert_allclose(bank.agents[0, 10, :4, 0], [0, -20, -50, 90], atol=1e-4)
+    return bank
+
+
+def _frames(bank, motion, valid):
+    """Everyone at every step from 10 on, when slot 1 does what it is told; ego stands."""
+    told = with_given(bank, jnp.asarray([[1, -1]]), motion, valid)
+
+    def one(scene, _):
+        frame = SIMULATOR.frame(told, scene, alone(scene), 0)
+        traffic = SIMULATOR.traffic.advance(told, scene, frame)
+        return replace(scene, step=scene.step + 1, traffic=traffic), frame
+
+    return jax.lax.scan(one, SIMULATOR.scene(told, 0, 10), None, length=STEPS)[1]
+
+
+frames_of = jax.jit(_frames)
+
+
+@jax.jit
+def driven(bank, brakes):
+    """Trajectories of slot 1 when it brakes with this share of 6 m/s2."""
+    actions = jnp.stack([jnp.broadcast_to(brakes, (80, 2)), jnp.zeros((80, 2))], -1)[None]
+    return motions_of_actions(bank, jnp.asarray([[1, -1]]), actions, TASK.motion)
+
+
+THERE = jnp.ones((1, 91, 2), bool)
+
+
+def test_given_trajectories_are_driven_and_the_others_replay(bank):
+    line = np.zeros((1, 91, 2, 4), np.float32)
+    line[0, :, 0] = np.stack([np.arange(91) * 0.5, np.full(91, -3.7), np.full(91, 0.1), np.full(91, 5.0)], -1)
+    frames = frames_of(bank, jnp.asarray(line), THERE.at[0, 60:].set(False))
+    np.testing.assert_allclose(frames.box[40, 1, :4], [25.0, -3.7, np.cos(0.1), np.sin(0.1)], rtol=1e-6)
+    np.testing.assert_allclose(frames.velocity[40, 1], [5 * np.cos(0.1), 5 * np.sin(0.1)], rtol=1e-5)
+    np.testing.assert_array_equal(frames.box[40, 3, :2], bank.agents[0, 50, 3, :2])
+    assert float(frames.z[40, 1]) == pytest.approx(
+        float(bank.agent_box[0, 1, 2]) / 2
+    )  # the road is at height 0
+    np.testing.assert_array_equal(frames.valid[:, 1], np.arange(10, 10 + STEPS) < 60)
+
+
+def test_given_actions_are_driven_as_an_agent_would(bank):
+    motion = np.asarray(driven(bank, -0.5))
+    assert motion.shape == (1, 91, 2, 4)
+    np.testing.assert_allclose(motion[0, :11, 0, :2], np.asarray(bank.agents[0, :11, 1, :2]), atol=1e-4)
+    # 10 m/s, 3 m/s2 of braking: 16.67 m, and not a millimetre back.
+    assert motion[0, -1, 0, 0] - motion[0, 10, 0, 0] == pytest.approx(100 / 6, abs=1e-3)
+    assert motion[0, -1, 0, 3] == 0.0 and (np.diff(motion[0, :, 0, 0]) >= 0).all()
+
+
+def test_reactive_vehicles_give_way_to_what_is_told_to_stop(bank):
+    frames = frames_of(bank, driven(bank, -0.5), THERE)
+    x, speed = np.asarray(frames.box)[:, 1:3, 0], np.asarray(frames.velocity)[:, 2, 0]
+    assert (x[:, 0] - x[:, 1] - 4.8 > 1.0).all()
+    assert x[-1, 0] - x[-1, 1] - 4.8 == pytest.approx(2.0, abs=1.0) and speed[-1] < 0.8
+
+
+@pytest.mark.slow
+def test_gradients_reach_the_actions_of_others(bank):
+    """How far the follower gets depends on what another is told to do: as finite differences say."""
+
+    @jax.jit
+    def place(brakes):
+        return _frames(bank, driven(bank, brakes), THERE).box[-1, 2, 0]
+
+    slope = float(jax.jit(jax.grad(place))(jnp.float32(-0.1)))
+    finite = float(place(jnp.float32(-0.09)) - place(jnp.float32(-0.11))) / 0.02
+    assert np.isfinite(slope) and slope == pytest.approx(finite, rel=0.03) and slope > 1.0
+
+
+def test_a_bank_that_tells_nobody_what_to_do_is_refused(bank):
+    with pytest.raises(UsageError, match="overridden"):
+        SIMULATOR.scene(bank, 0, 10)
+    assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")
+
+
+def test_traffic_is_found_by_name(bank):
+    assert isinstance(make_traffic("log"), LogTraffic) and isinstance(make_traffic("idm"), IdmTraffic)
+    assert isinstance(make_traffic("drivax.simulator.reactive:IdmTraffic"), IdmTraffic)
+    assert prepared(LogTraffic(), bank) is bank
+    for name, words in (("idn", "there is no traffic"), ("drivax.tasks.task:Task", "makes no traffic")):
+        with pytest.raises(UsageError, match=words):
+            make_traffic(name)

@@ -1,0 +1,182 @@
+"""Starts: any step of the log, and after a moment of wrong driving."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.api import evaluate
+from drivax.api import load as load_scenarios
+from drivax.errors import UsageError
+from drivax.geometry.boxes import corners, overlap
+from drivax.learning.config import TrainConfig
+from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN
+from drivax.settings import dump, load, parse_yaml
+from drivax.simulator.dynamics import GRIP_MPS2, command_between
+from drivax.simulator.override import OverrideTraffic, with_given
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.starts import LogStart, NoisyStart
+from drivax.tasks.task import Task
+from scenes import LANE_M, SMALL, bank_of, car, straight_road
+
+NOISY = Simulator(Task(), start=NoisyStart())
+
+
+@jax.jit
+def noisy(bank, step, keys):
+    """Starts of one scenario, one per key."""
+    return jax.vmap(lambda key: NOISY.scene(bank, 0, step, 0, key))(keys)
+
+
+def keys(count, seed=0):
+    return jax.random.split(jax.random.key(seed), count)
+
+
+@pytest.fixture(scope="module")
+def open_road():
+    return bank_of(straight_road([car(0, 0.9, 0, 6)]))
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0, 30.0])
+def test_draws_are_distributed_as_published(speed):
+    draws = jax.jit(jax.vmap(lambda key: NoisyStart().draw(key, jnp.asarray(speed))))(keys(20_000))
+    acceleration, curvature = (np.asarray(part, np.float64) for part in draws)
+    bound = 0.3 * (0.4 - 0.37 * min(speed / (40 / 3.6), 1.0))
+    strong = (acceleration >= 6 * 0.54) & (np.abs(curvature) >= 0.9 * bound)
+    # Mild draws end among the strong ones by chance: with probability 0.1 in either quantity.
+    assert strong.mean() == pytest.approx(0.75 + 0.25 * 0.01, abs=0.015)
+    # Uniform on [0.54, 0.6] and on [0, 0.6]: means 0.57 and 0.3, variances 0.06^2 / 12 and 0.6^2 / 12.
+    mean = 0.75 * 0.57 + 0.25 * 0.3
+    spread = 0.75 * (0.06**2 / 12 + 0.57**2) + 0.25 * (0.6**2 / 12 + 0.3**2) - mean**2
+    assert acceleration.mean() == pytest.approx(6 * mean, abs=0.03)
+    assert acceleration.std() == pytest.approx(6 * spread**0.5, rel=0.03)
+    # Left and right alike; the size is uniform on [0.9, 1] or [0, 1] of the bound.
+    square = 0.75 * (0.1**2 / 12 + 0.95**2) + 0.25 / 3
+    assert curvature.mean() == pytest.approx(0.0, abs=0.03 * bound)
+    assert curvature.std() == pytest.approx(bound * square**0.5, rel=0.03)
+    assert acceleration.min() >= 0.0 and acceleration.max() <= 3.6 and np.abs(curvature).max() <= bound
+
+
+def test_the_second_before_was_driven_with_one_action(open_road):
+    scenes = noisy(open_road, 10, keys(64))
+    history = scenes.history
+    logged = LogStart().begin(open_road, jnp.int32(0), jnp.int32(0), jnp.int32(0), None)[0]
+    np.testing.assert_allclose(history[:, :6], np.broadcast_to(logged[-6:], (64, 6, 4)), atol=1e-4)
+    between = jax.vmap(jax.vmap(command_between))(history[:, 5:-1], history[:, 6:])
+    acceleration, curvature = map(np.asarray, between)
+    assert np.ptp(acceleration, axis=1).max() < 1e-2 and (acceleration >= -1e-3).all()
+    grip = GRIP_MPS2 / np.asarray(history[:, 5:-1, 3]) ** 2
+    free = (np.abs(curvature) < 0.95 * grip).all(axis=1)
+    assert free.sum() > 32 and np.ptp(curvature[free], axis=1).max() < 1e-3
+    # They are all at step 10 of the log, hardly behind where the log is (some turned), and different.
+    assert (np.asarray(scenes.step) == 10).all()
+    assert (history[:, -1, 0] >= -0.3).all() and len(np.unique(np.asarray(history[:, -1, 1]))) > 48
+    travelled = np.asarray(scenes.route_m - open_road.log_progress[0, 0])
+    np.testing.assert_allclose(travelled, np.asarray(history[:, -1, 0] - logged[-1, 0]), atol=0.3)
+
+
+def test_no_start_collides_or_is_off_the_road():
+    # Lane 1 between the right edge and a column in lane 2: many draws end in either.
+    column = [car(x, 3.4, 0, 6) for x in range(-24, 25, 6)]
+    bank = bank_of(straight_road([car(0, 0.0, 0, 6), *column]))
+    x, y, heading, _ = np.asarray(noisy(bank, 10, keys(64)).history[:, -1]).T
+    rest = np.tile([4.8, 2.0], (64, 1))
+    box = np.concatenate([np.stack([x, y, np.cos(heading), np.sin(heading)], -1), rest], -1)
+    assert corners(box)[..., 1].min() >= -LANE_M / 2 - 0.3
+    others = np.array([[x, 3.4, 1, 0, 4.8, 2.0] for x in range(-24, 25, 6)])
+    assert not overlap(box[:, None], others).any()
+    assert np.ptp(y) > 0.2, "some draws are kept"
+
+
+def test_where_every_draw_fails_the_episode_begins_as_logged():
+    # Half a metre behind a car, a hand's breadth beside a column.
+    beside = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
+    bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *beside]))
+    strong = Simulator(Task(), start=NoisyStart(strong=1.0))
+    logged = Simulator(Task()).scene(bank, 0, 10)
+    drawn = jax.jit(jax.vmap(lambda key: strong.scene(bank, 0, 10, 0, key)))(keys(16))
+    np.testing.assert_array_equal(drawn.history, np.broadcast_to(logged.history, drawn.history.shape))
+    np.testing.assert_array_equal(drawn.route_m, np.full(16, logged.route_m))
+
+
+def test_a_start_is_free_of_those_who_are_told_where_to_be():
+    # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
+    bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
+    told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
+    given = with_given(bank, jnp.asarray([[1]]), told)
+    simulator = Simulator(Task(), OverrideTraffic(), NoisyStart(tries=16))
+    state = jax.jit(jax.vmap(lambda key: simulator.reset(given, 0, 10, 0, key)))(keys(256))
+    assert not np.asarray(state.facts.ignored).any()
+    alone = jax.jit(jax.vmap(lambda key: Simulator(Task(), start=NoisyStart()).scene(bank, 0, 10, 0, key)))
+    beside = np.asarray(alone(keys(256)).history)[:, -1]
+    near = (np.abs(beside[:, 0] - 5.3) < 4.8) & (np.abs(beside[:, 1] - 2.4) < 2.0)
+    assert near.any(), "some draws would have touched"
+
+
+def test_fewer_steps_where_the_log_does_not_reach_back(open_road):
+    first = Simulator(Task()).scene(open_road, 0, 0)
+    for step, driven in ((0, 0), (3, 3)):
+        history = np.asarray(noisy(open_road, step, keys(64)).history)
+        old = np.asarray(first.history)[driven:]
+        np.testing.assert_allclose(
+            history[:, : 16 - driven], np.broadcast_to(old, (64, *old.shape)), atol=1e-4
+        )
+    late = bank_of(straight_road([car(0, 0.9, 0, 6, steps=range(6, 91))]))
+    history = np.asarray(noisy(late, 10, keys(64)).history)
+    assert np.ptp(history[:, 11], axis=0).max() < 1e-4, "before step 6 nobody knows the agent"
+    assert np.ptp(history[:, 12:, 1], axis=0).max() > 1e-4
+
+
+def test_a_start_depends_on_its_key_only(open_road):
+    drawn = keys(64)
+    many, again = noisy(open_road, 10, drawn), noisy(open_road, 10, drawn[::-1])
+    np.testing.assert_array_equal(many.history, again.history[::-1])
+
+
+def test_a_noisy_start_without_a_key_is_refused(open_road):
+    with pytest.raises(UsageError, match="needs a random key"):
+        NOISY.reset(open_road, 0)
+
+
+@pytest.mark.parametrize("options", [{"steps": 16}, {"steps": 0}, {"strong": 1.5}, {"tries": 0}])
+def test_settings_that_cannot_be_meant_are_refused(options):
+    with pytest.raises(UsageError):
+        NoisyStart(**options)
+
+
+def test_an_episode_begins_at_any_step_as_logged():
+    bank = bank_of(straight_road([car(0, 0, 0, 6), car(30, 3.7, 0, 4)]))
+    simulator = Simulator(Task(metrics=("ade", "progress"), ends=()))
+    states = jax.jit(jax.vmap(lambda step: simulator.reset(bank, 0, step)))(jnp.arange(90))
+    row = bank.agents[0, :90, 0]
+    logged = jnp.stack([row[:, 0], row[:, 1], jnp.arctan2(row[:, AGENT_SIN], row[:, AGENT_COS])], -1)
+    np.testing.assert_allclose(states.scene.history[:, -1, :3], logged, atol=1e-6)
+    np.testing.assert_allclose(states.facts.log_divergence_m, 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.diff(states.facts.progress_m), 0.6, atol=1e-2)
+    assert (np.asarray(states.start) == np.arange(90)).all()
+
+
+def test_training_can_begin_so():
+    config = load(TrainConfig, {"start": {"kind": "noisy_start", "scale": 0.5}})
+    assert config.start == NoisyStart(scale=0.5) and load(TrainConfig, {}).start == LogStart()
+    assert load(TrainConfig, parse_yaml(dump(config))) == config
+
+
+@pytest.mark.slow
+def test_evaluation_begins_where_the_noise_leads_and_counts_from_there():
+    """80 steps at the speed and heading that the noise left: nothing of the second before is in any metric."""
+    data = load_scenarios([assemble(straight_road([car(0, 1.8, 0, 2)]), SMALL)])
+    same, other = (
+        evaluate(ConstantVelocity(), data, start=NoisyStart(), seed=seed, task=Task(metrics=("distance",)))
+        for seed in (3, 4)
+    )
+    for found in (same, other):
+        motion = found.motion[0]
+        assert len(motion) == 81 and motion[0, 3] > 2.0
+        assert found.metrics["distance"][0] == pytest.approx(8.0 * motion[0, 3], rel=1e-3)
+        assert 0.0 <= found.metrics["progress_ratio"][0] <= 1.0
+    assert same.motion[0, 0, 3] != other.motion[0, 0, 3]
+    with pytest.raises(UsageError, match="cannot begin elsewhere"):
+        evaluate(Expert(), data, start=NoisyStart())

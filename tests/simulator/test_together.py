@@ -1,0 +1,142 @@
+"""Several driven agents in one scenario, and agents that do what they are told."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.scenario.bank import AGENT_VALID
+from drivax.simulator.reactive import IdmTraffic
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.together import is_driven, slots_of
+from drivax.tasks.observations import PRESETS
+from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
+
+TASK = Task(observation=PRESETS["minimal"])
+REACTIVE = Simulator(TASK, IdmTraffic())
+CARS = [car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10), car(-50, 0, 0, 10)]
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return IdmTraffic().prepare(bank_of(straight_road(CARS)))
+
+
+@jax.jit
+def together(bank, slots, actions):
+    """Actions per step for a stack of agents: states and transitions of every step, and what each sees last."""
+    states = REACTIVE.reset_together(bank, 0, slots)
+
+    def one(states, action):
+        after, done = REACTIVE.step_together(bank, states, action)
+        return after, (after, done)
+
+    last, out = jax.lax.scan(one, states, actions)
+    return out, REACTIVE.observe_together(bank, last)
+
+
+@jax.jit
+def single(bank, actions):
+    def one(state, action):
+        after, done = REACTIVE.step(bank, state, action)
+        return after, (after, done)
+
+    last, out = jax.lax.scan(one, REACTIVE.reset(bank, 0), actions)
+    return out, REACTIVE.observe(bank, last.scene)
+
+
+@pytest.fixture(scope="module")
+def braking(bank):
+    """The leader (slot 1 is 15 m beside, so the order is by distance to ego) brakes hard, ego keeps its speed."""
+    leader = int(np.argmax(np.asarray(bank.agents[0, 10, :, 0])))
+    slots = slots_of(bank, 0, jnp.isin(jnp.arange(16), jnp.asarray([0, leader])), 3)
+    actions = np.zeros((30, 3, 2), np.float32)
+    actions[:, 1, 0] = -1.0
+    return slots, leader, together(bank, slots, jnp.asarray(actions))
+
+
+def test_slots_are_those_of_the_mask_that_are_there(bank):
+    cars = [car(0, 0, 0, 5), car(20, 0, 0, 5), car(40, 0, 0, 5, steps=range(30, 91)), car(60, 0, 0, 5)]
+    here = bank_of(straight_road(cars))
+    there = np.flatnonzero(np.asarray(here.agents[0, 10, :, AGENT_VALID]) > 0)
+    assert there.size == 3
+    mask = jnp.ones(16, bool)
+    assert slots_of(here, 0, mask, 5).tolist() == [*there, 16, 16]
+    assert slots_of(here, 0, mask, 2).tolist() == there[:2].tolist()
+    assert slots_of(here, 0, mask, 5, step=40).tolist() == [0, 1, 2, 3, 16]
+
+
+def test_driven_agents_see_and_hit_each_other(bank, braking):
+    slots, leader, ((states, _), seen) = braking
+    assert slots.tolist() == [0, leader, 16]
+    x = np.asarray(states.scene.history)[:, :, -1, 0]
+    # 10 m/s braked with 6 m/s2 stands after 8.33 m; ego drives on.
+    assert x[-1, 1] - 40.0 == pytest.approx(25 / 3, abs=0.01)
+    assert x[-1, 0] == pytest.approx(30.0, abs=1e-3)
+    # Bumpers meet when ego has driven 40 - 4.8 + 8.33 m: not yet. Both see the same distance.
+    assert not np.asarray(states.facts.collision)[:, :2].any()
+    ahead = x[-1, 1] - x[-1, 0]
+    first = np.asarray(seen["agents"])[:, :, -1, 0] * 50
+    assert np.isclose(first[0], ahead, atol=0.02).any() and np.isclose(first[1], -ahead, atol=0.02).any()
+
+
+def test_what_fills_up_the_stack_does_nothing(bank, braking):
+    _, _, ((states, done), _) = braking
+    assert np.asarray(is_driven(bank, jax.tree.map(lambda leaf: leaf[0], states))).tolist() == [
+        True,
+        True,
+        False,
+    ]
+    assert not np.asarray(done.reward)[:, 2].any() and not np.asarray(done.terminated)[:, 2].any()
+    assert not np.asarray(done.truncated)[:, 2].any()
+    for leaf in jax.tree.leaves((states.facts, done.reward)):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+
+
+def test_reactive_traffic_sees_every_driven_agent(bank, braking):
+    slots, _, ((states, _), _) = braking
+    behind = int(np.argmin(np.asarray(bank.agents[0, 10, :4, 0])))
+    row = int(np.flatnonzero(np.asarray(bank.paths.slot[0]) == behind)[0])
+    free = np.asarray(states.scene.traffic.speed)[:, :, -1, row]
+    # All states of the stack hold the same traffic.
+    np.testing.assert_array_equal(free[:, 0], free[:, 1])
+    # The last car follows ego: when ego brakes it does, too.
+    brakes = jnp.zeros((30, 3, 2)).at[:, 0, 0].set(-0.7)
+    (slowed, _), _ = together(bank, slots, brakes)
+    assert np.asarray(slowed.scene.traffic.speed)[-1, 0, -1, row] < free[-1, 0] - 0.5
+
+
+@pytest.mark.slow
+def test_a_stack_of_one_is_a_single_agent(bank):
+    actions = jax.random.uniform(jax.random.key(0), (30, 3, 2), minval=-0.5, maxval=0.3)
+    slots = jnp.asarray([0, 16, 16])
+    (states, done), seen = together(bank, slots, actions)
+    (wanted, wanted_done), observation = single(bank, actions[:, 0])
+    pairs = (states.scene.history[:, 0], wanted.scene.history), (done.reward[:, 0], wanted_done.reward)
+    for got, expected in (*pairs, *((seen[name][0], observation[name]) for name in observation)):
+        np.testing.assert_allclose(np.asarray(got, np.float32), np.asarray(expected, np.float32), atol=1e-5)
+
+
+def test_whose_episode_is_over_is_neither_rewarded_nor_judged_any_more(bank):
+    simulator = Simulator(Task(metrics=("training", "comfort")))
+    crash = bank_of(straight_road([car(0, 0, 0, 10), car(22, 0, 0, 0)]))
+
+    @jax.jit
+    def run(bank):
+        states = simulator.reset_together(bank, 0, jnp.asarray([0, 16]))
+
+        def one(carry, _):
+            states, over = carry
+            after, done = simulator.step_together(bank, states, jnp.zeros((2, 2)), over)
+            over |= done.terminated | done.truncated
+            return (after, over), (done.reward[0], done.terminated[0], after.episode.total[0])
+
+        return jax.lax.scan(one, (states, jnp.zeros(2, bool)), None, length=40)[1]
+
+    reward, terminated, total = (np.asarray(part) for part in run(crash))
+    # Bumpers are 22 - 4.8 m apart: the eighteenth step closes the gap.
+    assert np.flatnonzero(terminated).tolist() == [17]
+    assert reward[17] == pytest.approx(-1.0, abs=0.3) and not reward[18:].any()
+    np.testing.assert_array_equal(total[17:], np.broadcast_to(total[17], (23, *total[17].shape)))
+    assert (total[17] != total[16]).any()

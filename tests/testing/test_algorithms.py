@@ -1,0 +1,102 @@
+"""The free check of algorithms: an own one and PPO pass, and each rule has one that breaks it."""
+
+import re
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import own_terms
+from drivax.learning.ppo import PpoConfig
+from drivax.networks.actor_critic import ActorCriticConfig
+from drivax.networks.encoders import MlpConfig
+from drivax.planners.simple import ConstantVelocity, RandomActions
+from drivax.scenario.record import record
+from drivax.testing import BrokenContract, check_algorithm
+
+
+@record
+class State:
+    """What a toy needs to continue."""
+
+    parameters: jax.Array
+    iteration: jax.Array
+    key: jax.Array
+
+
+@dataclass(frozen=True)
+class Toy:
+    """Learns nothing about driving, with a fault."""
+
+    fault: str = ""
+
+    @property
+    def steps_per_iteration(self):
+        return 0 if self.fault == "steps" else 5
+
+    def build(self, simulator, bank, iterations):
+        return object() if self.fault == "learner" else ToyLearner(self.fault)
+
+
+class ToyLearner:
+    def __init__(self, fault):
+        self.fault = fault
+
+    def init(self, bank, key):
+        if self.fault == "state":
+            return {"parameters": jnp.zeros(2)}
+        return State(jnp.zeros(2), jnp.zeros((), jnp.int32), key)
+
+    def iterate(self, bank, state):
+        key, use = jax.random.split(state.key)
+        step = jax.random.normal(use, (2,))
+        if self.fault == "host":
+            step = jax.pure_callback(lambda: np.random.default_rng().normal(size=2).astype(np.float32), step)
+        parameters = state.parameters + (0.0 if self.fault == "idle" else step)
+        if self.fault == "form":
+            parameters = jnp.append(parameters, 1.0)
+        if self.fault == "nan":
+            parameters = parameters * jnp.nan
+        iteration = state.iteration + (2 if self.fault == "count" else 1)
+        loss = {"vector": step, "infinite": jnp.inf}.get(self.fault, jnp.sum(step))
+        return State(parameters, iteration, key), {"loss/toy": jnp.asarray(loss)}
+
+    def planner(self, parameters, name, samples):
+        if self.fault == "driver":
+            return lambda observation: parameters
+        return RandomActions() if samples or self.fault == "mode" else ConstantVelocity()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    {
+        "steps": "counts 0 steps per iteration", "learner": "builds no Learner",
+        "state": "without parameters or iteration", "form": "changes the form of its state", "idle": "learns nothing",
+        "count": "from iteration 0 to 2", "host": "does not repeat an iteration", "nan": "is not finite",
+        "vector": "logs 'loss/toy' as", "infinite": "logs 'loss/toy' as inf", "driver": "makes no Planner",
+        "mode": "at random by the mode",
+    }.items(),
+)  # fmt: skip
+def test_wrong_algorithms(fault, words):
+    with pytest.raises(BrokenContract) as error:
+        check_algorithm(Toy(fault))
+    assert re.search(words, str(error.value)) and "\n" not in str(error.value)
+
+
+def test_a_toy_passes():
+    check_algorithm(Toy())
+
+
+@pytest.mark.slow
+def test_an_own_algorithm_passes():
+    check_algorithm("own_terms:ReinforceConfig")
+
+
+@pytest.mark.slow
+def test_ppo_passes():
+    network = ActorCriticConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
+    check_algorithm(PpoConfig(network=network, environments=4, unroll=4, epochs=1, minibatches=2))
+    with_own = replace(network, encoder=own_terms.MeanConfig())
+    check_algorithm(PpoConfig(network=with_own, environments=4, unroll=4, epochs=1, minibatches=2))

@@ -1,0 +1,196 @@
+"""The free checks: our own terms pass them, and each rule has a term that breaks it and is told so."""
+
+import itertools
+import re
+
+import jax
+import jax.numpy as jnp
+import pytest
+from flax import nnx
+
+import own_terms
+from drivax.metrics.catalogue import METRICS, Metric
+from drivax.metrics.steps import StepValue
+from drivax.networks.encoders import MlpConfig
+from drivax.tasks.observations import View
+from drivax.tasks.rewards import TERMS
+from drivax.testing import BrokenContract, check_encoder, check_feature, check_metric, check_reward
+from drivax.testing.worlds import moments
+
+
+def refused(check, term, words):
+    with pytest.raises(BrokenContract) as error:
+        check(term)
+    assert re.search(words, str(error.value)), str(error.value)
+    assert "\n" not in str(error.value) and "; " in str(error.value)
+
+
+def test_the_worlds_show_what_terms_look_at():
+    found = moments().found
+    facts = found.facts
+    for name in ("collision", "offroad", "off_route", "ttc_defined", "straddling", "wrong_way"):
+        assert 0 < float(getattr(facts, name).mean()) < 1, name
+    kinds = found.surroundings.frame.kind[found.surroundings.frame.valid]
+    assert {1, 2} <= set(kinds.tolist())
+
+
+def some(names, *quick):
+    """Each compiles programs of its own: a few of them in the quick tests."""
+    slow = [pytest.param(name, marks=pytest.mark.slow) for name in names if name not in quick]
+    return [*quick, *slow]
+
+
+@pytest.mark.parametrize("name", some(TERMS, "own_terms:Crowded"))
+def test_right_reward_terms(name):
+    check_reward(own_terms.Crowded(5.0) if name.endswith("Crowded") else TERMS.get(name, name))
+
+
+def frame_of(around):
+    return around.frame.box[:, 0], around.frame.valid
+
+
+count = itertools.count()
+#: Each breaks one rule.
+WRONG_TERMS = {
+    "cannot be compiled": lambda b, n, a: jnp.ones(()) if n.speed_mps > 3 else jnp.zeros(()),
+    "another result every time": lambda b, n, a: n.speed_mps * 0.0 + float(next(count)),
+    "instead of one float32 number": lambda b, n, a: n.collision,
+    r"float32\[4\] instead of one": lambda b, n, a: jnp.stack([n.speed_mps] * 4),
+    "is not finite": lambda b, n, a: 1.0 / n.speed_mps,
+    "rows hold something else": lambda b, n, a: jnp.max(jnp.abs(a.frame.velocity)),
+    "more empty slots": lambda b, n, a: a.frame.valid.mean(dtype=jnp.float32),
+    "in another order": lambda b, n, a: a.frame.valid[5].astype(jnp.float32),
+    "turned and shifted": lambda b, n, a: jnp.abs(a.frame.box[0, 2]),
+}
+
+
+@pytest.mark.parametrize("words", some(WRONG_TERMS, "cannot be compiled", "turned and shifted"))
+def test_wrong_reward_terms(words):
+    def term(before, now, around):
+        return WRONG_TERMS[words](before, now, around)
+
+    refused(check_reward, term, words)
+
+
+def test_a_term_that_knows_batches_is_refused():
+    def term(before, now, around):
+        inside = jnp.ndim(now.speed_mps) == 0 and isinstance(now.speed_mps, jax.core.Tracer)
+        return now.speed_mps if inside else now.speed_mps + 1.0
+
+    refused(check_reward, term, "when it is compiled")
+
+
+@pytest.mark.parametrize("name", some(METRICS, "own_terms:nearest_other"))
+def test_right_metrics(name):
+    check_metric(METRICS.get(name, name))
+
+
+def metric(read, reads=frozenset(), **more):
+    return Metric("m", "low", "a wrong one", of=StepValue("wrong", "m", read, reads), operator="max", **more)
+
+
+def test_wrong_metrics():
+    refused(check_metric, metric(lambda m: (m.facts.speed_mps, True)), "'reads' does not name")
+    refused(check_metric, metric(lambda m: (m.facts.speed_mps, True), frozenset({"speed"})), "is no fact")
+    divided = metric(lambda m: (1.0 / m.facts.speed_mps, True), frozenset({"speed_mps"}))
+    refused(check_metric, divided, "is not finite")
+    guarded = metric(lambda m: (1.0 / m.facts.speed_mps, m.facts.speed_mps > 0), frozenset({"speed_mps"}))
+    check_metric(guarded)
+    refused(
+        check_metric, metric(lambda m: (m.found.surroundings.frame.box[0, 0], True)), "turned and shifted"
+    )
+    refused(
+        check_metric, Metric("m", "low", "text", compute=lambda e, v, k: v.value), "does not compute a Value"
+    )
+    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or text")
+
+
+@pytest.mark.parametrize("name", some(["goal"], "walkers"))
+def test_right_features(name):
+    check_feature(f"own_terms:{name}")
+
+
+WRONG_FEATURES = {
+    "cannot be compiled": lambda b, s, f: jnp.asarray([float(s.history[-1, 3])]),
+    r"gives int32": lambda b, s, f: s.step[None, None],
+    r"float32\[\] for": lambda b, s, f: s.history[-1, 3],
+    r"bool\[2\] as the mask of \[1, 2\]": lambda b, s, f: (s.history[-1:, 2:] * 0.0, jnp.ones(2, bool)),
+    "is not finite": lambda b, s, f: jnp.log(s.history[-1:, 3:]),
+    r"reaches \d+": lambda b, s, f: s.history[-1:, 3:] * 100.0,
+    "rows hold something else": lambda b, s, f: jnp.max(f(0).velocity)[None] / 100.0,
+    "more empty slots": lambda b, s, f: jnp.where(f(0).valid, 1.0, 0.0).mean()[None],
+    "in another order": lambda b, s, f: jnp.where(f(0).valid, f(0).box[:, 4], 0.0)[1:9],
+    "the log's future changes": lambda b, s, f: (
+        View.of(s).point(b.agents[s.index, s.step + 5, 0, :2])[None] / 50.0
+    ),
+    "turned and shifted": lambda b, s, f: s.history[-1:, 2] / 3.0,
+}
+
+
+@pytest.mark.parametrize("words", some(WRONG_FEATURES, "the log's future changes"))
+def test_wrong_features(words):
+    def feature(bank, scene, frames):
+        return WRONG_FEATURES[words](bank, scene, frames)
+
+    refused(check_feature, feature, words)
+
+
+def test_an_own_encoder():
+    check_encoder("own_terms:MeanConfig")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [(), (8,)])
+def test_our_encoders(rows):
+    check_encoder(MlpConfig(rows=rows, hidden=(8,)))
+
+
+class Wrong(nnx.Module):
+    """An encoder with a fault."""
+
+    def __init__(self, fault, spec, rngs):
+        self.fault, self.width = fault, 3
+        self.layer = nnx.Linear(spec["ego"][-1], 3, rngs=nnx.Rngs(next(count)) if fault == "seed" else rngs)
+        if fault == "state":
+            self.seen = nnx.BatchStat(jnp.zeros(()))
+        self.masked = next(name.removesuffix("_mask") for name in spec if name.endswith("_mask"))
+
+    def __call__(self, groups):
+        ego = groups["ego"][..., -1, :]
+        x = self.layer(ego) * (0.0 if self.fault == "constant" else 1.0)
+        rows, mask = groups[self.masked], groups[f"{self.masked}_mask"]
+        axes = tuple(range(-len(mask.shape) + ego.ndim - 1, 0)) if ego.ndim > 1 else None
+        if self.fault == "mask":
+            x = x + jnp.mean(rows, axis=(*(a - 1 for a in axes), -1) if axes else None)[..., None]
+        if self.fault == "nobody":
+            x = x / jnp.sum(mask, axis=axes)[..., None]
+        if self.fault == "gradient":
+            x = x + jnp.where(mask.any(axes), jnp.sqrt(jnp.sum(x * 0.0, -1)), 0.0)[..., None]
+        if self.fault == "batch" and x.ndim > 1:
+            x = x - x.mean(0)
+        return x[..., :2] if self.fault == "width" else x
+
+
+class WrongConfig:
+    def __init__(self, fault):
+        self.fault = fault
+
+    def build(self, spec, rngs):
+        return Wrong(self.fault, spec, rngs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    {
+        "width": "its width being 3", "state": "no parameters", "seed": "other parameters every time",
+        "batch": "alone and in a batch", "constant": "all observations alike", "mask": "what masked rows hold",
+        "nobody": "without any row is not finite", "gradient": "gradients that are not finite",
+    }.items(),
+)  # fmt: skip
+def test_wrong_encoders(fault, words):
+    refused(check_encoder, WrongConfig(fault), words)
+
+
+def test_no_encoder_at_all():
+    refused(check_encoder, "own_terms:hurry", "has no build")

@@ -1,0 +1,79 @@
+"""The free check of traffic: ours and an own one pass, and each rule has one that breaks it."""
+
+import itertools
+import re
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import pytest
+
+import own_terms
+from drivax.simulator.traffic import LogTraffic
+from drivax.testing import BrokenContract, check_traffic
+
+count = itertools.count()
+
+
+def test_log_replay_passes():
+    check_traffic(LogTraffic())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["idm", "own_terms:Drift"])
+def test_reactive_and_own_traffic_pass(name):
+    check_traffic(name)
+
+
+@dataclass(frozen=True)
+class Wrong(own_terms.Drift):
+    """Drift with a fault."""
+
+    fault: str = ""
+
+    def start(self, bank, index, step):
+        rows = super().start(bank, index, step)
+        if self.fault == "order":
+            return rows.at[:, 5:7].multiply(1.0 + jnp.arange(len(rows))[:, None] / 100.0)
+        if self.fault == "padding":
+            return rows.at[:, 5:7].multiply(len(rows) / 40.0)
+        if self.fault == "litter":
+            return rows.at[:, 5:7].multiply(1.0 + jnp.abs(rows[:, 0]).max() / 2000.0)
+        return jnp.zeros((9000,)).at[: rows.size].set(rows.ravel()) if self.fault == "size" else rows
+
+    def advance(self, bank, scene, frame):
+        if self.fault == "size":
+            return scene.traffic
+        rows = super().advance(bank, scene, frame)
+        change = {"form": rows[1:], "random": rows + float(next(count))}
+        change["turn"] = rows.at[:, 0].add(0.05)
+        change["leap"] = rows.at[:, 0].add(9.0)
+        return change.get(self.fault, rows)
+
+    def agents(self, bank, scene, back):
+        if self.fault == "size":
+            return bank.agents[scene.index, scene.step]
+        rows = super().agents(bank, scene, 0 if self.fault == "past" else back)
+        if self.fault in ("turn", "leap", "random"):
+            rows = rows.at[:, 0].add(-back * {"turn": 0.05, "leap": 9.0, "random": 0.0}[self.fault])
+        change = {
+            "shape": rows[:, :7],
+            "half": rows.at[:, 7].multiply(0.5),
+            "unit": rows.at[:, 3:5].multiply(1.1),
+        }
+        change["nan"] = rows.at[:, 0].divide(rows[:, 7])
+        return change.get(self.fault, rows)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    {
+        "form": "changes the form of its state", "size": "carries 36000 bytes", "random": "another result every time",
+        "shape": r"float32\[40, 7\]", "nan": "is not finite", "half": "half valid", "unit": "directions of length 1.1",
+        "past": "says another thing of the past", "leap": "moves an agent by", "order": "in another order",
+        "padding": "more empty slots", "litter": "rows hold something else", "turn": "turned and shifted",
+    }.items(),
+)  # fmt: skip
+def test_wrong_traffic(fault, words):
+    with pytest.raises(BrokenContract) as error:
+        check_traffic(Wrong(fault=fault))
+    assert re.search(words, str(error.value)) and "\n" not in str(error.value), str(error.value)

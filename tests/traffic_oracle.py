@@ -1,0 +1,167 @@
+"""Reactive traffic by another program: float64, one vehicle at a time, the whole path searched, no candidates."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.geometry.boxes import overlap
+from drivax.scenario.agent_paths import PATH_SPEED, PATH_X, PATH_Y, PATH_Z
+from drivax.simulator.reactive import DRIVES, IdmTraffic
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import alone
+from drivax.tasks.task import Task
+
+TRAFFIC = IdmTraffic()
+SIMULATOR = Simulator(Task(), TRAFFIC)
+STEPS = 80
+#: Two things whose gaps differ by less are equally near, m: a path of stored points has no better direction.
+EQUALLY_NEAR_M = 0.3
+
+
+def _rolled(bank, index):
+    """Ego replays; before every step the frame that everybody looked at, and the state of traffic."""
+
+    def one(scene, _):
+        frame = SIMULATOR.frame(bank, scene, alone(scene), 0)
+        at = bank.agents[index, jnp.minimum(scene.step + 1, bank.steps - 1), 0]
+        motion = jnp.stack([at[0], at[1], jnp.arctan2(at[4], at[3]), jnp.hypot(at[5], at[6])])
+        history = jnp.concatenate([scene.history[1:], motion[None]])
+        traffic = TRAFFIC.advance(bank, scene, frame)
+        after = replace(scene, step=scene.step + 1, history=history, traffic=traffic)
+        return after, (frame, scene.traffic)
+
+    return jax.lax.scan(one, SIMULATOR.scene(bank, index, 10), None, length=STEPS)[1]
+
+
+rolled = jax.jit(jax.vmap(_rolled, (None, 0)))
+
+
+def runs_of(bank):
+    """Frames and traffic of every scenario, ego replaying."""
+    whole = jax.tree.map(np.asarray, rolled(bank, jnp.arange(len(bank))))
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], whole) for i in range(len(bank))]
+
+
+class Path:
+    """A vehicle's path as a polyline, every point of it."""
+
+    def __init__(self, paths, index, row):
+        self.points = np.asarray(paths.points[index, row], np.float64)
+        self.spacing = float(paths.spacing[index, row])
+        self.arc = np.arange(len(self.points)) * self.spacing
+
+    def at(self, s):
+        columns = [np.interp(s, self.arc, self.points[:, k]) for k in range(self.points.shape[1])]
+        return columns[PATH_X], columns[PATH_Y], columns[PATH_Z], columns[PATH_SPEED]
+
+    def project(self, xy, first, reach):
+        """Arc, distance and direction of the nearest point between two arc lengths, and that of the 4 m around it."""
+        keep = (self.arc[1:] > first - self.spacing) & (self.arc[:-1] < reach)
+        a, b = self.points[:-1, :2][keep], self.points[1:, :2][keep]
+        u = b - a
+        share = np.clip(((xy - a) * u).sum(1) / np.maximum((u * u).sum(1), 1e-12), 0, 1)
+        away = np.hypot(*(xy - a - share[:, None] * u).T)
+        k = int(away.argmin())
+        arc = self.arc[:-1][keep][k] + share[k] * self.spacing
+        (x0, x1), (y0, y1) = (np.interp([arc - 2.0, arc + 2.0], self.arc, self.points[:, i]) for i in (0, 1))
+        around = np.array([x1 - x0, y1 - y0])
+        return arc, away[k], *(way / max(np.hypot(*way), 1e-9) for way in (u[k], around))
+
+
+def extents(box, way):
+    """Half of what a box measures along and across a direction."""
+    turn_cos, turn_sin = abs(box[2:4] @ way), abs(box[3] * way[0] - box[2] * way[1])
+    return turn_cos * box[4] / 2 + turn_sin * box[5] / 2, turn_sin * box[4] / 2 + turn_cos * box[5] / 2
+
+
+def law(speed, desired, gap, leader):
+    """The IDM, written out once more."""
+    wish = 2.0 + max(0.0, 1.5 * speed + speed * (speed - leader) / (2 * np.sqrt(1.5 * 3.0)))
+    return max(1.5 * (1 - (speed / max(desired, 0.1)) ** 4 - (wish / max(gap, 0.1)) ** 2), -6.0)
+
+
+def wanted(bank, index, row, arc, speed, ignored, frame, step):
+    """Accelerations of one vehicle, and how near the nearest thing is to the border of its corridor.
+
+    One acceleration for each thing that may count as the nearest.
+    """
+    path, slot = Path(bank.paths, index, row), int(bank.paths.slot[index, row])
+    x, y, z, most = path.at(arc)
+    length, width = np.asarray(bank.agent_box[index, slot, :2], np.float64)
+    look = min(20 + 1.5 * speed + speed * speed / 6, 120)
+    close, inside = np.inf, []
+    box = np.asarray(frame.box, np.float64)
+    for other in range(len(box)):
+        there = frame.valid[other] and other != slot and other not in ignored
+        if not there or abs(frame.z[other] - z) > 3 or np.hypot(*(box[other, :2] - [x, y])) > look + 12:
+            continue
+        s, away, way, around = path.project(box[other, :2], arc, arc + look)
+        (half_length, half_width), (long, wide) = extents(box[other], way), extents(box[other], around)
+        # A logged path jitters, and with it what a long thing measures along and across it.
+        beyond = [away - (width / 2 + 0.1 + half) for half in (half_width, wide)]
+        border = min(abs(beyond[0]), abs(beyond[1])) if beyond[0] * beyond[1] > 0 else 0.0
+        ahead = s - arc
+        if ahead > -1 and ahead < look + 1:
+            close = min(
+                close, border, abs(ahead) if away < width / 2 + half_width else np.inf, abs(ahead - look)
+            )
+        if away < width / 2 + 0.1 + half_width and 0 < ahead < look:
+            gaps = ahead - half_length - length / 2, ahead - long - length / 2
+            inside.append((*gaps, float(np.asarray(frame.velocity[other], np.float64) @ way)))
+    nearest = np.min([(here, there) for here, there, _ in inside], axis=0, initial=1e4)
+    results = [
+        law(speed, most, here, leader)
+        for here, there, leader in inside
+        if here < nearest[0] + EQUALLY_NEAR_M or there < nearest[1] + EQUALLY_NEAR_M
+    ]
+    results = results or [law(speed, most, 1e4, 0.0)]
+    state = np.asarray(bank.light_state[index, min(step, 90)])
+    for line, light in zip(bank.paths.stop_arc[index, row], bank.paths.stop_light[index, row], strict=True):
+        front = float(line) - arc - length / 2
+        brakes = {1: 6.0, 4: 6.0, 2: 3.0, 5: 3.0}.get(int(state[light]))
+        if brakes is None:
+            continue
+        if (front > 0 and speed**2 <= 2 * brakes * front) or (
+            front <= 0 < front + length / 2 and speed < 0.5 and brakes > 3
+        ):
+            results = [min(result, law(speed, most, max(front, 0.0), 0.0)) for result in results]
+    return results, close
+
+
+def compare(bank, index, frames, traffic, every=7):
+    """How far each vehicle's speed is from the oracle's after a step (m/s), and its acceleration there (m/s2)."""
+    found = []
+    for t in range(0, STEPS - 1, every):
+        frame = jax.tree.map(lambda leaf, t=t: leaf[t], frames)
+        for row in np.flatnonzero((traffic.phase[t] == DRIVES) & (traffic.phase[t + 1] == DRIVES)):
+            arc, speed = float(traffic.arc[t, -1, row]), float(traffic.speed[t, -1, row])
+            ignored = set(traffic.ignored[t + 1, row].tolist())
+            accelerations, close = wanted(bank, index, row, arc, speed, ignored, frame, 10 + t)
+            if close < 0.1:
+                continue  # on the border of the corridor, either answer is right
+            reached = traffic.speed[t + 1, -1, row]
+            acceleration = min(
+                accelerations, key=lambda a, v=speed, u=reached: abs(max(v + a * 0.1, 0.0) - u)
+            )
+            after = max(speed + acceleration * 0.1, 0.0)
+            moved = (speed + after) * 0.05 if after > 0 else speed**2 / max(-2 * acceleration, 1e-9)
+            assert traffic.arc[t + 1, -1, row] - arc == pytest.approx(moved, abs=1e-3)
+            found.append((abs(after - reached), acceleration))
+    return np.array(found).reshape(-1, 2)
+
+
+def meetings(bank, index, frames, traffic):
+    """Pairs of slots, one of them reacting, whose boxes come to overlap after the first step; and those that react."""
+    slots = np.asarray(bank.paths.slot[index])
+    reacting = [int(s) for s in slots[(traffic.phase != 0).any(0) & (slots > 0)]]
+    found = set()
+    for slot in reacting:
+        hits = overlap(frames.box[:, slot, None], frames.box) & frames.valid & frames.valid[:, slot, None]
+        hits &= np.abs(frames.z - frames.z[:, slot, None]) <= 3
+        hits[:, slot] = False
+        begins = hits.any(0) & ~hits[0]
+        found |= {(min(slot, int(o)), max(slot, int(o))) for o in np.flatnonzero(begins)}
+    return found, reacting
