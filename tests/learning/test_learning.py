@@ -48,7 +48,8 @@ def config():
 def test_collected_experience_is_consistent(data):
     bank = ScenarioBank.from_scenarios(data)
     simulator = Simulator(Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)))
-    environments = start_environments(simulator, bank, jax.random.key(0), 6)
+    begin = jax.jit(start_environments, static_argnums=(0, 3))
+    environments = begin(simulator, bank, jax.random.key(0), 6)
 
     def actor(observation, key):
         choice = 0.3 * jax.random.normal(key, (6, 2))

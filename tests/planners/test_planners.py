@@ -102,8 +102,8 @@ def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
 
 def test_random_actions_fill_the_action_space_evenly_and_follow_the_key(simulator):
     planner, bank = RandomActions(), bank_of(straight_road([car(0, 0, 0, 9)]))
-    state = simulator.reset(bank, 0, 10, 0)
-    situation = simulator.situation(bank, state)
+    state = jax.jit(simulator.reset)(bank, 0, 10, 0)
+    situation = jax.jit(simulator.situation)(bank, state)
     keys = jax.random.split(jax.random.key(3), 4000)
     actions = np.asarray(jax.vmap(lambda key: planner.act((), bank, state, situation, None, key)[0])(keys))
     # Uniform over [-1, 1): mean 0, variance 1/3, axes independent.

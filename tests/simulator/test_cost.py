@@ -93,6 +93,6 @@ def test_parts_are_timed_on_states_as_they_are(part):
     # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
     simulator, config = Simulator(Task()), BenchConfig(batch=2, steps=3)
-    states = jax.vmap(simulator.reset, (None, 0))(bank, jnp.zeros(2, jnp.int32))
+    states = jax.jit(jax.vmap(simulator.reset, (None, 0)))(bank, jnp.zeros(2, jnp.int32))
     shift = _rounds(config, _parts(simulator)[part])(bank, states)
     assert (jnp.abs(shift) < 1e-9).all()
