@@ -288,7 +288,9 @@ def main() -> None:
         RUNS.write_text(json.dumps(runs, indent=1) + "\n")
         print("\n".join(runs_table(runs)))
         return
-    command = " ".join(["python", "benchmarks/simulator.py", *sys.argv[1:]])
+    command = " ".join(["python", "benchmarks/simulator.py", *sys.argv[1:]]).replace(
+        str(args.data), args.data.name
+    )
     result = {"command": command, **measure(args.data, args.repeats), "versions": versions()}
     print(table(result, runs))
     if args.write:
