@@ -15,6 +15,7 @@ import statistics
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.sparse import map_where
 from drivax.studies.bench import (
     BenchConfig,
     bench,
@@ -120,19 +122,20 @@ def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
     """
     simulator, batch = Simulator(task, make_traffic(traffic)), 64
 
-    def step(bank: ScenarioBank, state: Any, action: Any, over: Any, index: Any) -> Any:
-        fresh = simulator.scene(bank, index)
+    def one(bank: ScenarioBank, state: Any, action: Any, over: Any, fresh: Any) -> Any:
         after, transition = simulator.step_or_begin(bank, state, action, over, fresh)
         return transition, simulator.observe(bank, after.scene)
+
+    def step(bank: ScenarioBank, states: Any, actions: Any, over: Any, index: Any) -> Any:
+        fresh = map_where(over, partial(simulator.beginning, bank), index)
+        return jax.vmap(one, in_axes=(None, 0, 0, 0, 0))(bank, states, actions, over, fresh)
 
     states = jax.eval_shape(jax.vmap(simulator.reset, in_axes=(None, 0)), bank, jnp.zeros(batch, jnp.int32))
     over, index = (jax.ShapeDtypeStruct((batch,), kind) for kind in (bool, jnp.int32))
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), bank)
     jax.clear_caches()
     began = time.perf_counter()
-    jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0, 0))).lower(
-        shapes, states, states.scene.action, over, index
-    ).compile()
+    jax.jit(step).lower(shapes, states, states.scene.action, over, index).compile()
     return time.perf_counter() - began
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.geometry.boxes import overlap
-from drivax.scenario.agent_paths import PATH_SPEED, PATH_X, PATH_Y, PATH_Z
+from drivax.scenario.agent_paths import PATH_X, PATH_Y, PROFILE_SPEED, PROFILE_Z
 from drivax.simulator.reactive import DRIVES, IdmTraffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import alone
@@ -50,12 +50,14 @@ class Path:
 
     def __init__(self, paths, index, row):
         self.points = np.asarray(paths.points[index, row], np.float64)
+        self.profile = np.asarray(paths.profile[index, row], np.float64)
         self.spacing = float(paths.spacing[index, row])
         self.arc = np.arange(len(self.points)) * self.spacing
 
     def at(self, s):
-        columns = [np.interp(s, self.arc, self.points[:, k]) for k in range(self.points.shape[1])]
-        return columns[PATH_X], columns[PATH_Y], columns[PATH_Z], columns[PATH_SPEED]
+        columns = [self.points[:, PATH_X], self.points[:, PATH_Y]]
+        columns += [self.profile[:, PROFILE_Z], self.profile[:, PROFILE_SPEED]]
+        return tuple(np.interp(s, self.arc, column) for column in columns)
 
     def project(self, xy, first, reach):
         """Arc, distance and direction of the nearest point between two arc lengths, and that of the 4 m around it."""

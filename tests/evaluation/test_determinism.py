@@ -91,7 +91,7 @@ def test_automatic_resets_change_no_episode(world):
         def one(state, over, row):
             taken = action(state.scene)
             after, transition = simulator.step_or_begin(
-                bank, state, taken, over, simulator.scene(bank, row, LATE)
+                bank, state, taken, over, simulator.beginning(bank, row, LATE)
             )
             return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
 

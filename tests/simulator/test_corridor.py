@@ -35,10 +35,11 @@ def paths():
     arc = np.linspace(0.0, LENGTH, PATH_POINTS)
     x, y, heading = pose(arc)
     way = [np.cos(heading), np.sin(heading)]
-    points = np.stack([x, y, 0 * x, *way, *way, 0 * x + 15.0], -1)
+    points, profile = np.stack([x, y, *way], -1), np.stack([0 * x, 0 * x + 15.0], -1)
     return AgentPaths(
         slot=jnp.zeros((1, 1), jnp.int16),
         points=jnp.asarray(points, jnp.float32)[None, None],
+        profile=jnp.asarray(profile, jnp.float32)[None, None],
         spacing=jnp.full((1, 1), LENGTH / (PATH_POINTS - 1)),
         log_arc=jnp.zeros((1, 91, 1)),
         log_speed=jnp.zeros((1, 91, 1)),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_SPEED, PATH_X, PATH_Y
+from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_X, PATH_Y, PROFILE_SPEED
 from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import AgentKind, LightState
 from drivax.simulator.idm import IdmParameters
@@ -305,7 +305,7 @@ def test_paths_go_through_the_log_and_on_along_the_lane():
     np.testing.assert_allclose(points[72:, PATH_Y], 0.0, atol=1e-3)
     np.testing.assert_allclose(points[:, PATH_X], -10 + spacing * np.arange(PATH_POINTS), atol=0.1)
     np.testing.assert_allclose(points[:, PATH_COS] ** 2 + points[:, PATH_SIN] ** 2, 1.0, atol=1e-5)
-    np.testing.assert_allclose(points[:50, PATH_SPEED], 10.0, atol=1e-4)
+    np.testing.assert_allclose(paths.profile[0, row, :50, PROFILE_SPEED], 10.0, atol=1e-4)
     np.testing.assert_allclose(np.asarray(paths.log_arc[0, :, row]), np.arange(91) * 1.0, atol=1e-3)
 
 

@@ -157,7 +157,7 @@ def test_order_and_padding_of_agents_change_nothing(simulator):
 def test_step_or_begin_is_step_or_reset(world):
     simulator = Simulator(Task())
     reset, step, either = (jax.jit(f) for f in (simulator.reset, simulator.step, simulator.step_or_begin))
-    state, another = reset(world, 1), jax.jit(simulator.scene)(world, 3)
+    state, another = reset(world, 1), jax.jit(simulator.beginning)(world, 3)
     action = jnp.array([0.2, 0.05])
     plain, _ = step(world, state, action)
     same, _ = either(world, state, action, jnp.asarray(False), another)

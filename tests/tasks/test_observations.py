@@ -7,7 +7,7 @@ import pytest
 
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.observations import PRESETS, ObservationConfig
+from drivax.tasks.observations import PRESETS, ObservationConfig, running_count
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, moved, straight_road
 
@@ -104,3 +104,9 @@ def test_a_replayed_scene_is_seen_as_it_was_live():
         stored = jax.tree.map(np.asarray, transition.after.scene)
         again = observe(bank, jax.tree.map(jnp.asarray, stored))
         jax.tree.map(np.testing.assert_array_equal, dict(live), dict(again))
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 468, 1024])
+def test_running_count_is_a_cumulative_sum(count):
+    inside = np.random.default_rng(count).random((3, count)) < 0.3
+    np.testing.assert_array_equal(jax.jit(jax.vmap(running_count))(inside), np.cumsum(inside, axis=1))

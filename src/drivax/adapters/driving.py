@@ -19,6 +19,7 @@ from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.sparse import map_where
 from drivax.simulator.types import SimState
 from drivax.synthetic.world import generate_recording
 
@@ -88,9 +89,10 @@ def advance_all(
     begins: Bool[Any, " B"], rows: Any,
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
     """The same for a batch; where an episode ``begins``, scenario ``rows`` starts instead and earns nothing."""
-    fresh = jax.vmap(simulator.scene, in_axes=(None, 0))(bank, jnp.asarray(rows))
+    begins = jnp.asarray(begins)
+    fresh = map_where(begins, partial(simulator.beginning, bank), jnp.asarray(rows))
     step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
-    states, transition = step(bank, states, jnp.asarray(actions), jnp.asarray(begins), fresh)
+    states, transition = step(bank, states, jnp.asarray(actions), begins, fresh)
     reward = jnp.where(begins, 0.0, transition.reward)
     seen = jax.vmap(partial(limited, simulator, bank))(states)
     return states, seen, (reward, transition.terminated, transition.truncated)

@@ -15,7 +15,8 @@ from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import Frame, SimState
+from drivax.simulator.sparse import map_where
+from drivax.simulator.types import Beginning, Frame, SimState
 
 
 @record
@@ -80,10 +81,12 @@ def collect(
         ``"<name>"`` the sum and ``"<name>/n"`` the number of episodes that define it.
     """
     count = environments.over.shape[0]
-    begin_all = jax.vmap(simulator.scene, in_axes=(None, 0, 0, None, 0))
     step_all = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
     observe_all = jax.vmap(simulator.observe, in_axes=(None, 0))
     everyone = jax.vmap(simulator.now, in_axes=(None, 0))
+
+    def begin(index: Array, step: Array, key: Array) -> Beginning:
+        return simulator.beginning(bank, index, step, 0, key)
 
     def one(carry: tuple[Environments, Frame, Array], _: None) -> tuple[Any, Any]:
         now, seen, key = carry
@@ -94,7 +97,7 @@ def collect(
         keys = jax.random.split(
             jax.random.fold_in(start_key, 1), count
         )  # not computed where starts are logged
-        fresh = begin_all(bank, index, start, 0, keys)
+        fresh = map_where(now.over, begin, index, start, keys)
         state, transition = step_all(bank, now.state, action, now.over, fresh, seen)
         row = Rollout(
             observation=now.observation,

@@ -80,10 +80,9 @@ class IdmPlanner(Memoryless):
         others &= jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
         # Only the closest of those that come near the route are measured against all of its points.
         nodes = jnp.where(there[:, None], path[:, :2], path[0, :2])[None]
-        near = reaching(
-            frame.box[None], nodes, (me[5:6] / 2 + _NEAR_M)[None], 2.0 * _STEP_M, 2.0 * _STEP_M, 9
-        )
-        slots, real = closest(near & others, me[None], frame.box)
+        boxes = frame.box.T
+        near = reaching(boxes, nodes, (me[5:6] / 2 + _NEAR_M)[None], 2.0 * _STEP_M, 2.0 * _STEP_M, 9)
+        slots, real = closest(near & others, me[None], boxes)
         box, velocity = frame.box[slots[0]], frame.velocity[slots[0]]
         along, lateral, cos, sin = project(path, there, offsets, box[:, :2], box[:, 2:4])
         half_length = jnp.abs(cos) * box[:, 4] / 2 + jnp.abs(sin) * box[:, 5] / 2

@@ -34,7 +34,7 @@ Array = np.ndarray[Any, Any]
 
 
 def light_arcs(
-    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 8"],
+    bank: ScenarioBank, scenario: Int[np.ndarray, " V"], points: Float[np.ndarray, "V M 6"],
     spacing: Float[np.ndarray, " V"],
 ) -> tuple[Float[np.ndarray, "V 4"], Int[np.ndarray, "V 4"]]:  # fmt: skip
     """Arc lengths of the stop lines that paths cross forwards, and the light of each.
@@ -42,7 +42,7 @@ def light_arcs(
     Args:
         bank: The scenarios.
         scenario: Row of the bank of each path.
-        points: Paths (``scenario.agent_paths.AgentPaths.points``).
+        points: Paths: x, y, cos, sin (``scenario.agent_paths.AgentPaths.points``), then height and speed (``profile``).
         spacing: Arc length between two points, m.
 
     Returns:
@@ -59,7 +59,7 @@ def light_arcs(
             continue
         crossed = _crossings(line[row][:, seen], points[mine], spacing[mine])
         for path, arc in zip(mine, crossed, strict=True):
-            heading = np.arctan2(points[path, :, 4], points[path, :, 3])
+            heading = np.arctan2(points[path, :, 3], points[path, :, 2])
             found = _places(arc, heading, spacing[path], exits[row, seen])
             for place, (where, light) in enumerate(found[:STOPS]):
                 arcs[path, place], lights[path, place] = where, seen[light]
@@ -74,8 +74,8 @@ def _crossings(line: Array, points: Array, spacing: Array) -> Float[np.ndarray, 
     before, after = ahead[:, :-1], ahead[:, 1:]
     share = -before / np.where(after > before, after - before, 1.0)
     through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= line[LIGHT_HALF]
-    facing = points[:, :-1, None, 3] * cos + points[:, :-1, None, 4] * sin > _ASKEW_COS
-    level = np.abs(points[:, :-1, None, 2] - line[LIGHT_Z]) <= LEVEL_M
+    facing = points[:, :-1, None, 2] * cos + points[:, :-1, None, 3] * sin > _ASKEW_COS
+    level = np.abs(points[:, :-1, None, 4] - line[LIGHT_Z]) <= LEVEL_M
     crosses = (before < 0.0) & (after >= 0.0) & through & facing & level
     first = np.argmax(crosses, axis=1)
     arc = (first + np.take_along_axis(share, first[:, None], axis=1)[:, 0]) * spacing[:, None]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
 from drivax.geometry.vectors import first_smallest
-from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_SPEED, AgentPaths
+from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, AgentPaths
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.simulator.types import Frame
@@ -78,20 +78,25 @@ class Leaders:
     real: Bool[Array, "R C"]
 
 
-def path_rows(paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]) -> Float[Array, "R 8"]:
-    """Rows at arc lengths of a scenario's paths, as those of ``AgentPaths.points``."""
+def path_poses(
+    paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]
+) -> tuple[Float[Array, "R 4"], Float[Array, "R 2"]]:
+    """Poses (x, y, cos, sin) at arc lengths of a scenario's paths; heights and the speeds that the paths allow."""
     at = arc / paths.spacing[index]
     low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
     part = jnp.clip(at - low, 0.0, 1.0)[:, None]
 
-    def both(row: Array, low: Array) -> Float[Array, "2 8"]:
-        return jax.lax.dynamic_slice(paths.points, (index, row, low, jnp.int32(0)), (1, 1, 2, 8))[0, 0]
+    def between(table: Float[Array, "N R M F"]) -> Float[Array, "R F"]:
+        def both(row: Array, low: Array) -> Float[Array, "2 F"]:
+            first = (index, row, low, jnp.int32(0))
+            return jax.lax.dynamic_slice(table, first, (1, 1, 2, table.shape[-1]))[0, 0]
 
-    ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
-    here = ends[:, 0] * (1 - part) + ends[:, 1] * part
+        ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
+        return ends[:, 0] * (1 - part) + ends[:, 1] * part
+
+    here = between(paths.points)
     unit = jax.lax.rsqrt(jnp.maximum(here[:, PATH_COS] ** 2 + here[:, PATH_SIN] ** 2, 1e-9))
-    column = jnp.arange(here.shape[1])
-    return here * jnp.where((column >= PATH_COS) & (column < PATH_SPEED), unit[:, None], 1.0)
+    return here * jnp.where(jnp.arange(4) >= PATH_COS, unit[:, None], 1.0), between(paths.profile)
 
 
 def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
@@ -107,7 +112,8 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
         frame: Everyone now.
     """
     look = _look(movers.speed)
-    nodes, tangents, arcs = _path_ahead(paths, index, movers, look)
+    rows, arcs = _path_ahead(paths, index, movers, look)
+    nodes = rows[..., :2]
     things, real = _closest(movers, frame, nodes)
     box, velocity = frame.box[things], frame.velocity[things]
     # Coordinates one by one: pairs of numbers at the end of an array do not vectorise.
@@ -119,12 +125,9 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     best = _number(reduce(jnp.minimum, keys), _PIECE_BITS)
     # Written out once: XLA would compute it anew for each of the columns that are read.
     best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
-    # Everything about a piece in one row, so that it is read once.
-    last = jnp.broadcast_to(jnp.arange(PIECES) == PIECES - 1, (len(nodes), PIECES)).astype(nodes.dtype)
-    columns = [part[:, at : at + PIECES] for part in (nodes, tangents, arcs[..., None]) for at in (0, 1)]
-    rows = jnp.concatenate([*columns, last[..., None]], axis=-1)
-    piece = jnp.moveaxis(rows[jnp.arange(len(things))[:, None], best], -1, 0)
-    x0, y0, x1, y1, *slopes, arc, end, last = piece
+    x0, y0, *before, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, best), -1, 0)
+    slopes = *before, cos1, sin1
+    arc, end = (jnp.take_along_axis(arcs, best + at, axis=1) for at in (0, 1))
     part, distance = _from_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
     long = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
     ux, uy = (x1 - x0) / long, (y1 - y0) / long
@@ -136,12 +139,21 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
     half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
     room = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
-    beyond = (along >= look[:, None]) | ((last > 0) & (part >= 1.0))
+    beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
     inside = real & (distance < room * room) & (along > 0.0) & ~beyond
     gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
     nearest = first_smallest(gap)[:, None] == jnp.arange(CLOSEST)
     speed = jnp.sum(jnp.where(nearest, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
     return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
+
+
+def _both_ends(rows: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[Array, "R C 8"]:
+    """The rows of two points on end of each path, side by side: one contiguous read each."""
+
+    def both(path: Float[Array, "K 4"], at: Array) -> Float[Array, " 8"]:
+        return jax.lax.dynamic_slice(path, (at, jnp.int32(0)), (2, 4)).reshape(8)
+
+    return jax.vmap(jax.vmap(both, in_axes=(None, 0)))(rows, first)
 
 
 def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
@@ -173,15 +185,15 @@ def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
 
 def _path_ahead(
     paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
-) -> tuple[Float[Array, "R K 2"], Float[Array, "R K 2"], Float[Array, "R K"]]:
-    """Points of the path from the one behind the vehicle to as far as it looks, directions and arc lengths."""
+) -> tuple[Float[Array, "R K 4"], Float[Array, "R K"]]:
+    """Rows of the path from the point behind the vehicle to as far as it looks, and their arc lengths."""
     spacing = paths.spacing[index]
     # One point more than it takes, since the first one lies behind.
     stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
     first = (movers.arc / spacing).astype(jnp.int32)
     place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
-    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place, : PATH_SIN + 1]
-    return rows[..., :2], rows[..., PATH_COS : PATH_SIN + 1], place * spacing[:, None]
+    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place]
+    return rows, place * spacing[:, None]
 
 
 def _closest(
@@ -190,19 +202,30 @@ def _closest(
     """The closest things whose box reaches into one of the rectangles around the corridor."""
     me = movers.box[:, None]
     behind = me[..., LENGTH] / 2 + BEHIND_M
-    near = reaching(frame.box[None], nodes, me[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
+    box = columns(frame.box)
+    near = reaching(box, nodes, me[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
     slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
     near &= frame.valid & (slot != movers.slot[:, None])
     near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
     near &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
-    return closest(near, movers.box, frame.box)
+    return closest(near, movers.box, box)
+
+
+def columns(box: Float[Array, "S 6"]) -> Float[Array, "6 S"]:
+    """The columns of boxes as rows of their own.
+
+    By a product with the unit matrix: a mere transposition is gone before operations are fused, and every one of them
+    reads with strides then.
+    """
+    unit = jnp.eye(box.shape[1], dtype=box.dtype)
+    return jnp.einsum("fg,sg->fs", unit, box, precision=jax.lax.Precision.HIGHEST)
 
 
 def closest(
-    near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "S 6"]
+    near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "6 S"]
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
-    """Of the boxes that are near the C whose centres are the closest; and whether there are as many."""
-    dx, dy = box[:, X] - me[:, X : X + 1], box[:, Y] - me[:, Y : Y + 1]
+    """Of the boxes (their :func:`columns`) that are near the C whose centres are the closest; and which are real."""
+    dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
     key = jnp.where(near, _numbered(dx * dx + dy * dy, jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
     # Computed once: without the barrier XLA computes it anew for each of the minima.
     key = jax.lax.optimization_barrier(key)
@@ -231,13 +254,13 @@ def _number(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
 
 
 def reaching(
-    box: Float[Array, "1 S 6"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
+    box: Float[Array, "6 S"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
     rectangles: int,
 ) -> Bool[Array, "R S"]:  # fmt: skip
     """Which boxes reach into one of the rectangles along the chords of K points on a path.
 
     Args:
-        box: Boxes.
+        box: Boxes, as :func:`columns`.
         nodes: Points on the path.
         half: Half the width of the corridor, m.
         behind: How much further back the first rectangle reaches, m.
@@ -245,14 +268,14 @@ def reaching(
         rectangles: How many; K - 1 is a multiple of it.
     """
     around = _rectangles(nodes, half, behind, beyond, rectangles)
-    deep, wide = box[..., LENGTH] / 2, box[..., WIDTH] / 2
+    deep, wide = box[LENGTH] / 2, box[WIDTH] / 2
     found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
     for number in range(rectangles):
         x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
-        turn_cos = jnp.abs(box[..., COS] * cos + box[..., SIN] * sin)
-        turn_sin = jnp.abs(box[..., SIN] * cos - box[..., COS] * sin)
-        ahead = jnp.abs(box[..., X] * cos + (box[..., Y] * sin - (x * cos + y * sin)))
-        left = jnp.abs(box[..., Y] * cos - (box[..., X] * sin + (y * cos - x * sin)))
+        turn_cos = jnp.abs(box[COS] * cos + box[SIN] * sin)
+        turn_sin = jnp.abs(box[SIN] * cos - box[COS] * sin)
+        ahead = jnp.abs(box[X] * cos + (box[Y] * sin - (x * cos + y * sin)))
+        left = jnp.abs(box[Y] * cos - (box[X] * sin + (y * cos - x * sin)))
         found |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
             left < width + turn_sin * deep + turn_cos * wide
         )

@@ -10,12 +10,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
-from drivax.scenario.agent_paths import PATH_POINTS, PATH_SPEED, TRAVELS_M, AgentPaths, with_paths
-from drivax.scenario.bank import AGENT_VALID, AGENT_VX, AGENT_VY, ScenarioBank
+from drivax.scenario.agent_paths import (
+    PATH_POINTS,
+    PROFILE_SPEED,
+    PROFILE_Z,
+    TRAVELS_M,
+    AgentPaths,
+    with_paths,
+)
+from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind, LightState
-from drivax.simulator.corridor import FREE_M, Leaders, Movers, leaders, path_rows
+from drivax.simulator.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import Frame, Scene
 
@@ -105,10 +112,10 @@ class IdmTraffic:
         step = scene.step - back
         logged = bank.agents[scene.index, jnp.clip(step, 0, bank.steps - 1)]
         at = PAST - 1 - min(back, PAST - 1)
-        here, speed = path_rows(paths, scene.index, now.arc[at]), now.speed[at]
-        column = jnp.arange(here.shape[1])
-        driven = here * jnp.where((column == AGENT_VX) | (column == AGENT_VY), speed[:, None], 1.0)
-        driven = jnp.where(column == AGENT_VALID, now.there[at][:, None], driven)
+        (here, profile), speed = path_poses(paths, scene.index, now.arc[at]), now.speed[at, :, None]
+        direction, there = here[:, 2:], now.there[at, :, None].astype(jnp.float32)
+        height = profile[:, PROFILE_Z : PROFILE_Z + 1]
+        driven = jnp.concatenate([here[:, :2], height, direction, direction * speed, there], axis=-1)
         slot = paths.slot[scene.index].astype(jnp.int32)
         reacts = (now.phase != REPLAYS) & (step > now.begin)
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
@@ -171,10 +178,10 @@ def _movers(bank: ScenarioBank, scene: Scene, slot: Int[Array, " R"]) -> tuple[M
     """The vehicles where they are now (waiting ones where they will appear), and the speed that their paths allow."""
     now = scene.traffic
     arc, speed = now.arc[-1], now.speed[-1]
-    here = path_rows(bank.paths, scene.index, arc)
+    here, profile = path_poses(bank.paths, scene.index, arc)
     size = bank.agent_box[scene.index, jnp.maximum(slot, 0), :2]
-    box = jnp.concatenate([here[:, :2], here[:, 3:5], size], axis=-1)
-    return Movers(box, here[:, 2], arc, speed, slot, now.ignored.astype(jnp.int32)), here[:, PATH_SPEED]
+    box, z = jnp.concatenate([here, size], axis=-1), profile[:, PROFILE_Z]
+    return Movers(box, z, arc, speed, slot, now.ignored.astype(jnp.int32)), profile[:, PROFILE_SPEED]
 
 
 def _without_parted(
@@ -246,14 +253,16 @@ def _may_enter(scene: Scene, movers: Movers, ahead: Leaders, frame: Frame) -> Bo
     entry = now.entry.astype(jnp.int32)
     ready = (now.phase == WAITS) & (scene.step + 1 >= entry) & ~taken
     late = scene.step + 1 > entry
-    order = entry * entry.shape[0] + jnp.arange(entry.shape[0])
+    # Whole numbers as floats: their minima vectorise.
+    order = (entry * entry.shape[0] + jnp.arange(entry.shape[0])).astype(jnp.float32)
     reach = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
-    dx, dy = (movers.box[:, None, i] - movers.box[None, :, i] for i in (0, 1))
+    x, y = columns(movers.box)[:2]
+    dx, dy = x[:, None] - x, y[:, None] - y
     near = dx * dx + dy * dy < (reach[:, None] + reach + 2 * _ENTRY_END_M) ** 2
-    # Those that are not ready come after everyone.
-    order = jnp.where(ready, order, jnp.iinfo(jnp.int32).max)
-    first = (order[None] < order[:, None]) & (late[None] | late[:, None])
-    return ready & ~(near & first).any(axis=1)
+    # Those that are not ready come after everyone; one that is due now makes way for those that are late.
+    order = jnp.where(ready, order, jnp.inf)
+    rival = jnp.where(near & (late[None] | late[:, None]), order[None], jnp.inf)
+    return ready & (jnp.min(rival, axis=1) >= order)
 
 
 def _entry_speed(movers: Movers, ahead: Leaders, driver: IdmParameters) -> Float[Array, " R"]:

@@ -19,7 +19,7 @@ from drivax.simulator.situation import measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.together import is_driven
 from drivax.simulator.traffic import LogTraffic, alone, frame_of
-from drivax.simulator.types import Frame, Scene, SimState, Situation, Task, Traffic, Transition
+from drivax.simulator.types import Beginning, Frame, Scene, SimState, Situation, Task, Traffic, Transition
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,13 @@ class Simulator:
         history, route_m = self.start.begin(bank, index, step, slot, agents, key)
         action = self.task.first_action(history, bank.agent_box[index, slot, 0])
         return replace(scene, history=history, route_m=route_m, action=action)
+
+    def beginning(
+        self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
+    ) -> Beginning:
+        """The :meth:`scene` of an episode that begins, and what its motion so far implies about stop lines."""
+        scene = self.scene(bank, index, step, slot, key)
+        return Beginning(scene, remember_lights(bank, scene))
 
     def frame(self, bank: ScenarioBank, scene: Scene, cast: Scene, back: int) -> Frame:
         """Everyone ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
@@ -164,7 +171,7 @@ class Simulator:
         state: SimState,
         action: Float[Array, " D"],
         over: Bool[Array, ""],
-        fresh: Scene,
+        fresh: Beginning,
         seen: Frame | None = None,
     ) -> tuple[SimState, Transition]:
         """A step, or where the episode is ``over`` the beginning of another one instead.
@@ -178,17 +185,18 @@ class Simulator:
             state: The state.
             action: What the agent does if its episode goes on.
             over: Whether it is over.
-            fresh: The :meth:`scene` that begins then.
+            fresh: The :meth:`beginning` that it has then; looked at only where ``over``, so that a batch needs to
+                compute it there only (:func:`simulator.sparse.map_where`).
             seen: ``now(bank, state.scene)``, from who has it at hand, so that it is not computed again.
         """
         seen = self.now(bank, state.scene) if seen is None else seen
         moved = self._move(bank, state.scene, seen, action, None)
-        scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
+        scene = jax.tree.map(partial(jnp.where, over), fresh.scene, moved)
         before = replace(
             state,
             contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
-            lights=jax.tree.map(partial(jnp.where, over), remember_lights(bank, fresh), state.lights),
-            start=jnp.where(over, fresh.step, state.start),
+            lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
+            start=jnp.where(over, fresh.scene.step, state.start),
         )
         after, transition = self._settle(bank, before, scene, alone(scene), seen, action)
         first = self.task.episode_start()

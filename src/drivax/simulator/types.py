@@ -135,6 +135,14 @@ class LightMemory:
 
 
 @record
+class Beginning:
+    """How an episode begins: its scene, and the memory of stop lines that led there."""
+
+    scene: Scene
+    lights: LightMemory
+
+
+@record
 class SimState:
     """State of one driven agent in one scenario.
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -31,6 +32,7 @@ from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.sparse import map_where
 from drivax.simulator.traffic import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
@@ -236,7 +238,6 @@ def _run(
 ) -> tuple[Any, Array]:
     """Steps a batch; what was earned and is seen, so that nothing is optimised away, and how many were steps."""
     key, batch = keys[0], carry[1].shape[0]
-    begin = jax.vmap(simulator.scene, in_axes=(None, 0))
     step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
 
     def judged(states: SimState) -> Array:
@@ -245,7 +246,8 @@ def _run(
 
     def one(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
         states, over, total, (action, _, seen) = carry
-        states, transition = step(bank, states, action, over, begin(bank, index), seen)
+        fresh = map_where(over, partial(simulator.beginning, bank), index)
+        states, transition = step(bank, states, action, over, fresh, seen)
         done = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.
         total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)

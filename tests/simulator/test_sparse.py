@@ -1,0 +1,34 @@
+"""Computing rows of a batch where they are wanted."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.simulator.sparse import AT_ONCE, map_where
+
+ROWS = 3 * AT_ONCE + 1
+
+
+@pytest.mark.parametrize("wanted", [0, 1, AT_ONCE, AT_ONCE + 1, ROWS])
+def test_rows_that_are_wanted_are_those_of_vmap_and_others_are_zero(wanted):
+    rng = np.random.default_rng(wanted)
+    mask = np.zeros(ROWS, bool)
+    mask[rng.permutation(ROWS)[:wanted]] = True
+    number, keys = rng.normal(size=(ROWS, 2)).astype(np.float32), jax.random.split(jax.random.key(3), ROWS)
+
+    def draw(number, key):
+        return {"sum": number + jax.random.normal(key, (2,)), "whole": jnp.int32(7), "flag": number[0] > 0}
+
+    found = jax.jit(lambda mask, *rows: map_where(mask, draw, *rows))(mask, number, keys)
+    every = jax.vmap(draw)(number, keys)
+    for name, leaf in every.items():
+        expected = np.where(mask.reshape(-1, *([1] * (leaf.ndim - 1))), leaf, np.zeros_like(leaf))
+        np.testing.assert_array_equal(found[name], expected)
+
+
+def test_a_batch_of_batches_wants_different_rows():
+    mask = jnp.asarray(np.random.default_rng(0).random((3, ROWS)) < 0.4)
+    number = jnp.arange(3.0 * ROWS).reshape(3, ROWS) + 1.0
+    found = jax.jit(jax.vmap(lambda mask, number: map_where(mask, jnp.square, number)))(mask, number)
+    np.testing.assert_array_equal(found, np.where(mask, number**2, 0.0))
