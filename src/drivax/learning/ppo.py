@@ -12,7 +12,8 @@ from flax import nnx
 from jaxtyping import Array
 
 from drivax.learning.collector import Environments, Rollout, collect, start_environments
-from drivax.networks.actor_critic import ActorCritic, ActorCriticConfig
+from drivax.networks.actor_critic import ActorCritic, NetworkConfig
+from drivax.networks.distributions import Actions
 from drivax.networks.encoders import group_spec
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
@@ -21,6 +22,7 @@ from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import ActionSpace, Discrete
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class PpoConfig:
     """
 
     kind: Literal["ppo"] = "ppo"
-    network: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     environments: int = 256
     unroll: int = 64
     latest_start: int = 10
@@ -93,7 +95,7 @@ class Ppo:
         self.config, self.simulator = config, simulator
         scene = jax.eval_shape(lambda b: Simulator(simulator.task, simulator.traffic).scene(b, 0, 10), bank)
         self.spec = group_spec(jax.eval_shape(simulator.observe, bank, scene))
-        self.actions = scene.action.shape[0]
+        self.actions = _actions(simulator.task.actions)
         updates = iterations * config.epochs * config.minibatches
         schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
         self.optimiser = optax.chain(
@@ -132,10 +134,9 @@ class Ppo:
         network = self.network(state.parameters)
 
         def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            policy = network.policy(observation)
+            policy, value = network.both(observation)
             choice = policy.sample(key)
-            extra = {"log_prob": policy.log_prob(choice), "value": network.value(observation)}
-            return choice, jnp.tanh(choice), extra
+            return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
 
         environments, rollout, totals = collect(
             self.simulator,
@@ -202,16 +203,14 @@ class Ppo:
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy = network.policy(part["observation"])
+        policy, value = network.both(part["observation"])
         log_prob = policy.log_prob(part["choice"])
         centre = mean(part["advantage"])
         spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
         advantage = (part["advantage"] - centre) / spread
         policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
-        value = network.value(part["observation"])
         value_loss = mean((value - part["target"]) ** 2)
-        # The entropy of a squashed Gaussian has no closed form: one fresh sample estimates it.
-        entropy = -mean(policy.log_prob(policy.sample(key)))
+        entropy = mean(policy.entropy_estimate(key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
         ratio = jnp.exp(log_prob - part["log_prob"])
         logs = {
@@ -224,3 +223,9 @@ class Ppo:
             - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
         }
         return total, logs
+
+
+def _actions(space: ActionSpace) -> Actions:
+    """What a policy's head has to know about an action space."""
+    levels = space.levels() if isinstance(space, Discrete) else None
+    return Actions(space.size, levels and tuple(tuple(axis.tolist()) for axis in levels))
