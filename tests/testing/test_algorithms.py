@@ -36,7 +36,7 @@ class Toy:
     def steps_per_iteration(self):
         return 0 if self.fault == "steps" else 5
 
-    def build(self, simulator, bank, iterations):
+    def build(self, environment, data, iterations):
         return object() if self.fault == "learner" else ToyLearner(self.fault)
 
 

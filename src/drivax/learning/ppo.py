@@ -11,18 +11,14 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
-from drivax.learning.collector import Environments, Rollout, collect, start_environments
+from drivax.learning.collector import Rollout, collect
+from drivax.learning.environment import Environment, Environments
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
 from drivax.networks.distributions import Actions
-from drivax.networks.encoders import group_spec
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
-from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
-from drivax.scenario.schema import CURRENT_STEP, STEPS
-from drivax.simulator.simulator import Simulator
-from drivax.tasks.actions import ActionSpace, Discrete
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,6 @@ class PpoConfig:
         network: Policy and value.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
-        latest_start: Episodes begin at a random step of the log between 10 and this one.
         epochs, minibatches: Passes over the experience, and updates per pass.
         learning_rate: Of Adam, falling linearly to a tenth over the run.
         gamma, lambda_: Discount, and mixing of advantages.
@@ -46,7 +41,6 @@ class PpoConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     environments: int = 256
     unroll: int = 64
-    latest_start: int = 10
     epochs: int = 4
     minibatches: int = 8
     learning_rate: float = 3e-4
@@ -64,17 +58,15 @@ class PpoConfig:
             raise ValueError(
                 f"environments x unroll = {self.steps_per_iteration} is no multiple of {self.minibatches} minibatches"
             )
-        if not CURRENT_STEP <= self.latest_start < STEPS - 2:
-            raise ValueError(f"latest_start is {self.latest_start}; use {CURRENT_STEP} to {STEPS - 3}")
 
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps of one iteration."""
         return self.environments * self.unroll
 
-    def build(self, simulator: Simulator, bank: ScenarioBank, iterations: int) -> Ppo:
-        """PPO on a simulator."""
-        return Ppo(self, simulator, bank, iterations)
+    def build(self, environment: Environment, data: Any, iterations: int) -> Ppo:
+        """PPO in an environment."""
+        return Ppo(self, environment, data, iterations)
 
 
 @record
@@ -89,13 +81,11 @@ class PpoState:
 
 
 class Ppo:
-    """PPO on one simulator. Holds configuration and the network's graph; everything computed is in the state."""
+    """PPO in one environment. Holds configuration and the network's graph; everything computed is in the state."""
 
-    def __init__(self, config: PpoConfig, simulator: Simulator, bank: ScenarioBank, iterations: int) -> None:
-        self.config, self.simulator = config, simulator
-        scene = jax.eval_shape(lambda b: Simulator(simulator.task, simulator.traffic).scene(b, 0, 10), bank)
-        self.spec = group_spec(jax.eval_shape(simulator.observe, bank, scene))
-        self.actions = _actions(simulator.task.actions)
+    def __init__(self, config: PpoConfig, environment: Environment, data: Any, iterations: int) -> None:
+        self.config, self.environment = config, environment
+        self.spec = environment.shapes(data)
         updates = iterations * config.epochs * config.minibatches
         schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
         self.optimiser = optax.chain(
@@ -104,13 +94,14 @@ class Ppo:
         self.graph = nnx.graphdef(self._network(jax.random.key(0)))
 
     def _network(self, key: Array) -> ActorCritic:
-        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), self.actions)
+        actions = Actions(self.environment.action_size, self.environment.levels)
+        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), actions)
 
-    def init(self, bank: ScenarioBank, key: Array) -> PpoState:
+    def init(self, data: Any, key: Array) -> PpoState:
         """The state before the first iteration."""
         network_key, environment_key, key = jax.random.split(key, 3)
         parameters = nnx.state(self._network(network_key), nnx.Param)
-        environments = start_environments(self.simulator, bank, environment_key, self.config.environments)
+        environments = self.environment.start(data, environment_key, self.config.environments)
         return PpoState(
             parameters, self.optimiser.init(parameters), environments, key, jnp.zeros((), jnp.int32)
         )
@@ -124,7 +115,7 @@ class Ppo:
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
-    def iterate(self, bank: ScenarioBank, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
+    def iterate(self, data: Any, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
         """One iteration: collect, then update. Pure; jit it with the state donated.
 
         Returns:
@@ -139,13 +130,7 @@ class Ppo:
             return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
 
         environments, rollout, totals = collect(
-            self.simulator,
-            bank,
-            state.environments,
-            actor,
-            collect_key,
-            self.config.unroll,
-            self.config.latest_start,
+            self.environment, data, state.environments, actor, collect_key, self.config.unroll
         )
         last = network.value(environments.observation)
         parameters, optimiser, losses = self._update(state, rollout, last, update_key)
@@ -223,9 +208,3 @@ class Ppo:
             - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
         }
         return total, logs
-
-
-def _actions(space: ActionSpace) -> Actions:
-    """What a policy's head has to know about an action space."""
-    levels = space.levels() if isinstance(space, Discrete) else None
-    return Actions(space.size, levels and tuple(tuple(axis.tolist()) for axis in levels))
