@@ -9,8 +9,9 @@ import pytest
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.learning.collector import collect, start_environments
+from drivax.learning.collector import collect
 from drivax.learning.config import TrainConfig
+from drivax.learning.driving import Driving
 from drivax.learning.loop import logged, train
 from drivax.learning.policies import load_policy
 from drivax.scenario.bank import ScenarioBank
@@ -48,14 +49,14 @@ def config():
 def test_collected_experience_is_consistent(data):
     bank = ScenarioBank.from_scenarios(data)
     simulator = Simulator(Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)))
-    begin = jax.jit(start_environments, static_argnums=(0, 3))
-    environments = begin(simulator, bank, jax.random.key(0), 6)
+    driving = Driving(simulator)
+    environments = jax.jit(driving.start, static_argnums=2)(bank, jax.random.key(0), 6)
 
     def actor(observation, key):
         choice = 0.3 * jax.random.normal(key, (6, 2))
         return choice, jnp.tanh(choice), {}
 
-    run = jax.jit(lambda b, e, k: collect(simulator, b, e, actor, k, 120))
+    run = jax.jit(lambda b, e, k: collect(driving, b, e, actor, k, 120))
     after, rollout, totals = run(bank, environments, jax.random.key(1))
     ended = np.asarray(rollout.terminated | rollout.truncated)
     alive = np.asarray(rollout.alive)

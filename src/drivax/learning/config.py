@@ -6,7 +6,11 @@ from dataclasses import dataclass, field
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
+from drivax.learning.driving import Driving
 from drivax.learning.ppo import PpoConfig
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.catalogue import make_traffic
+from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
@@ -21,7 +25,9 @@ class TrainConfig:
         seed: Of networks, environments and exploration.
         task: Actions, observation, reward, termination, and the metrics that are logged on the way.
         algorithm: What learns, and how.
+        traffic: How the others move, while learning and in validation: ``log``, ``idm``, or ``package.module:name``.
         start: How episodes begin while learning; validation begins as logged.
+        latest_start: Episodes of learning begin at a random step of the log between 10 and this one.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
     """
@@ -30,13 +36,21 @@ class TrainConfig:
     seed: int = 0
     task: Task = field(default_factory=lambda: Task(metrics="training"))
     algorithm: PpoConfig | AlgorithmConfig = field(default_factory=PpoConfig)
+    traffic: str = "log"
     start: LogStart | NoisyStart = field(default_factory=LogStart)
+    latest_start: int = CURRENT_STEP
     evaluate_every: int = 0
     checkpoint_every: int = 20
 
     def __post_init__(self) -> None:
         if isinstance(self.task.actions, DirectState):
             raise UsageError("policies cannot learn in direct_state", cure="choose a space in [-1, 1]")
+        # Refuses a traffic or a step that does not exist before any work is done.
+        self.environment()
+
+    def environment(self) -> Driving:
+        """What is learned in."""
+        return Driving(Simulator(self.task, make_traffic(self.traffic), self.start), self.latest_start)
 
     @property
     def iterations(self) -> int:

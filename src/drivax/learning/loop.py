@@ -18,7 +18,7 @@ from drivax.learning.algorithm import Learner, LearnerState
 from drivax.learning.config import TrainConfig
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.simulator import Simulator
+from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.progress import Progress
 from drivax.tracking.runs import RunFolder
@@ -68,8 +68,9 @@ def train(
     folder = _open(config, data, validation, Path(out), resume, overwrite)
     if resume:
         config = folder.config(TrainConfig)
-    bank = ScenarioBank.from_scenarios(data)
-    learner = config.algorithm.build(Simulator(config.task, start=config.start), bank, config.iterations)
+    environment = config.environment()
+    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    learner = config.algorithm.build(environment, bank, config.iterations)
     checkpoints = Checkpoints(folder.checkpoints)
     state = _first_state(learner, bank, config, checkpoints if resume else None)
     held_out = None if validation is None else Validation.of(validation)
@@ -119,7 +120,9 @@ def validate(
 ) -> tuple[float, dict[str, float]]:
     """Closed-loop score of the policy's mode on held-out scenarios, and what to log."""
     planner = learner.planner(state.parameters, "policy", samples=False)
-    results = evaluate(planner, validation.bank, validation.names, task=config.task)
+    results = evaluate(
+        planner, validation.bank, validation.names, task=config.task, traffic=make_traffic(config.traffic)
+    )
     # Full scores where there are any; partial ones are never mixed with them.
     name = next(n for n in ("vmax_score", "vmax_score_partial") if np.isfinite(results.metrics[n]).any())
     score = float(np.nanmean(results.metrics[name]))

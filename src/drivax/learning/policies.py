@@ -9,7 +9,6 @@ import jax
 from drivax.learning.config import TrainConfig
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
-from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder
@@ -31,7 +30,7 @@ def load_policy(
     """
     folder = RunFolder.open(run)
     config = folder.config(TrainConfig)
-    learner = config.algorithm.build(Simulator(config.task), bank, config.iterations)
+    learner = config.algorithm.build(config.environment(), bank, config.iterations)
     checkpoints = Checkpoints(folder.checkpoints)
     template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
     chosen = checkpoints.best() if step is None else step

@@ -11,16 +11,14 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
-from drivax.learning.collector import Environments, Rollout, collect, start_environments
-from drivax.networks.actor_critic import ActorCritic, ActorCriticConfig
-from drivax.networks.encoders import group_spec
+from drivax.learning.collector import Rollout, collect
+from drivax.learning.environment import Environment, Environments
+from drivax.networks.actor_critic import ActorCritic, NetworkConfig
+from drivax.networks.distributions import Actions
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
-from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
-from drivax.scenario.schema import CURRENT_STEP, STEPS
-from drivax.simulator.simulator import Simulator
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,6 @@ class PpoConfig:
         network: Policy and value.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
-        latest_start: Episodes begin at a random step of the log between 10 and this one.
         epochs, minibatches: Passes over the experience, and updates per pass.
         learning_rate: Of Adam, falling linearly to a tenth over the run.
         gamma, lambda_: Discount, and mixing of advantages.
@@ -41,10 +38,9 @@ class PpoConfig:
     """
 
     kind: Literal["ppo"] = "ppo"
-    network: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     environments: int = 256
     unroll: int = 64
-    latest_start: int = 10
     epochs: int = 4
     minibatches: int = 8
     learning_rate: float = 3e-4
@@ -62,17 +58,15 @@ class PpoConfig:
             raise ValueError(
                 f"environments x unroll = {self.steps_per_iteration} is no multiple of {self.minibatches} minibatches"
             )
-        if not CURRENT_STEP <= self.latest_start < STEPS - 2:
-            raise ValueError(f"latest_start is {self.latest_start}; use {CURRENT_STEP} to {STEPS - 3}")
 
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps of one iteration."""
         return self.environments * self.unroll
 
-    def build(self, simulator: Simulator, bank: ScenarioBank, iterations: int) -> Ppo:
-        """PPO on a simulator."""
-        return Ppo(self, simulator, bank, iterations)
+    def build(self, environment: Environment, data: Any, iterations: int) -> Ppo:
+        """PPO in an environment."""
+        return Ppo(self, environment, data, iterations)
 
 
 @record
@@ -87,13 +81,11 @@ class PpoState:
 
 
 class Ppo:
-    """PPO on one simulator. Holds configuration and the network's graph; everything computed is in the state."""
+    """PPO in one environment. Holds configuration and the network's graph; everything computed is in the state."""
 
-    def __init__(self, config: PpoConfig, simulator: Simulator, bank: ScenarioBank, iterations: int) -> None:
-        self.config, self.simulator = config, simulator
-        scene = jax.eval_shape(lambda b: Simulator(simulator.task, simulator.traffic).scene(b, 0, 10), bank)
-        self.spec = group_spec(jax.eval_shape(simulator.observe, bank, scene))
-        self.actions = scene.action.shape[0]
+    def __init__(self, config: PpoConfig, environment: Environment, data: Any, iterations: int) -> None:
+        self.config, self.environment = config, environment
+        self.spec = environment.shapes(data)
         updates = iterations * config.epochs * config.minibatches
         schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
         self.optimiser = optax.chain(
@@ -102,13 +94,14 @@ class Ppo:
         self.graph = nnx.graphdef(self._network(jax.random.key(0)))
 
     def _network(self, key: Array) -> ActorCritic:
-        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), self.actions)
+        actions = Actions(self.environment.action_size, self.environment.levels)
+        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), actions)
 
-    def init(self, bank: ScenarioBank, key: Array) -> PpoState:
+    def init(self, data: Any, key: Array) -> PpoState:
         """The state before the first iteration."""
         network_key, environment_key, key = jax.random.split(key, 3)
         parameters = nnx.state(self._network(network_key), nnx.Param)
-        environments = start_environments(self.simulator, bank, environment_key, self.config.environments)
+        environments = self.environment.start(data, environment_key, self.config.environments)
         return PpoState(
             parameters, self.optimiser.init(parameters), environments, key, jnp.zeros((), jnp.int32)
         )
@@ -122,7 +115,7 @@ class Ppo:
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
-    def iterate(self, bank: ScenarioBank, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
+    def iterate(self, data: Any, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
         """One iteration: collect, then update. Pure; jit it with the state donated.
 
         Returns:
@@ -132,19 +125,12 @@ class Ppo:
         network = self.network(state.parameters)
 
         def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            policy = network.policy(observation)
+            policy, value = network.both(observation)
             choice = policy.sample(key)
-            extra = {"log_prob": policy.log_prob(choice), "value": network.value(observation)}
-            return choice, jnp.tanh(choice), extra
+            return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
 
         environments, rollout, totals = collect(
-            self.simulator,
-            bank,
-            state.environments,
-            actor,
-            collect_key,
-            self.config.unroll,
-            self.config.latest_start,
+            self.environment, data, state.environments, actor, collect_key, self.config.unroll
         )
         last = network.value(environments.observation)
         parameters, optimiser, losses = self._update(state, rollout, last, update_key)
@@ -202,16 +188,14 @@ class Ppo:
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy = network.policy(part["observation"])
+        policy, value = network.both(part["observation"])
         log_prob = policy.log_prob(part["choice"])
         centre = mean(part["advantage"])
         spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
         advantage = (part["advantage"] - centre) / spread
         policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
-        value = network.value(part["observation"])
         value_loss = mean((value - part["target"]) ** 2)
-        # The entropy of a squashed Gaussian has no closed form: one fresh sample estimates it.
-        entropy = -mean(policy.log_prob(policy.sample(key)))
+        entropy = mean(policy.entropy_estimate(key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
         ratio = jnp.exp(log_prob - part["log_prob"])
         logs = {
