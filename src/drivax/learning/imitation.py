@@ -73,10 +73,8 @@ class Cloning:
         observation, action, clipped = environment.demonstrations(data, key, self.batch)
         policy = act(parameters, observation)
         error = policy.mode() - action
-        if self.loss == "mse":
-            loss = jnp.mean(error**2, axis=-1)
-        else:
-            loss = -policy.log_prob(policy.choice_of(action))
+        squared = self.loss == "mse"
+        loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.choice_of(action))
         counts = (~clipped if self.mask_clipped else jnp.ones_like(clipped)).astype(jnp.float32)
         share = 1.0 / jnp.maximum(counts.sum(), 1.0)
         mean = jnp.sum(loss * counts) * share

@@ -135,16 +135,22 @@ def validate(
 
 
 def logged(raw: Mapping[str, Any]) -> dict[str, float]:
-    """Means to log from the sums of an iteration: metrics per episode that defines them, rewards per step."""
-    sums = {name.removeprefix("rollout/"): float(v) for name, v in raw.items() if name.startswith("rollout/")}
-    row = {name: float(value) for name, value in raw.items() if not name.startswith("rollout/")}
-    if "episodes" in sums:
-        row["rollout/episodes"] = sums["episodes"]
-    for name, value in sums.items():
-        if name.startswith("reward/"):
-            row[name] = value / max(sums["steps"], 1.0)
-        elif sums.get(f"{name}/n", 0.0) > 0:
-            row[f"rollout/{name}"] = value / sums[f"{name}/n"]
+    """Means to log from the numbers of an iteration.
+
+    A name with ``<name>/n`` beside it is a sum over so many (episodes that define a metric, updates): its mean is
+    logged, and nothing where there were none. Sums of ``rollout/reward/*`` are over the steps. What else there is
+    is logged as it is.
+    """
+    values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
+    steps = values.pop("rollout/steps", 0.0)
+    row = {}
+    for name, value in values.items():
+        if name.startswith("rollout/reward/"):
+            name, count = name.removeprefix("rollout/"), steps
+        else:
+            count = float(raw.get(f"{name}/n", 1.0))
+        if count > 0:
+            row[name] = value / count
     return row
 
 

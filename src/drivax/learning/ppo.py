@@ -11,10 +11,11 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
+from drivax.learning.algorithm import Also
 from drivax.learning.collector import Rollout, collect
 from drivax.learning.environment import Environment, Environments
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
-from drivax.networks.distributions import Actions
+from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
@@ -110,13 +111,24 @@ class Ppo:
         """The network with these parameters."""
         return nnx.merge(self.graph, parameters)
 
+    def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
+        """The policy with these parameters."""
+        return self.network(parameters).policy(observation)
+
     def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
         """The policy as a planner; the value network stays behind."""
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
-    def iterate(self, data: Any, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
+    def iterate(
+        self, data: Any, state: PpoState, also: Also | None = None
+    ) -> tuple[PpoState, dict[str, Array]]:
         """One iteration: collect, then update. Pure; jit it with the state donated.
+
+        Args:
+            data: The environment's data.
+            state: The state.
+            also: A further loss of the policy.
 
         Returns:
             The next state, and sums (``rollout/*``, see ``collector.collect``) and means (``loss/*``) to log.
@@ -133,12 +145,12 @@ class Ppo:
             self.environment, data, state.environments, actor, collect_key, self.config.unroll
         )
         last = network.value(environments.observation)
-        parameters, optimiser, losses = self._update(state, rollout, last, update_key)
+        parameters, optimiser, losses = self._update(state, rollout, last, update_key, also)
         following = PpoState(parameters, optimiser, environments, key, state.iteration + 1)
         return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
     def _update(
-        self, state: PpoState, rollout: Rollout, last: Array, key: Array
+        self, state: PpoState, rollout: Rollout, last: Array, key: Array, also: Also | None
     ) -> tuple[Any, Any, dict[str, Array]]:
         config = self.config
         value_t = rollout.extra["value"]
@@ -173,7 +185,7 @@ class Ppo:
         ) -> tuple[tuple[Any, Any], dict[str, Array]]:
             (parameters, optimiser), (rows, key) = carry, now
             part = jax.tree.map(lambda leaf: leaf[rows], batch)
-            (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key)
+            (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key, also)
             logs["gradient_norm"] = optax.tree.norm(gradient)
             change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
             return (optax.apply_updates(parameters, change), optimiser), logs
@@ -182,7 +194,9 @@ class Ppo:
         (parameters, optimiser), logs = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
         return parameters, optimiser, {f"loss/{name}": value.mean() for name, value in logs.items()}
 
-    def _loss(self, parameters: Any, part: dict[str, Any], key: Array) -> tuple[Array, dict[str, Array]]:
+    def _loss(
+        self, parameters: Any, part: dict[str, Any], key: Array, also: Also | None
+    ) -> tuple[Array, dict[str, Array]]:
         config, network, alive = self.config, self.network(parameters), part["alive"]
 
         def mean(value: Array) -> Array:
@@ -198,7 +212,8 @@ class Ppo:
         entropy = mean(policy.entropy_estimate(key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
         ratio = jnp.exp(log_prob - part["log_prob"])
-        logs = {
+        further, logs = (0.0, {}) if also is None else also(parameters, jax.random.fold_in(key, 1))
+        logs |= {
             "policy": policy_loss,
             "value": value_loss,
             "entropy": entropy,
@@ -207,4 +222,4 @@ class Ppo:
             "explained_variance": 1.0
             - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
         }
-        return total, logs
+        return total + further, logs

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
 from drivax.learning import replay
+from drivax.learning.algorithm import Also
 from drivax.learning.branches import in_any
 from drivax.learning.collector import Actor, collect
 from drivax.learning.environment import Environment, Environments
@@ -24,9 +24,6 @@ from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.temporal_difference import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
 from drivax.scenario.record import record
-
-#: A further loss of the policy: from its parameters and a key to the loss and what to log of it.
-Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,9 @@ class SacConfig:
                 cure=f"set warm_up to {2 * self.environments} or more",
             )
         if self.network.distribution == "grid":
-            raise UsageError("SAC needs a policy with a gradient through its samples", cure="gaussian or beta")
+            raise UsageError(
+                "SAC needs a policy with a gradient through its samples", cure="gaussian or beta"
+            )
 
     @property
     def steps_per_iteration(self) -> int:
@@ -192,7 +191,11 @@ class Sac:
             self.environment, data, state.environments, actor, collect_key, config.unroll, config.replay.store
         )
         kept = replay.add(state.replay, rollout)
-        first = (Trained(state.parameters, state.critic, state.log_temperature), state.target, state.optimiser)
+        first = (
+            Trained(state.parameters, state.critic, state.log_temperature),
+            state.target,
+            state.optimiser,
+        )
 
         @jax.jit  # so that asking for the shapes of what it logs traces nothing a second time
         def learn() -> tuple[tuple[Trained, Any, Any], dict[str, Array]]:
@@ -216,7 +219,7 @@ class Sac:
         return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
     def _actor(self, parameters: Any, explores: Bool[Array, ""]) -> Actor:
-        """Samples the policy; where it ``explores`` before the first update, as configured. The action is the choice."""
+        """Samples the policy, or as configured where it ``explores``; remembers the action as its choice."""
 
         def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
             sample_key, uniform_key = jax.random.split(key)

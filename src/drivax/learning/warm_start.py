@@ -1,7 +1,7 @@
 """Warm starts: clone the expert first, then learn on from that policy by reward, with imitation fading out.
 
-One learner for every algorithm that learns on: it is given the algorithm's own learner, and adds a phase before it and a
-loss beside its policy's.
+One learner for every algorithm that learns on: it is given the algorithm's own learner, and adds a phase before it and
+a loss beside its policy's.
 """
 
 from __future__ import annotations
@@ -165,7 +165,9 @@ class WarmStarted:
             def run() -> tuple[Any, dict[str, Array]]:
                 after, logs = phase(data, state)
                 # What only the other phase logs was measured no time in this one.
-                other = {name: jnp.zeros(leaf.shape, leaf.dtype) for part in names for name, leaf in part.items()}
+                other = {
+                    name: jnp.zeros(leaf.shape, leaf.dtype) for part in names for name, leaf in part.items()
+                }
                 return after, other | logs
 
             return run
