@@ -125,8 +125,11 @@ class _Action:
     def sample(self, key):
         return self.loc + 0.3 * jax.random.normal(key, self.loc.shape)
 
+    def action(self, choice):
+        return jnp.tanh(choice)
+
     def mode(self):
-        return jnp.tanh(self.loc)
+        return self.action(self.loc)
 
 
 class Reinforce:

@@ -13,7 +13,8 @@ from jaxtyping import Array
 
 from drivax.learning.collector import Rollout, collect
 from drivax.learning.environment import Environment, Environments
-from drivax.networks.actor_critic import ActorCritic, ActorCriticConfig
+from drivax.networks.actor_critic import ActorCritic, NetworkConfig
+from drivax.networks.distributions import Actions
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
@@ -37,7 +38,7 @@ class PpoConfig:
     """
 
     kind: Literal["ppo"] = "ppo"
-    network: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     environments: int = 256
     unroll: int = 64
     epochs: int = 4
@@ -93,7 +94,8 @@ class Ppo:
         self.graph = nnx.graphdef(self._network(jax.random.key(0)))
 
     def _network(self, key: Array) -> ActorCritic:
-        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), self.environment.action_size)
+        actions = Actions(self.environment.action_size, self.environment.levels)
+        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), actions)
 
     def init(self, data: Any, key: Array) -> PpoState:
         """The state before the first iteration."""
@@ -123,10 +125,9 @@ class Ppo:
         network = self.network(state.parameters)
 
         def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            policy = network.policy(observation)
+            policy, value = network.both(observation)
             choice = policy.sample(key)
-            extra = {"log_prob": policy.log_prob(choice), "value": network.value(observation)}
-            return choice, jnp.tanh(choice), extra
+            return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
 
         environments, rollout, totals = collect(
             self.environment, data, state.environments, actor, collect_key, self.config.unroll
@@ -187,16 +188,14 @@ class Ppo:
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy = network.policy(part["observation"])
+        policy, value = network.both(part["observation"])
         log_prob = policy.log_prob(part["choice"])
         centre = mean(part["advantage"])
         spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
         advantage = (part["advantage"] - centre) / spread
         policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
-        value = network.value(part["observation"])
         value_loss = mean((value - part["target"]) ** 2)
-        # The entropy of a squashed Gaussian has no closed form: one fresh sample estimates it.
-        entropy = -mean(policy.log_prob(policy.sample(key)))
+        entropy = mean(policy.entropy_estimate(key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
         ratio = jnp.exp(log_prob - part["log_prob"])
         logs = {

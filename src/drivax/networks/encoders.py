@@ -16,7 +16,8 @@ Groups = Mapping[str, Array]
 #: Shapes of one observation, by group.
 GroupSpec = Mapping[str, tuple[int, ...]]
 
-_ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
+Activation = Literal["relu", "tanh", "gelu", "silu"]
+ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
 
 
 @runtime_checkable
@@ -56,7 +57,7 @@ class MlpConfig:
     kind: Literal["mlp"] = "mlp"
     rows: tuple[int, ...] = ()
     hidden: tuple[int, ...] = (256, 256)
-    activation: Literal["relu", "tanh", "gelu", "silu"] = "relu"
+    activation: Activation = "relu"
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MlpEncoder:
         """The encoder with fresh parameters."""
@@ -77,12 +78,12 @@ class MlpEncoder(nnx.Module):
             if masked and self.pools:
                 # One row is what the mask's first axis counts; times of one row go side by side with their masks.
                 one = math.prod(spec[name][1:]) + math.prod(spec[f"{name}_mask"][1:])
-                shared[name] = _layers(one, config.rows, rngs)
+                shared[name] = dense_layers(one, config.rows, rngs)
                 width += config.rows[-1]
             else:
                 width += math.prod(spec[name]) + (math.prod(spec[f"{name}_mask"]) if masked else 0)
         self.shared = nnx.Dict(shared)
-        self.layers = _layers(width, config.hidden, rngs)
+        self.layers = dense_layers(width, config.hidden, rngs)
         self.width = config.hidden[-1]
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
@@ -110,11 +111,12 @@ class MlpEncoder(nnx.Module):
 
     def _dense(self, layers: Any, x: Array) -> Array:
         for layer in layers:
-            x = _ACTIVATIONS[self.activation](layer(x))
+            x = ACTIVATIONS[self.activation](layer(x))
         return x
 
 
-def _layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
+def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
+    """Dense layers of these sizes, with orthogonal weights for what follows relu or tanh."""
     layers = []
     for size in sizes:
         layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
