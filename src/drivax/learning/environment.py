@@ -6,7 +6,7 @@ functions but :meth:`Environment.observe` act on a batch.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float
 
@@ -21,7 +21,10 @@ class Environments:
         state: Their states.
         over: Whether each one's episode has ended; the next step begins a new one.
         observation: What each one's policy sees now.
+        environment_axis: The axis that counts environments; several devices divide it among them.
     """
+
+    environment_axis: ClassVar[int] = 0
 
     state: Any
     over: Bool[Array, "*batch"]
