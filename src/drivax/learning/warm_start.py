@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from drivax.planners.planner import Planner
 from drivax.scenario.record import record
 
 
+@runtime_checkable
 class Online(Protocol):
     """A learner that can learn on from a policy: its state has ``parameters``, ``key`` and ``iteration``."""
 
