@@ -23,7 +23,14 @@ from pendulum import Demonstrations, Pendulum
 TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 CLONING = Cloning(batch=16, updates=3)
 SAC = SacConfig(
-    TINY, ReplayConfig(64), environments=2, unroll=4, updates_per_step=1, batch=8, warm_up=8, explore="policy"
+    network=TINY,
+    replay=ReplayConfig(64),
+    environments=2,
+    unroll=4,
+    updates_per_step=1,
+    batch=8,
+    warm_up=8,
+    explore="policy",
 )
 PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
 

@@ -20,7 +20,15 @@ from pendulum import Demonstrations, Pendulum
 
 TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 #: Small enough that six iterations write over the whole ring.
-SAC = SacConfig(TINY, ReplayConfig(32), environments=4, unroll=4, updates_per_step=1, batch=8, warm_up=16)
+SAC = SacConfig(
+    network=TINY,
+    replay=ReplayConfig(32),
+    environments=4,
+    unroll=4,
+    updates_per_step=1,
+    batch=8,
+    warm_up=16,
+)
 PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
 START = WarmStart(iterations=2, cloning=Cloning(batch=8, updates=2), weight=0.5, half_life=2)
 ALGORITHMS = {
