@@ -26,6 +26,14 @@ from drivax.networks.encoders import (
     MlpConfig,
     dense_layers,
 )
+from drivax.networks.entity import EntityConfig
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+
+#: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or the
+#: dotted name of one's own.
+EncoderSettings = (
+    MlpConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig | EntityConfig | EncoderConfig
+)
 
 
 @dataclass(frozen=True)
@@ -42,7 +50,7 @@ class NetworkConfig:
         shared_encoder: Whether policy and value look through one encoder. Critics never share.
     """
 
-    encoder: MlpConfig | EncoderConfig = field(default_factory=MlpConfig)
+    encoder: EncoderSettings = field(default_factory=MlpConfig)
     head: tuple[int, ...] = (64,)
     activation: Activation = "tanh"
     first_scale: float = 0.3
