@@ -17,8 +17,6 @@ from drivax.networks.distributions import (
     parameters_of,
 )
 from drivax.networks.encoders import (
-    ACTIVATIONS,
-    Activation,
     Encoder,
     EncoderConfig,
     Groups,
@@ -27,6 +25,7 @@ from drivax.networks.encoders import (
     dense_layers,
 )
 from drivax.networks.entity import EntityConfig
+from drivax.networks.pooling import ACTIVATIONS, Activation
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
 #: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or the
