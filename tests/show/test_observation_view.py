@@ -54,7 +54,6 @@ def test_columns_are_taken_apart_with_their_units():
     np.testing.assert_allclose(seen["agents", "velocity"][0, 1], [-5, 0], atol=1e-5)
     np.testing.assert_allclose(seen["agents", "length"][0, 1], [4.8], atol=1e-5)
     np.testing.assert_allclose(seen["road", "length"][:2, 0], [10, 10])
-    np.testing.assert_allclose(seen["road", "limit"][0], [13.5, 15])
     np.testing.assert_allclose(seen["ego_static", "last_action"], [0.25, -0.5])
     assert (
         seen.has("lights", "state", "on_route") and not seen.has("agents", "height") and not seen.has("none")

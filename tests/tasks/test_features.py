@@ -24,7 +24,8 @@ from scenes import LANE_M, RED, bank_of, car, line, straight_road
 RADIUS_M, STRAIGHT_M = 50.0, 40.0
 EXAMPLES = ("relative_velocity", "lane_curvature", "recommended_speed", "time_gap", "stop_line")
 EVERYTHING = ObservationConfig(
-    agents=3, steps=2, road=150, road_ahead_m=100.0, road_side_m=60.0, lights=2, route=16, features=Features(**{g: tuple(c) for g, c in COLUMNS.items()}),
+    agents=3, steps=2, road=150, road_ahead_m=100.0, road_side_m=60.0, lights=2, route=16,
+    features=Features(**{g: tuple(c) for g, c in COLUMNS.items()}),
     own=tuple(OwnGroup(getattr(example_features, name)) for name in EXAMPLES),
 )  # fmt: skip
 FEW = replace(

@@ -237,11 +237,11 @@ def _wide(flags: Values, like: Values) -> Values:
 def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:
     """How many entries count and how many are broken; mean, standard deviation, smallest and largest of the former."""
     finite = np.isfinite(values)
-    kept = values[valid & finite].astype(np.float64)
+    kept, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
     if not kept.size:
-        return 0, int((~finite).sum()), *(float("nan"),) * 4
-    numbers = (kept.mean(), kept.std(), kept.min(), kept.max())
-    return kept.size, int((~finite).sum()), *(float(number) for number in numbers)
+        nothing = float("nan")
+        return 0, broken, nothing, nothing, nothing, nothing
+    return kept.size, broken, float(kept.mean()), float(kept.std()), float(kept.min()), float(kept.max())
 
 
 def collision_correlation(values: Values, valid: Values, collides: Values) -> float:

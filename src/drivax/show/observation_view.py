@@ -30,20 +30,21 @@ _STATES = {"unknown": "unknown", "green": "green", "yellow": "amber", "red": "re
 _ROADS = {"lane": ("lane", 1.6), "edge": ("edge", 2.2), "crosswalk": ("line", 5.0)}
 #: Nothing further than this is drawn, m; space around what is drawn, m.
 _FARTHEST_M, _MARGIN_M = 130.0, 4.0
+#: The picture is at least so wide for its height, and so high for its width.
+_SLIMMEST = 0.66
 #: An agent of unknown size is a dot of this radius, m.
 _DOT_M = 0.9
 _SCALE = {
     "position": POSITION_M,
     "goal": POSITION_M,
     "velocity": SPEED_MPS,
-    "limit": SPEED_MPS,
     **dict.fromkeys(("length", "width"), SIZE_M),
 }
 
 
 @dataclass(frozen=True)
 class Seen:
-    """An observation taken apart: columns by group and feature, in m and m/s.
+    """An observation taken apart: columns by group and feature, lengths in m, velocities in m/s, others as they are.
 
     Attributes:
         values: Group -> feature -> ``[..., columns]``, only what is configured.
@@ -138,7 +139,11 @@ def _extent(config: ObservationConfig, seen: Seen) -> tuple[Values, Values]:
         if seen.has(group, "position"):
             points.append(_up(seen[group, "position"][seen.masks[group]]))
     everything = np.clip(np.concatenate(points), -_FARTHEST_M, _FARTHEST_M)
-    return everything.min(axis=0) - _MARGIN_M, everything.max(axis=0) + _MARGIN_M
+    low, high = everything.min(axis=0) - _MARGIN_M, everything.max(axis=0) + _MARGIN_M
+    # Neither a tower nor a ribbon: as much more on both sides as is needed.
+    width, height = high - low
+    more = np.array([max(_SLIMMEST * height - width, 0.0), max(_SLIMMEST * width - height, 0.0)]) / 2
+    return low - more, high + more
 
 
 def _draw(axes: Axes, config: ObservationConfig, seen: Seen) -> None:
@@ -231,12 +236,15 @@ def _draw_agents(axes: Axes, seen: Seen) -> None:
             now = step == steps - 1
             faded = 1.0 if now else 0.12 + 0.3 * step / steps
             _outline(axes, seen, "agents", (row, step), colour, faded, 4.0 + step / steps)
+        if kind[1] + kind[2] > 0:  # who is slim gets a halo
+            place = _up(seen["agents", "position"][row, -1])
+            axes.scatter(*place, s=70, color=colour, alpha=0.45, linewidth=0, zorder=3.9)
         if seen.has("agents", "velocity"):
             _arrow(axes, seen["agents", "position"][row, -1], seen["agents", "velocity"][row, -1])
 
 
 def _outline(
-    axes: Axes, seen: Seen, group: str, at: tuple[int, ...], colour: str, alpha: float, zorder: float
+    axes: Axes, seen: Seen, group: str, at: tuple[Any, ...], colour: str, alpha: float, zorder: float
 ) -> None:
     """A box where heading and size are known, else a dot."""
     from matplotlib.patches import Circle, Polygon

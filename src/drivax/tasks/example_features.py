@@ -36,16 +36,17 @@ def relative_velocity(
     now, view, ego = frames(0), View.of(scene), scene.history[-1]
     there = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
     distance = jnp.where(there, norm(now.box[:, :2] - view.xy), jnp.inf)
-    order = jnp.argsort(distance)[:_OTHERS]
+    rank = jnp.arange(_OTHERS)
+    order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
     own = jnp.stack([ego[3], jnp.zeros(())])
-    return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order]
+    return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
 
 
 def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
     """Curvature of the lane that ego is on, in units of 0.1 1/m (left positive), and whether it is on one.
 
-    It is that of the piece of lane within 2.5 m and 60 degrees that fits place and heading best, a metre weighing as much
-    as 15 degrees. No route is needed. Bridges are not told apart from what is under them.
+    It is that of the piece of lane within 2.5 m and 60 degrees that fits place and heading best, a metre weighing as
+    much as 15 degrees. No route is needed. Bridges are not told apart from what is under them.
     """
     view = View.of(scene)
     rows, layer = bank.road[scene.index], bank.road_at[scene.index, 2]
