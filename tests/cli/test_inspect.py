@@ -151,6 +151,7 @@ def test_page(sets, inspect, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
+@pytest.mark.slow
 def test_observations(sets, inspect, tmp_path):
     """Described as a table and as JSON, and drawn; the task is that of a training configuration."""
     task = "task: {observation: {agents: 2, steps: 2, road: 20, lights: 1, route: 2}}\n"

@@ -18,7 +18,8 @@ from drivax.evaluation.observation_statistics import (
     observation_statistics,
 )
 from drivax.planners.planner import Memoryless
-from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.evaluation.rollout import judging
+from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Physical, Published
@@ -37,14 +38,14 @@ def faulty(bank, scene, frames):
 
 @record
 class Shy(Memoryless):
-    """Brakes the harder the nearer the first agent; looks at nothing but that agent's place ahead."""
+    """Hardly does a thing, by the place ahead of the first agent; looks at nothing else."""
 
     actions: Any = static(default=Physical())
     name: str = static(default="shy")
     replays: bool = static(default=False)
 
     def act(self, carry, bank, state, situation, observation, key):
-        return jnp.stack([observation["agents"][0, -1, 0] - 0.5, jnp.zeros(())]), carry
+        return jnp.stack([1e-3 * observation["agents"][0, -1, 0], jnp.zeros(())]), carry
 
 
 TASK = Task(
@@ -71,8 +72,7 @@ def column(found, group, name):
 
 
 def test_episodes_are_looked_at_until_and_after_the_collision(bank):
-    simulator = Simulator(replace(TASK, to_the_end=True, metrics=("collision",)))
-    looks = look_at(simulator, ConstantVelocity(), bank, every=10)
+    looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
     assert looks.state.scene.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
     assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
@@ -161,6 +161,7 @@ def test_importance_of_a_linear_policy_is_known():
 def test_permuting_keeps_masks_and_moves_only_valid_entries():
     rng = np.random.default_rng(2)
     mask = rng.random((50, 4)) < 0.5
+    mask[:, 0] = True
     values = np.where(mask[..., None], rng.normal(size=(50, 4, 2)), 0.0)
     asked = []
 

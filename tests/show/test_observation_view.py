@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from drivax.errors import UsageError
-from drivax.show.observation_tables import cell
+from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
+from drivax.show.observation_tables import observation_overview, observation_table
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig
 
@@ -67,7 +70,7 @@ def test_what_is_seen_is_drawn_and_nothing_else():
     image = pixels(draw_observation(CONFIG, full, "a title"))
     empty = {name: np.zeros_like(value) if name.endswith("_mask") else value for name, value in full.items()}
     nothing = pixels(draw_observation(CONFIG, empty, "a title"))
-    for name in ("vehicle", "pedestrian", "edge", "lane", "red", "route"):
+    for name in ("vehicle", "pedestrian", "edge", "red", "route"):
         # The legend shows each sign once.
         assert share(image, name) > share(nothing, name) + 25, name
     littered = {name: np.array(value) for name, value in full.items()}
@@ -102,5 +105,31 @@ def test_a_missing_matplotlib_is_named(monkeypatch):
         draw_observation(CONFIG, observed())
 
 
-def test_cells():
-    assert [cell(value) for value in (float("nan"), -0.001, 1.239, -3.0)] == ["", "0.00", "1.24", "-3.00"]
+def statistics(**more):
+    one = FeatureStatistics("ego", "velocity ahead", 240, 0, 0.6, 0.004, -0.001, 1.239, -0.25, 1.2)
+    other = FeatureStatistics("mine", "0", 0, 7, *(float("nan"),) * 6)
+    groups = {"ego": 1.3, "mine": float("nan")}
+    return ObservationStatistics(
+        "shy", 40, 3, 320, **{"permuted": 320, "features": (one, other), "groups": groups} | more
+    )
+
+
+def printed(table):
+    out = io.StringIO()
+    Console(file=out, width=100).print(table)
+    return [line.split() for line in out.getvalue().splitlines()]
+
+
+def test_the_table():
+    rows = printed(observation_table(statistics()))
+    assert rows[0][-3:] == ["r", "collision", "importance"]
+    assert rows[1:3] == [
+        ["ego", "1.30"],
+        ["velocity", "ahead", "240", "0.60", "0.00", "0.00", "1.24", "-0.25", "1.20"],
+    ]
+    assert rows[3:] == [["mine"], ["0", "0", "7"]]
+    assert printed(observation_table(statistics(permuted=0)))[1] == ["ego"]
+    text = observation_overview(statistics())
+    assert (
+        text == "320 states of 40 episodes driven by shy, 3 with a collision; 7 entries are NaN or infinite"
+    )

@@ -17,7 +17,7 @@ from scenes import RED, bank_of, car, straight_road
 
 BOXES = 12
 SMALL = ObservationConfig(
-    agents=8, steps=3, road=20, lights=1, route=1, features=Features(agents=("position", "length"), route=())
+    agents=8, steps=2, road=20, lights=1, route=1, features=Features(agents=("position", "length"), route=())
 )
 
 
@@ -87,27 +87,31 @@ def test_lines_of_sight_on_paper():
 def bank():
     cars = [
         car(0, 0, 0, 4), car(15, 0, 0, 4, 12.0, 2.6), car(32, 0.2, 0, 4, 4.0), car(-20, 3.7, 0, 4, 4.2),
-        car(-40, 0, 0, 4, 4.4), car(60, 3.7, 0, 4, 4.6), car(15, 3.7, 0, 4, 0.6, 0.6, AgentKind.PEDESTRIAN),
+        car(-40, 0, 0, 4, 4.4), car(60, 11, 0, 4, 4.6), car(15, 3.7, 0, 4, 0.6, 0.6, AgentKind.PEDESTRIAN),
     ]  # fmt: skip
     return bank_of(straight_road(cars, light=RED))
 
 
 FIRST = 15
-FAULTS = (
-    Perception(), Perception(occlusion=True), Perception(range_m=30.0), Perception(noise_m=0.1),
-    Perception(noise_m=0.1, seed=1), Perception(dropout_m=40.0),
-    Perception(dropout_m=40.0, noise_m=0.1, range_m=50.0, occlusion=True),
-)  # fmt: skip
+ALL = Perception(dropout_m=40.0, noise_m=0.1, range_m=50.0, occlusion=True)
+FAULTS = {
+    "none": Perception(),
+    "occlusion": Perception(occlusion=True),
+    "noise": Perception(noise_m=0.1),
+    "all": ALL,
+}
 
 
 @pytest.fixture(scope="module")
 def seen(bank):
-    """What is seen at every step from 15 on with each kind of fault, by one program."""
-    simulators = [Simulator(Task(observation=replace(SMALL, perception=one))) for one in FAULTS]
+    """What is seen at every step from 15 on with each kind of fault, by one program; and the scenes."""
+    simulators = {
+        name: Simulator(Task(observation=replace(SMALL, perception=one))) for name, one in FAULTS.items()
+    }
 
     def look(bank, step):
-        scene = simulators[0].scene(bank, 0, step)
-        return [one.observe(bank, scene) for one in simulators]
+        scene = simulators["none"].scene(bank, 0, step)
+        return {name: one.observe(bank, scene) for name, one in simulators.items()} | {"scene": scene}
 
     return jax.device_get(jax.jit(jax.vmap(look, (None, 0)))(bank, jnp.arange(FIRST, 91)))
 
@@ -118,90 +122,93 @@ def lengths(seen, step=0):
     return sorted(np.round(rows[mask, 2].astype(np.float64) * 5, 1).tolist())
 
 
-def test_who_is_behind_a_bus_or_out_of_range_is_not_there(seen):
-    truth, occluded, near = seen[:3]
-    assert lengths(truth) == [0.6, 4.0, 4.2, 4.4, 4.6, 12.0]
-    # The car at 32 m is hidden by the bus ahead of ego; the one at 60 m to the left is seen past it.
-    assert lengths(occluded) == [0.6, 4.2, 4.4, 4.6, 12.0]
-    assert lengths(near) == [0.6, 4.2, 12.0]
-    assert truth["lights_mask"][0].all() and not near["lights_mask"][0].any()
-    # Who is not seen now has no past, and leaves no gap among the nearest.
-    for one in (occluded, near):
-        mask = one["agents_mask"]
+def test_who_is_behind_a_bus_is_not_there(seen):
+    assert lengths(seen["none"]) == [0.6, 4.0, 4.2, 4.4, 4.6, 12.0]
+    # The car at 32 m is hidden by the bus ahead of ego; the one at 60 m, far to the left, is seen past it.
+    assert lengths(seen["occlusion"]) == [0.6, 4.2, 4.4, 4.6, 12.0]
+    for name in ("occlusion", "all"):
+        # Who is not seen now has no past, and leaves no gap among the nearest.
+        mask = seen[name]["agents_mask"]
         assert not (mask.any(axis=2) & ~mask[..., -1]).any()
         assert (np.sort(mask[..., -1], axis=1)[:, ::-1] == mask[..., -1]).all()
+    # Of the agents in view, all but that at 61 m are in range of 50 m, and chance lets each be seen at some steps.
+    everyone = {length for step in range(76) for length in lengths(seen["all"], step)}
+    assert everyone == {0.6, 4.2, 4.4, 12.0}
 
 
-def errors(seen, truth):
-    """Errors of the places of agents, m, where they are there: (step, row, past step, xy)."""
-    return (seen["agents"][..., :2] - truth["agents"][..., :2]) * 50
+def errors(seen, group="agents"):
+    """Errors of places, m."""
+    return (seen["noise"][group][..., :2] - seen["none"][group][..., :2]) * 50
 
 
 def test_noise_is_as_large_as_said_and_independent(seen):
-    truth, noisy, other = seen[0], seen[3], seen[4]
-    now = truth["agents_mask"][..., -1]
-    error = errors(noisy, truth)[:, :, -1][now]
+    truth, noisy = seen["none"], seen["noise"]
+    error = errors(seen)[:, :6, -1]
     count = error.size
-    assert count > 800
+    assert truth["agents_mask"][:, :6, -1].all() and not truth["agents_mask"][:, 6:].any() and count > 800
     assert abs(error.mean()) < 4 * 0.1 / np.sqrt(count)
     assert abs(error.std() - 0.1) < 4 * 0.1 / np.sqrt(2 * count)
-    again = errors(other, truth)[:, :, -1][now]
-    assert abs(np.corrcoef(error.ravel(), again.ravel())[0, 1]) < 4 / np.sqrt(count)
-    by_agent = errors(noisy, truth)[:, 0, -1, 0]
-    assert abs(np.corrcoef(by_agent[1:], by_agent[:-1])[0, 1]) < 0.5
+    for axis in range(3):  # steps, agents, directions
+        one = np.delete(error, -1, axis=axis).ravel()
+        other = np.delete(error, 0, axis=axis).ravel()
+        assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(len(one))
     for group in ("road", "lights"):
-        mask = truth[f"{group}_mask"]
-        difference = noisy[group] - truth[group]
-        assert (np.abs(difference[..., :2][mask]) > 0).any(axis=-1).all() and not difference[..., 2:].any()
-        assert not noisy[group][~mask].any()
-        assert abs((difference[..., :2][mask] * 50).std() - 0.1) < 0.02
-    assert noisy["ego"].tobytes() == truth["ego"].tobytes()
+        mask, error = truth[f"{group}_mask"], errors(seen, group)
+        assert error[mask].all() and not error[~mask].any() and abs(error[mask].std() - 0.1) < 0.02
+        np.testing.assert_array_equal(noisy[group][..., 2:], truth[group][..., 2:])
+    np.testing.assert_array_equal(noisy["ego"], truth["ego"])
 
 
 def test_a_past_step_is_shown_as_it_was_seen_then(seen):
     """Ego drives straight on at 4 m/s, so what it saw a step ago lies 0.4 m further behind now."""
-    shift = 0.4 / 50
-    for one in (seen[3], seen[6]):
-        rows, mask = one["agents"], one["agents_mask"]
+    for name in ("noise", "all"):
+        rows, mask = seen[name]["agents"], seen[name]["agents_mask"]
         compared = 0
         for step in range(1, len(rows)):
             for row in np.flatnonzero(mask[step, :, -1]):
-                before = np.flatnonzero(
-                    (np.abs(rows[step - 1, :, -1, 2] - rows[step, row, -1, 2]) < 1e-6) & mask[step - 1, :, -1]
-                )
+                same = np.abs(rows[step - 1, :, -1, 2] - rows[step, row, -1, 2]) < 1e-6
+                before = np.flatnonzero(same & mask[step - 1, :, -1])
                 # It was seen then if and only if it is remembered now.
                 assert len(before) == mask[step, row, -2]
                 if len(before):
-                    wanted = rows[step - 1, before[0], -1, :2] - np.array([shift, 0.0])
+                    wanted = rows[step - 1, before[0], -1, :2] - np.array([0.4 / 50, 0.0])
                     np.testing.assert_allclose(rows[step, row, -2, :2], wanted, atol=1e-5)
                     compared += 1
-        assert compared > 100
+        assert compared > 60
 
 
-def test_dropout_by_distance(bank, seen):
-    """The share of steps at which something is seen is exp(-distance / 40 m)."""
-    distance = np.array([1.0, 15.0, 40.0, 90.0], np.float32)
-    scene = jax.jit(lambda bank: Simulator(Task()).scene(bank, 0, 20))(bank)
-    look = jax.vmap(lambda step: lights_seen(Perception(dropout_m=40.0), replace(scene, step=step), distance))
-    there = np.asarray(jax.jit(look)(jnp.arange(4000))).mean(axis=0)
-    wanted = np.exp(-distance / 40.0)
-    np.testing.assert_array_less(np.abs(there - wanted), 4 * np.sqrt(wanted * (1 - wanted) / 4000))
-    # Agents go by the same rule: at every step, each for itself.
-    truth, dropped = seen[0]["agents_mask"][..., -1], seen[5]["agents_mask"][..., -1]
-    near = np.sort(np.linalg.norm(seen[0]["agents"][:, :6, -1, :2] * 50, axis=-1), axis=1)
-    expected = np.exp(-near / 40.0)
-    spread = np.sqrt((expected * (1 - expected)).sum())
-    assert abs(dropped.sum() - expected.sum()) < 4 * spread and truth.sum() == expected.size
-    assert len(np.unique(dropped.sum(axis=1))) > 2
+def test_range_and_dropout_by_distance(seen):
+    """The share of steps at which something is seen is exp(-distance / 40 m); nothing is seen beyond the range."""
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["scene"])
+    distance = jnp.array([1.0, 15.0, 40.0, 90.0])
+
+    def look(faults):
+        return jax.vmap(lambda step: lights_seen(faults, replace(scene, step=step), distance))(
+            jnp.arange(4000)
+        )
+
+    one, other, near = (
+        np.asarray(look(Perception(**faults)))
+        for faults in ({"dropout_m": 40.0}, {"dropout_m": 40.0, "seed": 1}, {"range_m": 40.0})
+    )
+    wanted = np.exp(-np.asarray(distance) / 40.0)
+    np.testing.assert_array_less(np.abs(one.mean(axis=0) - wanted), 4 * np.sqrt(wanted * (1 - wanted) / 4000))
+    assert abs(np.corrcoef(one[:, 2], other[:, 2])[0, 1]) < 4 / np.sqrt(4000)
+    assert near.all(axis=0).tolist() == [True, True, True, False] and not near[:, 3].any()
+    # Agents go by the same rule, each for itself at every step.
+    free = np.linalg.norm(seen["occlusion"]["agents"][:, :5, -1, :2] * 50, axis=-1)
+    expected = np.where(free <= 50.0, np.exp(-free / 40.0), 0.0)
+    found = seen["all"]["agents_mask"][..., -1].sum(axis=1)
+    assert abs(found.sum() - expected.sum()) < 4 * np.sqrt((expected * (1 - expected)).sum())
+    assert len(np.unique(found)) > 2
 
 
 def test_a_replayed_scene_is_perceived_as_it_was_live(bank, seen):
     """A stored scene, observed alone and in another program, as it was seen in the batch."""
-    simulator = Simulator(Task(observation=replace(SMALL, perception=FAULTS[-1])))
-    scene = jax.tree.map(np.asarray, jax.jit(lambda bank: simulator.scene(bank, 0, 40))(bank))
-    again = jax.jit(simulator.observe)(bank, jax.tree.map(jnp.asarray, scene))
-    for name, value in again.items():
-        np.testing.assert_allclose(value, seen[-1][name][40 - FIRST], atol=1e-6, err_msg=name)
+    simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["scene"])
+    for name, value in jax.jit(simulator.observe)(bank, scene).items():
+        np.testing.assert_allclose(value, seen["all"][name][25], atol=1e-6, err_msg=name)
 
 
 def test_what_is_off_leaves_no_trace(bank):

@@ -8,7 +8,7 @@ action depends on it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import advanced
+from drivax.evaluation.rollout import advanced, judging
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
@@ -137,7 +137,7 @@ def observation_statistics(
         raise UsageError(
             f"planner {planner.name} acts in another action space than the task", cure="use the task's"
         )
-    simulator = Simulator(replace(task, to_the_end=True, metrics=("collision",)))
+    simulator = Simulator(judging(task))
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
@@ -146,7 +146,7 @@ def observation_statistics(
     if permute:
         rows = np.unique(np.linspace(0, hit.size - 1, min(PERMUTED, hit.size)).round().astype(int))
         known, permuted = (looks.state, looks.carry, looks.key, looks.observation), len(rows)
-        *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[rows], known)
+        *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], known)
         act = partial(_actions, simulator, planner, bank, *rest)
         columns, groups = importances(act, jax.device_get(shown), seed)
     features = []
