@@ -51,6 +51,36 @@ def overlap(a: Any, b: Any) -> Any:
     return result
 
 
+def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
+    """Where segments pass through boxes (slab test), as shares of the way from ``start`` to ``end``.
+
+    Args:
+        start: Points ``[..., 2]``.
+        end: Points ``[..., 2]``.
+        box: Boxes ``[..., 6]``.
+
+    Returns:
+        Shares in [0, 1] at which each segment enters and leaves; it passes through where the first is smaller.
+    """
+    xp = box.__array_namespace__()
+    cos, sin = box[..., COS], box[..., SIN]
+
+    def turned(point: Any) -> tuple[Any, Any]:
+        x, y = point[..., 0] - box[..., X], point[..., 1] - box[..., Y]
+        return x * cos + y * sin, y * cos - x * sin
+
+    enters, leaves = None, None
+    halves = (box[..., LENGTH] / 2, box[..., WIDTH] / 2)
+    for begin, stop, half in zip(turned(start), turned(end), halves, strict=True):
+        way = stop - begin
+        way = xp.where(abs(way) < 1e-9, xp.full_like(way, 1e-9), way)
+        first, second = (-half - begin) / way, (half - begin) / way
+        low, high = xp.minimum(first, second), xp.maximum(first, second)
+        enters = xp.maximum(low, xp.zeros_like(low)) if enters is None else xp.maximum(enters, low)
+        leaves = xp.minimum(high, xp.ones_like(high)) if leaves is None else xp.minimum(leaves, high)
+    return enters, leaves
+
+
 def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:
     """First time at which two boxes overlap at constant velocities and fixed headings, in closed form.
 

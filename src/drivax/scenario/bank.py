@@ -63,6 +63,7 @@ class ScenarioBank:
         log_ahead: Distance that the logged ego still drives.
         road: Observation pieces in order of rank: x, y, direction, length, layer (``ROAD_LANE``, ...), limit (-1).
         road_at: What decides which of them are seen: x, y, layer.
+        road_curvature: Turn of each piece per metre, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
         paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
@@ -92,6 +93,7 @@ class ScenarioBank:
     log_ahead: Float[Array, "N T"]
     road: Float[Array, "N O 7"]
     road_at: Float[Array, "N 3 O"]
+    road_curvature: Float[Array, "N O"]
     flags: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
     cell_m: float = static()
@@ -343,9 +345,9 @@ def _stack_maps(
 def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     rows = _column(scenarios, "road_rows").astype(np.int32)
     used = max(1, int(rows.max())) if trim else scenarios[0].capacity.road_rows
-    xy, direction, length, kind, limit = (
+    xy, direction, length, kind, limit, curvature = (
         _column(scenarios, f"road_{name}")[:, :used]
-        for name in ("xy", "direction", "length", "kind", "limit")
+        for name in ("xy", "direction", "length", "kind", "limit", "curvature")
     )
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
     there = np.arange(used) < rows[:, None]
@@ -354,6 +356,7 @@ def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarr
     return {
         "road": np.concatenate(columns, -1, dtype=np.float32),
         "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1, dtype=np.float32),
+        "road_curvature": curvature.astype(np.float32),
     }
 
 
