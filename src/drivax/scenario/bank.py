@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.angles import wrap
+from drivax.scenario.lane_codes import lane_codes
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
 
@@ -55,6 +56,7 @@ class ScenarioBank:
         edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
         lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
             added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
+        lane_codes: Strand, neighbours and end of every lane of the graph (``scenario.lane_codes``).
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.sides.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
@@ -80,6 +82,7 @@ class ScenarioBank:
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
     lanes: Float[Array, "N 8 C"]
+    lane_codes: Float[Array, "N G 6"]
     grid_edge: Int[Array, "N cells1"]
     grid_lane: Int[Array, "N cells1"]
     grid_side: Int[Array, "N cells"]
@@ -328,9 +331,11 @@ def _stack_maps(
         points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
+    graphs = max(1, _used(_column(scenarios, "lane_length") > 0, trim))
     arrays = {
         "edges": edges,
         "lanes": lanes,
+        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, :graphs],
         "grid_edge": grid_edge,
         "grid_lane": grid_lane,
         "grid_side": _column(scenarios, "grid_side"),

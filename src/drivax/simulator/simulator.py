@@ -184,8 +184,12 @@ class Simulator:
         seen = self.now(bank, state.scene) if seen is None else seen
         moved = self._move(bank, state.scene, seen, action, None)
         scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
+        facts = state.facts
+        if facts.strand is not None:  # asked for
+            facts = replace(facts, strand=jnp.where(over, jnp.int16(-1), facts.strand))
         before = replace(
             state,
+            facts=facts,
             contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
             lights=jax.tree.map(partial(jnp.where, over), remember_lights(bank, fresh), state.lights),
             start=jnp.where(over, fresh.step, state.start),
@@ -233,7 +237,7 @@ class Simulator:
         """Measures an agent after everyone has moved on from a frame, and turns the step into a transition."""
         now = self.frame(bank, moved, cast, 0)
         found, contacts, lights = measure(
-            bank, moved, now, seen, before.contacts, before.lights, self.task.reads
+            bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
         terminated, truncated = self.task.ended(bank, found.scene, found.facts)
         terms = self.task.reward(before.facts, found.facts, found.surroundings)
