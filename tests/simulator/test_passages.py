@@ -25,7 +25,7 @@ from metric_scenes import two_way_road
 from scenes import LANE_M, car, line, straight_road
 
 T = (np.arange(STEPS) - 10) * 0.1
-SIZE = replace(CAPACITIES["default"], agents=2, parked=2, road_rows=128, lights=2)
+SIZE = replace(CAPACITIES["default"], agents=2, parked=2, lights=2)
 SIMULATOR = Simulator(Task(rewards=RewardConfig(preset="aggressive"), metrics="none", ends=()))
 
 

@@ -68,6 +68,7 @@ class ScenarioBank:
         flags: ``scenario.schema.Flag`` bits.
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
         paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
+        driver: Planner that drives others than ego (``planners.driven.with_driver``), None where nobody does.
         given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
@@ -104,6 +105,7 @@ class ScenarioBank:
     trimmed: bool = static()
     paths: Any = None
     given: Any = None
+    driver: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
