@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
-from drivax.planners.planner import Memoryless
+from drivax.planners.planner import Memoryless, Planner
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import AgentKind
@@ -134,7 +134,7 @@ class PlannerTraffic:
         return jnp.where(far, here.shape[0], order).astype(jnp.int32)
 
 
-def with_driver(bank: ScenarioBank, driver: Any) -> ScenarioBank:
+def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:
     """The bank with a planner that drives others than ego in :class:`PlannerTraffic`.
 
     Raises:

@@ -15,7 +15,7 @@ from drivax.scenario.bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import nothing_crossed, remember_lights
-from drivax.simulator.situation import measure, surroundings
+from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.together import is_driven
 from drivax.simulator.traffic import LogTraffic, alone, frame_of
@@ -184,12 +184,9 @@ class Simulator:
         seen = self.now(bank, state.scene) if seen is None else seen
         moved = self._move(bank, state.scene, seen, action, None)
         scene = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, moved)
-        facts = state.facts
-        if facts.strand is not None:  # asked for
-            facts = replace(facts, strand=jnp.where(over, jnp.int16(-1), facts.strand))
         before = replace(
             state,
-            facts=facts,
+            facts=forget_strand(state.facts, over),
             contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
             lights=jax.tree.map(partial(jnp.where, over), remember_lights(bank, fresh), state.lights),
             start=jnp.where(over, fresh.step, state.start),

@@ -77,11 +77,9 @@ def measure(
         The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
     """
     around = surroundings(bank, scene, frame)
-    lanes, route, me = around.lanes, around.route, frame.box[scene.slot]
-    ground = _ground(bank, scene, frame)
+    lanes, route, me, ground = around.lanes, around.route, frame.box[scene.slot], _ground(bank, scene, frame)
     beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
-    half = bank.agent_box[scene.index, scene.slot, 2] / 2
-    z = jnp.where(lanes.near, lanes.z + half, frame.z[scene.slot])
+    z = jnp.where(lanes.near, lanes.z + bank.agent_box[scene.index, scene.slot, 2] / 2, frame.z[scene.slot])
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
     codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
@@ -119,6 +117,15 @@ def measure(
         **_requested(bank, scene, frame, codes, reads, strand),
     )
     return Situation(scene, _kept(facts, reads), around), codes, lights
+
+
+def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
+    """The same facts, without where the agent came from if its episode is ``over``."""
+
+    def forget(path: tuple[Any, ...], fact: Array) -> Array:
+        return jnp.where(over, jnp.int16(-1), fact) if path[0].name == "strand" else fact
+
+    return jax.tree_util.tree_map_with_path(forget, facts)
 
 
 def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings:

@@ -99,10 +99,10 @@ class Facts:
     lateral_acceleration_mps2: Float[Array, "*batch"]
     acceleration_mps2: Float[Array, "*batch"]
     jerk_mps3: Float[Array, "*batch"]
-    gap_m: Float[Array, "*batch"]
-    strand: Int[Array, "*batch"]
-    lane_changed: Bool[Array, "*batch"]
-    merged: Bool[Array, "*batch"]
+    gap_m: Any = None
+    strand: Any = None
+    lane_changed: Any = None
+    merged: Any = None
 
 
 #: Facts that few look at, measured only where they are asked for by name.
