@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from drivax.geometry.vectors import root
+
 #: Corners in units of half length and half width: front left, front right, rear right, rear left.
 _CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0))
 X, Y, COS, SIN, LENGTH, WIDTH = range(6)
@@ -79,6 +81,27 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
         enters = xp.maximum(low, xp.zeros_like(low)) if enters is None else xp.maximum(enters, low)
         leaves = xp.minimum(high, xp.ones_like(high)) if leaves is None else xp.minimum(leaves, high)
     return enters, leaves
+
+
+def gap(a: Any, b: Any) -> Any:
+    """Smallest distance between two boxes, m; 0 where they overlap.
+
+    Of two convex polygons that are apart, a corner of one of them is nearest to the other.
+    """
+    xp = a.__array_namespace__()
+    nearest = xp.minimum(_nearest_corner(a, b), _nearest_corner(b, a))
+    return root(xp.where(overlap(a, b), xp.zeros_like(nearest), nearest))
+
+
+def _nearest_corner(box: Any, other: Any) -> Any:
+    """Squared distance of the corner of ``other`` that is nearest to ``box``, which is filled."""
+    xp = box.__array_namespace__()
+    points, box = corners(other), box[..., None, :]
+    dx, dy = points[..., 0] - box[..., X], points[..., 1] - box[..., Y]
+    ahead, left = dx * box[..., COS] + dy * box[..., SIN], dy * box[..., COS] - dx * box[..., SIN]
+    beyond = xp.maximum(abs(ahead) - box[..., LENGTH] / 2, xp.zeros_like(ahead))
+    beside = xp.maximum(abs(left) - box[..., WIDTH] / 2, xp.zeros_like(left))
+    return xp.min(beyond * beyond + beside * beside, axis=-1)
 
 
 def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.angles import wrap
+from drivax.scenario.lane_codes import lane_codes
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
 
@@ -55,6 +56,7 @@ class ScenarioBank:
         edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
         lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
             added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
+        lane_codes: Strand, neighbours and end of every lane of the graph (``scenario.lane_codes``).
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.sides.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
@@ -67,6 +69,7 @@ class ScenarioBank:
         flags: ``scenario.schema.Flag`` bits.
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
         paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
+        driver: Planner that drives others than ego (``planners.driven.with_driver``), None where nobody does.
         given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
@@ -81,6 +84,7 @@ class ScenarioBank:
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
     lanes: Float[Array, "N 8 C"]
+    lane_codes: Float[Array, "N G 6"]
     grid_edge: Int[Array, "N cells1"]
     grid_lane: Int[Array, "N cells1"]
     grid_side: Int[Array, "N cells"]
@@ -103,6 +107,7 @@ class ScenarioBank:
     trimmed: bool = static()
     paths: Any = None
     given: Any = None
+    driver: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -330,9 +335,11 @@ def _stack_maps(
         points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
+    graphs = max(1, _used(_column(scenarios, "lane_length") > 0, trim))
     arrays = {
         "edges": edges,
         "lanes": lanes,
+        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, :graphs],
         "grid_edge": grid_edge,
         "grid_lane": grid_lane,
         "grid_side": _column(scenarios, "grid_side"),
