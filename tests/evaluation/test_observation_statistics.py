@@ -17,8 +17,8 @@ from drivax.evaluation.observation_statistics import (
     look_at,
     observation_statistics,
 )
-from drivax.planners.planner import Memoryless
 from drivax.evaluation.rollout import judging
+from drivax.planners.planner import Memoryless
 from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
 from drivax.simulator.simulator import Simulator

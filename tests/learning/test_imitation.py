@@ -1,4 +1,4 @@
-"""Cloning against NumPy, and warm starts: what each phase changes, and how imitation fades."""
+"""Cloning against NumPy, and imitation beside learning by reward."""
 
 from dataclasses import dataclass, replace
 
@@ -10,11 +10,9 @@ from scipy import stats
 
 from drivax.errors import UsageError
 from drivax.learning.imitation import BcConfig, Cloning
-from drivax.learning.loop import logged
 from drivax.learning.ppo import PpoConfig
-from drivax.learning.replay import ReplayConfig
 from drivax.learning.sac import SacConfig
-from drivax.learning.warm_start import BcPpoConfig, BcSacConfig, WarmStart
+from drivax.learning.warm_start import BcPpoConfig, WarmStart
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Grid, SquashedGaussian
 from drivax.networks.encoders import MlpConfig
@@ -22,16 +20,6 @@ from pendulum import Demonstrations, Pendulum
 
 TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 CLONING = Cloning(batch=16, updates=3)
-SAC = SacConfig(
-    network=TINY,
-    replay=ReplayConfig(64),
-    environments=2,
-    unroll=4,
-    updates_per_step=1,
-    batch=8,
-    warm_up=8,
-    explore="policy",
-)
 PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
 
 
@@ -113,34 +101,6 @@ def test_a_grid_and_missing_experts_are_refused(shown):
         SacConfig(network=network)
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
-def test_a_warm_start_clones_and_then_learns(shown, algorithm):
-    start = WarmStart(iterations=2, cloning=CLONING, weight=0.5, half_life=3)
-    both = {"sac": BcSacConfig(warm_start=start, sac=SAC), "ppo": BcPpoConfig(warm_start=start, ppo=PPO)}
-    learner = both[algorithm].build(Pendulum(), shown, 4)
-    state = jax.jit(learner.init)(shown, jax.random.key(0))
-    iterate = jax.jit(learner.iterate)
-    rows, states = [], [state]
-    for _ in range(4):
-        state, raw = iterate(shown, state)
-        states.append(state)
-        rows.append(logged(raw))
-    cloned, learned = rows[:2], rows[2:]
-    first, second = jax.device_get((states[0], states[2]))
-    # Cloning moves the policy alone, and logs nothing of what it did not do.
-    np.testing.assert_array_equal(first.learner.environments.over, second.learner.environments.over)
-    same = jax.tree.map(np.array_equal, first.learner.optimiser, second.learner.optimiser)
-    assert all(jax.tree.leaves(same))
-    assert not any(name.startswith("reward/") for row in cloned for name in row)
-    assert cloned[1]["loss/imitation"] < cloned[0]["loss/imitation"]
-    assert "loss/policy" not in cloned[0] and "loss/policy" in learned[-1]
-    assert "reward/swing" in learned[0] and "loss/imitation" in learned[-1]
-    assert int(state.iteration) == 4
-    # Learning goes on from the clone, and the environments with it.
-    final = jax.device_get(states[-1])
-    assert not np.array_equal(first.learner.environments.state.angle, final.learner.environments.state.angle)
-
-
 def test_imitation_fades():
     weights = [float(WarmStart(weight=0.8, half_life=10).weight_at(jnp.asarray(i))) for i in (0, 10, 30)]
     np.testing.assert_allclose(weights, [0.8, 0.4, 0.1], rtol=1e-6)
@@ -149,6 +109,7 @@ def test_imitation_fades():
         WarmStart(weight=-1.0)
 
 
+@pytest.mark.slow
 def test_imitation_beside_pulls_the_policy_toward_the_expert(shown):
     """From the same clone, learning by reward with a large weight stays nearer to the expert than without."""
     errors = {}

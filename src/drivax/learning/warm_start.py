@@ -129,7 +129,7 @@ class WarmStartState:
 
     Attributes:
         parameters: The policy's, and what belongs to it in the learner's state.
-        learner: The learner's state but for its parameters and iteration.
+        learner: The learner's state, which counts its own iterations, but for its parameters.
         optimiser: Of cloning.
         iteration: Iterations done, cloning included.
     """
@@ -152,7 +152,8 @@ class WarmStarted:
     def init(self, data: Any, key: Array) -> WarmStartState:
         """The state before the first iteration."""
         learner = self.online.init(data, key)
-        return self._apart(learner, self.optimiser.init(learner.parameters), learner.iteration)
+        optimiser = self.optimiser.init(learner.parameters)
+        return self._apart(learner, optimiser, jnp.zeros((), jnp.int32))
 
     def planner(self, parameters: Any, name: str, samples: bool) -> Planner:
         """The policy as a planner."""
@@ -187,14 +188,13 @@ class WarmStarted:
 
     def _learn(self, data: Any, state: WarmStartState) -> tuple[WarmStartState, dict[str, Array]]:
         """An iteration of the learner, with the imitation's loss while that has a weight."""
-        since = state.iteration - self.config.iterations
-        weight, imitation = self.config.weight_at(since), self._imitation(data)
+        weight, imitation = self.config.weight_at(state.learner.iteration), self._imitation(data)
 
         def also(parameters: Any, key: Array) -> tuple[Array, dict[str, Array]]:
             loss, logs = imitation(parameters, key)
             return weight * loss, logs
 
-        learner = replace(state.learner, parameters=state.parameters, iteration=since)
+        learner = replace(state.learner, parameters=state.parameters)
         after, logs = self.online.iterate(data, learner, also if self.config.weight else None)
         return self._apart(after, state.optimiser, state.iteration + 1), _counted(logs)
 
@@ -207,7 +207,7 @@ class WarmStarted:
         return loss
 
     def _apart(self, learner: Any, optimiser: Any, iteration: Array) -> WarmStartState:
-        rest = replace(learner, parameters=(), iteration=())
+        rest = replace(learner, parameters=())
         return WarmStartState(learner.parameters, rest, optimiser, iteration)
 
 
