@@ -66,6 +66,18 @@ class WarmStart:
         if min(self.iterations, self.half_life) < 0 or self.weight < 0.0:
             raise UsageError("a warm start has negative settings", cure="use 0 or more")
 
+    def rest(self, iterations: int) -> int:
+        """How many iterations of a run are left to learn by reward.
+
+        Raises:
+            UsageError: None.
+        """
+        if iterations <= self.iterations:
+            raise UsageError(
+                f"all {iterations} iterations clone", cure="raise total_steps, or lower warm_start.iterations"
+            )
+        return iterations - self.iterations
+
     def weight_at(self, iteration: Int[Array, ""]) -> Float[Array, ""]:
         """The weight so many iterations after cloning."""
         if not self.half_life:
@@ -94,7 +106,7 @@ class BcSacConfig:
     def build(self, environment: Environment, data: Any, iterations: int) -> WarmStarted:
         """Cloning, then SAC."""
         refuse_flat(self.warm_start.cloning, self.sac.network)
-        online = self.sac.build(environment, data, iterations - self.warm_start.iterations)
+        online = self.sac.build(environment, data, self.warm_start.rest(iterations))
         return WarmStarted(self.warm_start, online, environment)
 
 
@@ -119,7 +131,7 @@ class BcPpoConfig:
     def build(self, environment: Environment, data: Any, iterations: int) -> WarmStarted:
         """Cloning, then PPO."""
         refuse_flat(self.warm_start.cloning, self.ppo.network)
-        online = self.ppo.build(environment, data, iterations - self.warm_start.iterations)
+        online = self.ppo.build(environment, data, self.warm_start.rest(iterations))
         return WarmStarted(self.warm_start, online, environment)
 
 
