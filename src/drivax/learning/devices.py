@@ -18,7 +18,7 @@ from drivax.errors import UsageError
 _AXIS = "devices"
 
 
-def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[jax.Device]:
+def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[Any]:
     """The devices that a run uses.
 
     Args:
@@ -46,7 +46,7 @@ def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[jax.Devi
     raise UsageError(f"{what} cannot be divided among {count} devices", cure=cure)
 
 
-def mesh_of(devices: Sequence[jax.Device]) -> Mesh:
+def mesh_of(devices: Sequence[Any]) -> Mesh:
     """The devices in a row."""
     return Mesh(np.array(devices), (_AXIS,))
 
@@ -58,9 +58,7 @@ def layout(mesh: Mesh, agents: int, state: Any) -> Any:
     def place(axis: int | None) -> NamedSharding:
         if by_agents:
             axis = 0
-        return NamedSharding(
-            mesh, PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS)
-        )
+        return NamedSharding(mesh, PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS))
 
     places = [place(axis) for _, axis in _divisible(state, agents)]
     return jax.tree.unflatten(jax.tree.structure(state), places)

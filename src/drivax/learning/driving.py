@@ -7,10 +7,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
+from drivax.learning.branches import in_any
 from drivax.learning.environment import Environments, Outcome
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
@@ -175,23 +175,9 @@ def _totals(
             sums[f"{name}/n"] = counts.sum().astype(jnp.float32)
         return sums
 
-    # Most steps end no episode; the branch is on the whole batch, so it really is skipped.
+    # Most steps end no episode; the branch is on all batches of the program, so it really is skipped.
     nothing = {name: jnp.zeros(()) for metric in logged for name in (metric, f"{metric}/n")}
-    totals: dict[str, Any] = jax.lax.cond(_any(done), of_episodes, lambda: nothing)
+    totals: dict[str, Any] = jax.lax.cond(in_any(done), of_episodes, lambda: nothing)
     for name, term in terms.items():
         totals[f"reward/{name}"] = jnp.sum(jnp.where(over, 0.0, term))
     return totals
-
-
-@custom_vmap
-def _any(done: Bool[Array, " B"]) -> Bool[Array, ""]:
-    """Whether any is true; of several learners side by side in any of them.
-
-    Without that a branch on it would be one per learner, and under ``vmap`` both sides of every branch are computed.
-    """
-    return done.any()
-
-
-@_any.def_vmap
-def _any_of_all(axis_size: int, in_batched: Any, done: Bool[Array, "*batch"]) -> tuple[Bool[Array, ""], bool]:
-    return _any(done.reshape(-1)), False

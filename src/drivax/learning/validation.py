@@ -63,7 +63,11 @@ def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
     Returns:
         None where the row holds no validation.
     """
-    seen = {name.removeprefix("validation/"): value for name, value in row.items() if name.startswith("validation/")}
+    seen = {
+        name.removeprefix("validation/"): value
+        for name, value in row.items()
+        if name.startswith("validation/")
+    }
     if not seen:
         return None
     if rule == "score":
