@@ -1,7 +1,7 @@
 """Pendulum swing-up as an environment: a control task whose known results judge the algorithms.
 
-Dynamics, observation and reward are those of Gymnasium's ``Pendulum-v1`` (tested against it step by step); written here
-from its documented equations: ``theta'' = 3 g / (2 l) sin(theta) + 3 / (m l^2) u``, semi-implicit Euler of 0.05 s, costs
+Dynamics, observation and reward are those of Gymnasium's ``Pendulum-v1`` (tested against it step by step), from its
+documented equations: ``theta'' = 3 g / (2 l) sin(theta) + 3 / (m l^2) u``, semi-implicit Euler of 0.05 s, costs
 ``theta^2 + 0.1 theta'^2 + 0.001 u^2``, 200 steps.
 """
 

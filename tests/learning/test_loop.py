@@ -67,7 +67,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
             np.testing.assert_allclose(one, other, rtol=1e-6)
     bank = ScenarioBank.from_scenarios(data)
     assert load_policy(inside[0], bank)[1] == config.task
-    with pytest.raises(UsageError, match="holds 3 agents; name one of them, as .*seed-4"):
+    with pytest.raises(UsageError, match=r"holds 3 agents; name one of them, as .*seed-4"):
         load_policy(folder.path, bank)
     _, trainings = read_runs([folder.path])
     assert [training.name for training in trainings] == ["seed-4", "seed-5", "seed-6"]
@@ -99,7 +99,7 @@ def test_learning_stops_when_patience_is_up(data, config, tmp_path):
         about = json.loads((path / "checkpoints" / "step-000000030" / "about.json").read_text())
         row = rows[-1]
         wanted = [row[f"validation/{name}"] for name in ("accuracy", "progress_ratio", "comfortable")]
-        assert about["score"] == wanted and all(0.0 <= value for value in wanted)
+        assert about["score"] == wanted and all(value >= 0.0 for value in wanted)
     # Nothing is left to do, and resuming does nothing.
     train(patient, data, tmp_path / "run", validation=data, resume=True)
     assert [row["step"] for row in read_rows(run.path / "seed-4" / "metrics.jsonl")] == [10, 20, 30]

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from drivax import settings
+from drivax.errors import UsageError
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions
 from drivax.networks.encoders import MlpConfig, group_spec
+from drivax.networks.entity import EntityConfig
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
 SMALL = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,))
 LEVELS = ((-1.0, 0.0, 1.0), (-1.0, -0.5, 0.0, 0.5, 1.0))
@@ -115,3 +119,50 @@ def test_twin_critics_share_nothing_and_can_be_negative():
     assert reached[0] > 0 and reached[1] == 0
     by_action = jax.grad(lambda a: twins(one, a)[0])(action)
     assert float(jnp.abs(by_action).min()) > 0
+
+
+def load(text):
+    return settings.load(NetworkConfig, settings.parse_yaml(text))
+
+
+def test_encoders_in_yaml():
+    assert load("encoder: {kind: lq, size: small}").encoder == LqConfig()
+    assert load("encoder: lqh").encoder == LqhConfig()
+    assert load("encoder: {hidden: [8]}").encoder == MlpConfig(hidden=(8,))
+    wayformer = load(
+        "encoder: {kind: wayformer, size: published, fusion: early, latents: 4, dtype: bfloat16}"
+    ).encoder
+    assert wayformer == WayformerConfig(size="published", fusion="early", latents=4, dtype="bfloat16")
+    assert (wayformer.sizes.width, wayformer.sizes.heads, wayformer.sizes.layers) == (256, 8, 4)
+    for encoder in (
+        wayformer,
+        LqConfig(embedding=()),
+        MtrConfig(layers=1),
+        EntityConfig(goal=("route", "goal")),
+    ):
+        config = NetworkConfig(encoder=encoder, distribution="beta")
+        assert load(settings.dump(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("encoder: {kind: lqq}", r"^encoder: there is no kind 'lqq'; did you mean 'lq'"),
+        (
+            "encoder: {kind: cnn}",
+            r"^encoder: there is no kind 'cnn'; use one of mlp, lq, lqh, mtr, wayformer, entity",
+        ),
+        ("encoder: {kind: lq, size: tiny}", r"^encoder\.size: 'tiny' is none of published, small"),
+        ("encoder: {kind: mtr, latents: 8}", r"^encoder\.latents: there is no such setting"),
+        ("encoder: {kind: lq, width: 10}", r"^encoder: width 10 is no multiple of 4 heads"),
+        (
+            "encoder: {kind: wayformer, fusion: soon}",
+            r"^encoder\.fusion: 'soon' is none of early, late, hier",
+        ),
+        ("distribution: normal", r"^distribution: 'normal' is none of gaussian, beta, grid"),
+        ("first_scale: 0", r"^first_scale is 0; use more than 0"),
+    ],
+)
+def test_mistaken_networks_are_named(text, message):
+    with pytest.raises(UsageError, match=message):
+        load(text)

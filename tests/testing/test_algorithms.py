@@ -100,3 +100,10 @@ def test_ppo_passes():
     check_algorithm(PpoConfig(network=network, environments=4, unroll=4, epochs=1, minibatches=2))
     with_own = replace(network, encoder=own_terms.MeanConfig())
     check_algorithm(PpoConfig(network=with_own, environments=4, unroll=4, epochs=1, minibatches=2))
+
+
+def test_an_own_algorithm_is_short(repository):
+    """The guide's takes at most 80 lines, whole."""
+    guide = (repository / "docs" / "guide" / "custom.md").read_text()
+    (code,) = re.findall(r"```python\n(# my_algorithm.py\n.*?)```", guide, re.S)
+    assert "class ReinforceConfig" in code and len(code.splitlines()) <= 80

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array
 
 from drivax.learning.environment import Environment
 from drivax.planners.planner import Planner
+
+#: A further loss of a policy: from its parameters and a key to the loss, and what to log of it.
+Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
 @runtime_checkable

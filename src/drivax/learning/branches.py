@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool
 def in_any(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
     """Whether it holds anywhere: in the batch, and under ``vmap`` in any learner.
 
-    ``jax.lax.cond`` on a condition per learner would compute both sides of every branch; on this one it branches. Learners
-    that train side by side are in the same iteration, so phases of a run lose nothing by it.
+    ``jax.lax.cond`` on a condition per learner would compute both sides of every branch; on this one it branches.
+    Learners that train side by side are in the same iteration, so phases of a run lose nothing by it.
     """
     return condition.any()
 

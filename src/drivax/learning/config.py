@@ -7,14 +7,20 @@ from dataclasses import dataclass, field
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
 from drivax.learning.driving import Driving
+from drivax.learning.imitation import BcConfig
 from drivax.learning.ppo import PpoConfig
+from drivax.learning.sac import SacConfig
 from drivax.learning.validation import Rule
+from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.catalogue import make_traffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
+
+#: What ``algorithm`` can be: ``kind: ppo``, ``sac``, ``bc``, ``bc_ppo``, ``bc_sac``, or one's own.
+Algorithm = PpoConfig | SacConfig | BcConfig | BcPpoConfig | BcSacConfig | AlgorithmConfig
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,7 @@ class TrainConfig:
     total_steps: int = 2_000_000
     seed: int = 0
     task: Task = field(default_factory=lambda: Task(metrics="training"))
-    algorithm: PpoConfig | AlgorithmConfig = field(default_factory=PpoConfig)
+    algorithm: Algorithm = field(default_factory=PpoConfig)
     traffic: str = "log"
     start: LogStart | NoisyStart = field(default_factory=LogStart)
     latest_start: int = CURRENT_STEP

@@ -172,18 +172,20 @@ def _record(
 
 
 def logged(raw: Mapping[str, Any]) -> dict[str, float]:
-    """Means to log from what an iteration gives.
+    """Means to log from the numbers of an iteration.
 
-    Where ``<name>/n`` is given, ``<name>`` is a sum over so many, and is left out where that is 0;
-    ``rollout/reward/<term>`` is a sum over ``rollout/steps`` and becomes ``reward/<term>``.
+    A name with ``<name>/n`` beside it is a sum over so many (episodes that define a metric, updates): its mean is
+    logged, and nothing where there were none. Sums of ``rollout/reward/*`` are over the steps. What else there is
+    is logged as it is.
     """
+    values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
+    steps = values.pop("rollout/steps", 0.0)
     row = {}
-    for name, value in raw.items():
+    for name, value in values.items():
         if name.startswith("rollout/reward/"):
-            row[name.removeprefix("rollout/")] = float(value) / max(float(raw["rollout/steps"]), 1.0)
-        elif f"{name}/n" in raw:
-            if raw[f"{name}/n"] > 0:
-                row[name] = float(value) / float(raw[f"{name}/n"])
-        elif name != "rollout/steps" and not name.endswith("/n"):
-            row[name] = float(value)
+            name, count = name.removeprefix("rollout/"), steps
+        else:
+            count = float(raw.get(f"{name}/n", 1.0))
+        if count > 0:
+            row[name] = value / count
     return row

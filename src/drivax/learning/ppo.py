@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -12,6 +11,7 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
+from drivax.learning.algorithm import Also
 from drivax.learning.collector import Rollout, collect
 from drivax.learning.devices import divided
 from drivax.learning.environment import Environment, Environments
@@ -22,9 +22,6 @@ from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
 from drivax.scenario.record import record
-
-#: A further loss, of parameters and a key, with what to log of it.
-Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
 @dataclass(frozen=True)

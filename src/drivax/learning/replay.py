@@ -4,9 +4,9 @@ A state in log traffic is a tenth of its observation, and what is stored is obse
 driven (design, ideas 1 and 4). The price is that every sampled step is observed twice, before and after; ``store:
 observation`` keeps observations in bfloat16 instead.
 
-Rows are steps of all environments side by side. What row t led to is in the row behind it, the final state of an episode
-in the row that only begins the next one, so nothing is stored twice; the newest row has no row behind it yet and is not
-sampled, and writing over the oldest row leaves none that leads to it.
+Rows are steps of all environments side by side. What row t led to is in the row behind it, the final state of an
+episode in the row that only begins the next one, so nothing is stored twice. The newest row has no row behind it yet
+and is not sampled; writing over the oldest row leaves none that leads to it.
 """
 
 from __future__ import annotations
@@ -132,7 +132,9 @@ def add(replay: Replay, rollout: Rollout) -> Replay:
     if steps > rows:
         raise UsageError(f"{steps} steps for a replay of {rows} rows", cure="give it a larger capacity")
     new = {
-        "stored": rollout.state if rollout.observation is None else _floats(rollout.observation, jnp.bfloat16),
+        "stored": rollout.state
+        if rollout.observation is None
+        else _floats(rollout.observation, jnp.bfloat16),
         "action": rollout.choice,
         "reward": rollout.reward,
         "terminated": rollout.terminated,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -15,18 +14,17 @@ from jaxtyping import Array, Bool
 
 from drivax.errors import UsageError
 from drivax.learning import replay
+from drivax.learning.algorithm import Also
 from drivax.learning.branches import in_any
 from drivax.learning.collector import Actor, collect
 from drivax.learning.environment import Environment, Environments
+from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Replay, ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.temporal_difference import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
 from drivax.scenario.record import record
-
-#: A further loss of the policy: from its parameters and a key to the loss and what to log of it.
-Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,9 @@ class SacConfig:
                 cure=f"set warm_up to {2 * self.environments} or more",
             )
         if self.network.distribution == "grid":
-            raise UsageError("SAC needs a policy with a gradient through its samples", cure="gaussian or beta")
+            raise UsageError(
+                "SAC needs a policy with a gradient through its samples", cure="gaussian or beta"
+            )
 
     @property
     def steps_per_iteration(self) -> int:
@@ -127,10 +127,9 @@ class Sac:
         self.target_entropy = (
             -float(environment.action_size) if config.target_entropy is None else config.target_entropy
         )
-        clip = optax.clip_by_global_norm(config.gradient_norm)
         optimisers = {
-            "policy": optax.chain(clip, optax.adam(config.policy_rate)),
-            "critic": optax.chain(clip, optax.adam(config.critic_rate)),
+            "policy": clipped_adam(config.policy_rate, config.gradient_norm),
+            "critic": clipped_adam(config.critic_rate, config.gradient_norm),
             "temperature": optax.adam(config.temperature_rate),
         }
         self.optimiser = optax.partition(optimisers, Trained("policy", "critic", "temperature"))
@@ -192,7 +191,11 @@ class Sac:
             self.environment, data, state.environments, actor, collect_key, config.unroll, config.replay.store
         )
         kept = replay.add(state.replay, rollout)
-        first = (Trained(state.parameters, state.critic, state.log_temperature), state.target, state.optimiser)
+        first = (
+            Trained(state.parameters, state.critic, state.log_temperature),
+            state.target,
+            state.optimiser,
+        )
 
         @jax.jit  # so that asking for the shapes of what it logs traces nothing a second time
         def learn() -> tuple[tuple[Trained, Any, Any], dict[str, Array]]:
@@ -216,7 +219,7 @@ class Sac:
         return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
     def _actor(self, parameters: Any, explores: Bool[Array, ""]) -> Actor:
-        """Samples the policy; where it ``explores`` before the first update, as configured. The action is the choice."""
+        """Samples the policy, or as configured where it ``explores``; remembers the action as its choice."""
 
         def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
             sample_key, uniform_key = jax.random.split(key)

@@ -1,14 +1,14 @@
 """Warm starts: clone the expert first, then learn on from that policy by reward, with imitation fading out.
 
-One learner for every algorithm that learns on: it is given the algorithm's own learner, and adds a phase before it and a
-loss beside its policy's.
+One learner for every algorithm that learns on: it is given the algorithm's own learner, and adds a phase before it and
+a loss beside its policy's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from drivax.planners.planner import Planner
 from drivax.scenario.record import record
 
 
+@runtime_checkable
 class Online(Protocol):
     """A learner that can learn on from a policy: its state has ``parameters``, ``key`` and ``iteration``."""
 
@@ -128,7 +129,7 @@ class WarmStartState:
 
     Attributes:
         parameters: The policy's, and what belongs to it in the learner's state.
-        learner: The learner's state but for its parameters and iteration.
+        learner: The learner's state, which counts its own iterations, but for its parameters.
         optimiser: Of cloning.
         iteration: Iterations done, cloning included.
     """
@@ -151,7 +152,8 @@ class WarmStarted:
     def init(self, data: Any, key: Array) -> WarmStartState:
         """The state before the first iteration."""
         learner = self.online.init(data, key)
-        return self._apart(learner, self.optimiser.init(learner.parameters), learner.iteration)
+        optimiser = self.optimiser.init(learner.parameters)
+        return self._apart(learner, optimiser, jnp.zeros((), jnp.int32))
 
     def planner(self, parameters: Any, name: str, samples: bool) -> Planner:
         """The policy as a planner."""
@@ -165,7 +167,9 @@ class WarmStarted:
             def run() -> tuple[Any, dict[str, Array]]:
                 after, logs = phase(data, state)
                 # What only the other phase logs was measured no time in this one.
-                other = {name: jnp.zeros(leaf.shape, leaf.dtype) for part in names for name, leaf in part.items()}
+                other = {
+                    name: jnp.zeros(leaf.shape, leaf.dtype) for part in names for name, leaf in part.items()
+                }
                 return after, other | logs
 
             return run
@@ -184,14 +188,13 @@ class WarmStarted:
 
     def _learn(self, data: Any, state: WarmStartState) -> tuple[WarmStartState, dict[str, Array]]:
         """An iteration of the learner, with the imitation's loss while that has a weight."""
-        since = state.iteration - self.config.iterations
-        weight, imitation = self.config.weight_at(since), self._imitation(data)
+        weight, imitation = self.config.weight_at(state.learner.iteration), self._imitation(data)
 
         def also(parameters: Any, key: Array) -> tuple[Array, dict[str, Array]]:
             loss, logs = imitation(parameters, key)
             return weight * loss, logs
 
-        learner = replace(state.learner, parameters=state.parameters, iteration=since)
+        learner = replace(state.learner, parameters=state.parameters)
         after, logs = self.online.iterate(data, learner, also if self.config.weight else None)
         return self._apart(after, state.optimiser, state.iteration + 1), _counted(logs)
 
@@ -204,7 +207,7 @@ class WarmStarted:
         return loss
 
     def _apart(self, learner: Any, optimiser: Any, iteration: Array) -> WarmStartState:
-        rest = replace(learner, parameters=(), iteration=())
+        rest = replace(learner, parameters=())
         return WarmStartState(learner.parameters, rest, optimiser, iteration)
 
 

@@ -17,14 +17,21 @@ from drivax.networks.distributions import (
     parameters_of,
 )
 from drivax.networks.encoders import (
-    ACTIVATIONS,
-    Activation,
     Encoder,
     EncoderConfig,
     Groups,
     GroupSpec,
     MlpConfig,
     dense_layers,
+)
+from drivax.networks.entity import EntityConfig
+from drivax.networks.pooling import ACTIVATIONS, Activation
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+
+#: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or the
+#: dotted name of one's own.
+EncoderSettings = (
+    MlpConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig | EntityConfig | EncoderConfig
 )
 
 
@@ -42,7 +49,7 @@ class NetworkConfig:
         shared_encoder: Whether policy and value look through one encoder. Critics never share.
     """
 
-    encoder: MlpConfig | EncoderConfig = field(default_factory=MlpConfig)
+    encoder: EncoderSettings = field(default_factory=MlpConfig)
     head: tuple[int, ...] = (64,)
     activation: Activation = "tanh"
     first_scale: float = 0.3
