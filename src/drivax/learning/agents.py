@@ -43,6 +43,11 @@ class Agents:
             return self.learner.iterate(data, state)
         return jax.vmap(self.learner.iterate, (None, 0))(data, state)
 
+    def shapes_of_one(self, shapes: Any) -> Any:
+        """Shapes of the state of one agent, from those of the state of all."""
+        rank = int(self.several)
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[rank:], leaf.dtype), shapes)
+
     def one(self, tree: Any, number: int) -> Any:
         """What belongs to one agent: of its state, a part of it, or what is logged."""
         return jax.tree.map(lambda leaf: leaf[number], tree) if self.several else tree

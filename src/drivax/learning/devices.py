@@ -18,7 +18,7 @@ from drivax.errors import UsageError
 _AXIS = "devices"
 
 
-def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[jax.Device]:
+def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[Any]:
     """The devices that a run uses.
 
     Args:
@@ -46,7 +46,7 @@ def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[jax.Devi
     raise UsageError(f"{what} cannot be divided among {count} devices", cure=cure)
 
 
-def mesh_of(devices: Sequence[jax.Device]) -> Mesh:
+def mesh_of(devices: Sequence[Any]) -> Mesh:
     """The devices in a row."""
     return Mesh(np.array(devices), (_AXIS,))
 

@@ -175,7 +175,7 @@ def _totals(
             sums[f"{name}/n"] = counts.sum().astype(jnp.float32)
         return sums
 
-    # Most steps end no episode; the branch is on the whole batch, so it really is skipped.
+    # Most steps end no episode; the branch is on all batches of the program, so it really is skipped.
     nothing = {name: jnp.zeros(()) for metric in logged for name in (metric, f"{metric}/n")}
     totals: dict[str, Any] = jax.lax.cond(in_any(done), of_episodes, lambda: nothing)
     for name, term in terms.items():

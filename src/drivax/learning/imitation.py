@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment
+from drivax.learning.optimisers import clipped_adam
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
@@ -21,8 +22,6 @@ from drivax.scenario.record import record
 
 #: From parameters and a batch of observations to action distributions.
 Act = Callable[[Any, dict[str, Array]], Distribution]
-#: Learning rates fall linearly to this share over a run.
-_LAST_RATE = 0.1
 
 
 @runtime_checkable
@@ -63,8 +62,7 @@ class Cloning:
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:
         """The optimiser of a run of so many updates."""
-        schedule = optax.linear_schedule(self.learning_rate, _LAST_RATE * self.learning_rate, max(updates, 1))
-        return optax.chain(optax.clip_by_global_norm(self.gradient_norm), optax.adam(schedule))
+        return clipped_adam(self.learning_rate, self.gradient_norm, updates=max(updates, 1))
 
     def of_batch(
         self, act: Act, parameters: Any, environment: Demonstrated, data: Any, key: Array

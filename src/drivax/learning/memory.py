@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ _CURES = {
     "program": "lower algorithm.environments and unroll, or raise algorithm.minibatches",
 }
 #: Fields of a learner's state that have a line of their own.
-_FIELDS = {"replay": "replay", "environments": "environments"}
+_FIELDS = ("replay", "environments")
 _REST = "networks and optimiser"
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
@@ -64,7 +64,7 @@ class MemoryAccount:
 
 
 def account(
-    data: Any, validation: Any, state: Any, compiled: jax.stages.Compiled, device: jax.Device, share: int
+    data: Any, validation: Any, state: Any, compiled: jax.stages.Compiled, devices: Sequence[Any]
 ) -> MemoryAccount:
     """The account of a run.
 
@@ -73,18 +73,19 @@ def account(
         validation: What is validated on, on the first device.
         state: The learners' state: its shapes, with where they lie.
         compiled: One iteration.
-        device: One of the devices.
-        share: How many devices the run has.
+        devices: What it runs on.
     """
     parts = {"scenarios": _bytes(data), "validation": _bytes(validation), "replay": 0, "environments": 0}
     parts[_REST] = 0
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
-        parts[_FIELDS.get(getattr(path[0], "name", "") if path else "", _REST)] += _leaf_bytes(leaf)
+        names = [getattr(key, "name", "") for key in path]
+        parts[next((name for name in names if name in _FIELDS), _REST)] += _leaf_bytes(leaf)
     parts["program"] = _beside(compiled)
-    return MemoryAccount(parts, memory_of(device, share), f"{device.platform}:{device.id}")
+    device = devices[0]
+    return MemoryAccount(parts, memory_of(device, len(devices)), f"{device.platform}:{device.id}")
 
 
-def memory_of(device: jax.Device, share: int = 1) -> int | None:
+def memory_of(device: Any, share: int = 1) -> int | None:
     """Bytes that a device has for us; of a CPU the machine's or the container's memory, divided by ``share``."""
     told = device.memory_stats() or {}
     if "bytes_limit" in told:

@@ -13,7 +13,9 @@ from jaxtyping import Array
 
 from drivax.learning.algorithm import Also
 from drivax.learning.collector import Rollout, collect
+from drivax.learning.devices import divided
 from drivax.learning.environment import Environment, Environments
+from drivax.learning.optimisers import clipped_adam
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
@@ -35,7 +37,8 @@ class PpoConfig:
         gamma, lambda_: Discount, and mixing of advantages.
         clip: Of the probability ratio.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        gradient_norm: Gradients are clipped to this global norm.
+        gradient_norm: Gradients are clipped to this global norm; those of policy and value apart, unless they share an
+            encoder.
     """
 
     kind: Literal["ppo"] = "ppo"
@@ -87,10 +90,12 @@ class Ppo:
     def __init__(self, config: PpoConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config, self.environment = config, environment
         self.spec = environment.shapes(data)
-        updates = iterations * config.epochs * config.minibatches
-        schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
-        self.optimiser = optax.chain(
-            optax.clip_by_global_norm(config.gradient_norm), optax.adam(schedule, eps=1e-5)
+        self.optimiser = clipped_adam(
+            config.learning_rate,
+            config.gradient_norm,
+            updates=max(iterations * config.epochs * config.minibatches, 1),
+            eps=1e-5,
+            apart=not config.network.shared_encoder,
         )
         self.graph = nnx.graphdef(self._network(jax.random.key(0)))
 
@@ -128,7 +133,7 @@ class Ppo:
         Args:
             data: The environment's data.
             state: The state.
-            also: A further loss of the policy.
+            also: A further loss of the parameters, added in every update.
 
         Returns:
             The next state, and sums (``rollout/*``, see ``collector.collect``) and means (``loss/*``) to log.
@@ -144,16 +149,15 @@ class Ppo:
         environments, rollout, totals = collect(
             self.environment, data, state.environments, actor, collect_key, self.config.unroll
         )
-        last = network.value(environments.observation)
-        parameters, optimiser, losses = self._update(state, rollout, last, update_key, also)
+        batch = self._batch(rollout, network.value(environments.observation))
+        parameters, optimiser, losses = self._update(state, batch, update_key, also)
         following = PpoState(parameters, optimiser, environments, key, state.iteration + 1)
         return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
-    def _update(
-        self, state: PpoState, rollout: Rollout, last: Array, key: Array, also: Also | None
-    ) -> tuple[Any, Any, dict[str, Array]]:
-        config = self.config
+    def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
+        """What is learned from, ``[time x batch]``; ``last`` is the value of where the rollout ends."""
         value_t = rollout.extra["value"]
+        # The row behind a truncated step holds its final state, so this is the value that it bootstraps.
         value_tp1 = jnp.concatenate([value_t[1:], last[None]])
         advantage, target = generalised_advantages(
             rollout.reward,
@@ -161,8 +165,8 @@ class Ppo:
             value_tp1,
             rollout.terminated,
             rollout.truncated,
-            config.gamma,
-            config.lambda_,
+            self.config.gamma,
+            self.config.lambda_,
         )
         batch = {
             "observation": rollout.observation,
@@ -172,19 +176,25 @@ class Ppo:
             "target": target,
             "alive": rollout.alive.astype(jnp.float32),
         }
-        batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
-        size = config.steps_per_iteration
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+
+    def _update(
+        self, state: PpoState, batch: dict[str, Any], key: Array, also: Also | None
+    ) -> tuple[Any, Any, dict[str, Array]]:
+        config = self.config
 
         def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
             order_key, noise_key = jax.random.split(key)
-            order = jax.random.permutation(order_key, size).reshape(config.minibatches, -1)
-            return jax.lax.scan(minibatch, carry, (order, jax.random.split(noise_key, config.minibatches)))
+            order = jax.random.permutation(order_key, config.steps_per_iteration)
+            order = order.reshape(config.minibatches, -1)
+            # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
+            shuffled = divided(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
+            return jax.lax.scan(minibatch, carry, (shuffled, jax.random.split(noise_key, config.minibatches)))
 
         def minibatch(
-            carry: tuple[Any, Any], now: tuple[Array, Array]
+            carry: tuple[Any, Any], now: tuple[dict[str, Any], Array]
         ) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            (parameters, optimiser), (rows, key) = carry, now
-            part = jax.tree.map(lambda leaf: leaf[rows], batch)
+            (parameters, optimiser), (part, key) = carry, now
             (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key, also)
             logs["gradient_norm"] = optax.tree.norm(gradient)
             change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
@@ -197,23 +207,24 @@ class Ppo:
     def _loss(
         self, parameters: Any, part: dict[str, Any], key: Array, also: Also | None
     ) -> tuple[Array, dict[str, Array]]:
-        config, network, alive = self.config, self.network(parameters), part["alive"]
+        config, alive = self.config, part["alive"]
+        entropy_key, also_key = jax.random.split(key)
 
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy, value = network.both(part["observation"])
+        policy, value = self.network(parameters).both(part["observation"])
         log_prob = policy.log_prob(part["choice"])
         centre = mean(part["advantage"])
         spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
         advantage = (part["advantage"] - centre) / spread
         policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
         value_loss = mean((value - part["target"]) ** 2)
-        entropy = mean(policy.entropy_estimate(key))
+        entropy = mean(policy.entropy_estimate(entropy_key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
+        further, logs = (0.0, {}) if also is None else also(parameters, also_key)
         ratio = jnp.exp(log_prob - part["log_prob"])
-        further, logs = (0.0, {}) if also is None else also(parameters, jax.random.fold_in(key, 1))
-        logs |= {
+        return total + further, logs | {
             "policy": policy_loss,
             "value": value_loss,
             "entropy": entropy,
@@ -222,4 +233,3 @@ class Ppo:
             "explained_variance": 1.0
             - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
         }
-        return total + further, logs

@@ -12,7 +12,7 @@ and is not sampled; writing over the oldest row leaves none that leads to it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +66,10 @@ class Replay:
         alive: Whether the row is a step; false where it only begins an episode, and where nothing was written yet.
         next_row: Where the next row goes: the oldest, once the ring is full.
         store: What is stored.
+        environment_axis: The axis that counts environments; several devices divide it among them.
     """
+
+    environment_axis: ClassVar[int] = 1
 
     stored: Any
     action: Float[Array, "*batch row environment D"]

@@ -18,6 +18,7 @@ from drivax.learning.algorithm import Also
 from drivax.learning.branches import in_any
 from drivax.learning.collector import Actor, collect
 from drivax.learning.environment import Environment, Environments
+from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Replay, ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions, Distribution
@@ -126,10 +127,9 @@ class Sac:
         self.target_entropy = (
             -float(environment.action_size) if config.target_entropy is None else config.target_entropy
         )
-        clip = optax.clip_by_global_norm(config.gradient_norm)
         optimisers = {
-            "policy": optax.chain(clip, optax.adam(config.policy_rate)),
-            "critic": optax.chain(clip, optax.adam(config.critic_rate)),
+            "policy": clipped_adam(config.policy_rate, config.gradient_norm),
+            "critic": clipped_adam(config.critic_rate, config.gradient_norm),
             "temperature": optax.adam(config.temperature_rate),
         }
         self.optimiser = optax.partition(optimisers, Trained("policy", "critic", "temperature"))
