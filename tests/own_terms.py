@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from drivax.learning.collector import collect, start_environments
+from drivax.learning.collector import collect
 from drivax.metrics.catalogue import Metric
 from drivax.metrics.steps import StepValue
-from drivax.networks.encoders import group_names, group_spec
+from drivax.networks.encoders import group_names
 from drivax.planners.network import NetworkPlanner
 from drivax.planners.planner import Memoryless
 from drivax.scenario.record import record
@@ -125,30 +125,31 @@ class _Action:
     def sample(self, key):
         return self.loc + 0.3 * jax.random.normal(key, self.loc.shape)
 
+    def action(self, choice):
+        return jnp.tanh(choice)
+
     def mode(self):
-        return jnp.tanh(self.loc)
+        return self.action(self.loc)
 
 
 class Reinforce:
     """REINFORCE with the reward to go of the next steps."""
 
-    def __init__(self, config, simulator, bank):
-        self.config, self.simulator = config, simulator
-        self.spec = group_spec(
-            jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank)
-        )
+    def __init__(self, config, environment, data):
+        self.config, self.environment = config, environment
+        self.spec = environment.shapes(data)
         self.graph, _ = nnx.split(_Gauss(self.spec, nnx.Rngs(0)))
         self.optimiser = optax.adam(config.learning_rate)
 
-    def init(self, bank, key):
+    def init(self, data, key):
         key, network, environments = jax.random.split(key, 3)
         parameters = nnx.state(_Gauss(self.spec, nnx.Rngs(network)), nnx.Param)
-        begun = start_environments(self.simulator, bank, environments, self.config.environments)
+        begun = self.environment.start(data, environments, self.config.environments)
         return ReinforceState(
             parameters, self.optimiser.init(parameters), begun, key, jnp.zeros((), jnp.int32)
         )
 
-    def iterate(self, bank, state):
+    def iterate(self, data, state):
         key, collecting = jax.random.split(state.key)
         policy = nnx.merge(self.graph, state.parameters)
 
@@ -157,7 +158,7 @@ class Reinforce:
             return choice, jnp.tanh(choice), {}
 
         begun, rollout, sums = collect(
-            self.simulator, bank, state.environments, actor, collecting, self.config.unroll
+            self.environment, data, state.environments, actor, collecting, self.config.unroll
         )
         gains = jnp.cumsum(rollout.reward[::-1], axis=0)[::-1]
 
@@ -189,8 +190,8 @@ class ReinforceConfig:
     def steps_per_iteration(self):
         return self.environments * self.unroll
 
-    def build(self, simulator, bank, iterations):
-        return Reinforce(self, simulator, bank)
+    def build(self, environment, data, iterations):
+        return Reinforce(self, environment, data)
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,24 @@ class Needy:
             raise UsageError("steps are negative", cure="use 0 or more")
 
 
+@dataclass(frozen=True)
+class Sized:
+    width: int = 8
+    depth: int = 2
+    adam: Adam = field(default_factory=Adam)
+
+    @classmethod
+    def preset(cls, name: str) -> Sized:
+        if name != "large":
+            raise UsageError(f"there is no size {name!r}", cure="use large")
+        return cls(width=99, depth=9, adam=Adam(lr=0.5, clip=1.0))
+
+
+@dataclass(frozen=True)
+class House:
+    rooms: Sized = field(default_factory=lambda: Sized(width=5))
+
+
 def load(text: str, *overrides: str) -> Training:
     return settings.load(Training, settings.parse_yaml(text) or {}, overrides)
 
@@ -304,3 +322,20 @@ def test_a_folder_may_bear_the_name_of_a_preset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo").mkdir()
     assert settings.load(dict, "demo")["total_steps"] > 0
+
+
+def test_a_record_may_start_from_a_preset_of_its_own():
+    def house(text: str, *overrides: str) -> House:
+        return settings.load(House, settings.parse_yaml(text), overrides)
+
+    large = Sized(99, 9, Adam(lr=0.5, clip=1.0))
+    assert house("rooms: {depth: 3}").rooms == Sized(width=5, depth=3)
+    assert house("rooms: {preset: large}").rooms == large
+    changed = house("rooms: {preset: large, depth: 3, adam: {clip: null}}", "--rooms.adam.lr", "0.25")
+    assert changed.rooms == Sized(99, 3, Adam(lr=0.25, clip=None))
+    assert house("{}", "--rooms.preset", "large", "--rooms.width", "4").rooms == Sized(4, 9, large.adam)
+    assert settings.load(Sized, {"preset": "large", "width": 1}) == Sized(1, 9, large.adam)
+    assert settings.load(House, settings.parse_yaml(settings.dump(changed))) == changed
+    assert "preset" not in settings.dump(changed)
+    with pytest.raises(UsageError, match=r"^rooms: there is no size 'huge'; use large$"):
+        house("rooms: {preset: huge}")

@@ -7,6 +7,8 @@ Everything that the command line does can be done from here; names are imported 
 from __future__ import annotations
 
 import importlib
+import os
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -25,6 +27,25 @@ _HOMES = {
     "ScenarioSet": "drivax.scenario.store",
     "Task": "drivax.tasks.task",
 }
+
+#: jaxlib 0.10's CPU client runs the parts of a program on a pool of threads, and in programs that train several agents
+#: side by side one now and then is never woken up again: training hangs for ever. Without its scheduler for concurrency
+#: the parts run one after the other. XLA ends a process that gives a flag it does not know; so the version counts.
+_XLA_FLAG, _XLA_SERIES = "--xla_cpu_enable_concurrency_optimized_scheduler", "0.10."
+
+
+def _avoid_the_hang() -> None:
+    """Sets the flag, unless the user has; before JAX reads it, which is when its backend starts."""
+    given = os.environ.get("XLA_FLAGS", "")
+    try:
+        known = metadata.version("jaxlib").startswith(_XLA_SERIES)
+    except metadata.PackageNotFoundError:
+        return
+    if known and _XLA_FLAG not in given:
+        os.environ["XLA_FLAGS"] = f"{given} {_XLA_FLAG}=false".strip()
+
+
+_avoid_the_hang()
 
 __all__ = ["ScenarioBank", "ScenarioSet", "Task", "evaluate", "load", "make_simulator", "train"]
 

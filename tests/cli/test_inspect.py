@@ -151,10 +151,43 @@ def test_page(sets, inspect, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
+@pytest.mark.slow
+def test_observations(sets, inspect, tmp_path):
+    """Described as a table and as JSON, and drawn; the task is that of a training configuration."""
+    task = "task: {observation: {agents: 2, steps: 2, road: 20, lights: 1, route: 2}}\n"
+    (tmp_path / "lean.yaml").write_text(task)
+    words = (sets[0], "--observations", "--task", tmp_path / "lean.yaml", "--planner", "constant_velocity")
+    out = inspect(*words, "--draw", tmp_path / "seen.png")
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert out.startswith(
+        "32 states of 4 episodes driven by constant_velocity, 0 with a collision; every number is f"
+    )
+    (row,) = [line.split() for line in out.splitlines() if line.startswith("  length ") and "64" in line][:1]
+    # Two steps of every look; all cars are as long, and a policy of no action depends on nothing.
+    assert row == ["length", "72", "0.96", "0.00", "0.96", "0.96"]
+    assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
+    again = inspect(*words, "--draw", tmp_path / "seen.png", status=2)
+    assert "--overwrite" in again and len(again.splitlines()) == 1
+    found = json.loads(inspect(*words, "--json"))
+    assert (found["states"], found["episodes"], found["planner"]) == (32, 4, "constant_velocity")
+    assert {row["group"] for row in found["features"]} == {
+        "ego",
+        "ego_static",
+        "agents",
+        "road",
+        "lights",
+        "route",
+    }
+    assert all(row["broken"] == 0 and row["importance"] is None for row in found["features"])
+
+
 @pytest.mark.parametrize(
     ("words", "said", "status"),
     [
         ([], "no scenario set", 2),
+        (["ONE", "--draw", "x.png"], "--draw needs --observations", 2),
+        (["ONE", "ONE", "--observations"], "one set", 2),
+        (["ONE", "--observations", "--planner", "nobody"], "there is no planner 'nobody'", 2),
         (["ONE", "--json", "--html", "x.html"], "exclude", 2),
         (["gone"], "gone", 1),
     ],

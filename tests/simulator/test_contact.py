@@ -1,16 +1,20 @@
 """Contacts: time to collision against a fine simulation, fault by hand-made scenes, the contact memory."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shapely.geometry import Polygon
 
-from drivax.geometry.boxes import corners, overlap, time_to_overlap
+from drivax.geometry.boxes import corners, gap, overlap, time_to_overlap
 from drivax.simulator.contact import (
     CollisionType,
     Contact,
     first_contacts,
     judge_contacts,
+    nearest_gap,
     next_contacts,
     time_to_collision,
 )
@@ -208,3 +212,33 @@ def test_gradient_of_time_to_overlap_is_finite():
     gradient = jax.grad(lambda v: time_to_overlap(a, v, b, jnp.zeros(2), 5.0))(jnp.array([8.0, 0.0]))
     # d/dv of (15.2 / v)
     np.testing.assert_allclose(gradient[0], -15.2 / 64, rtol=1e-4)
+
+
+def test_gaps_agree_with_polygons():
+    rng = np.random.default_rng(4)
+    pose = rng.uniform([-8, -8, -3, 1, 1], [8, 8, 3, 6, 3], (400, 2, 5))
+    rows = np.array([[box(*p) for p in pair] for pair in pose])
+    expected = [Polygon(rectangle(*a)).distance(Polygon(rectangle(*b))) for a, b in pose]
+    assert min(expected) == 0.0 and max(expected) > 10.0
+    np.testing.assert_allclose(gap(rows[:, 0], rows[:, 1]), expected, atol=1e-9)
+    np.testing.assert_allclose(gap(rows[:, 1], rows[:, 0]), expected, atol=1e-9)
+    cross = np.array(box(0, 0, 0, 10, 1)), np.array(box(0, 0, np.pi / 2, 10, 1))  # no corner in the other
+    assert gap(*cross) == 0.0
+    here = jnp.array(box(0, 0))
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: gap(here, here.at[0].set(x)))))
+    slopes = slope(jnp.array([0.0, 4.8, 5.8, -6.0]))
+    np.testing.assert_allclose(slopes, [0.0, 0.0, 1.0, -1.0], atol=1e-6)
+
+
+def test_the_nearest_gap_is_that_to_the_nearest_who_counts():
+    rows = [box(0, 0), box(8.8, 0), box(0, 3.5), box(-5.8, 0), box(0, -60)]
+    now = frame(rows, [[0, 0]] * 5)
+    none, nearest = jnp.zeros(5, bool), jax.jit(nearest_gap)
+    assert float(nearest(now, jnp.asarray(0), none)) == pytest.approx(1.0)
+    assert float(nearest(now, jnp.asarray(0), none.at[3].set(True))) == pytest.approx(1.5)
+    # From the car ahead: 4 m to the first. Another level, and empty slots, do not count.
+    assert float(nearest(now, jnp.asarray(1), none)) == pytest.approx(4.0)
+    above = replace(now, z=now.z.at[3].set(4.0))
+    assert float(nearest(above, jnp.asarray(0), none)) == pytest.approx(1.5)
+    gone = replace(now, valid=now.valid.at[1:4].set(False), box=now.box.at[1].set(jnp.nan))
+    assert float(nearest(gone, jnp.asarray(0), none)) == 50.0

@@ -10,10 +10,12 @@ from drivax.evaluation.rollout import drive, judging
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
+from drivax.simulator import situation
 from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.simulator import Simulator
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
+from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 from drivax.testing.worlds import padded
 
@@ -62,6 +64,27 @@ def test_the_count_would_see_pairs_of_agents(bank):
     few = operations(bank, Pairs(Task()))
     many = operations(padded(bank, bank.agents.shape[2]), Pairs(Task()))
     assert many - few > 3 * 64 * 64 * 2  # differences and squares of pairs, four times as many
+
+
+def test_what_is_measured_on_request_costs_nothing_where_nobody_asks(bank, monkeypatch):
+    asked = set()
+
+    def noted(name):
+        real = getattr(situation, name)
+
+        def call(*arguments):
+            asked.add(name)
+            return real(*arguments)
+
+        monkeypatch.setattr(situation, name, call)
+
+    noted("lane_passage")
+    noted("nearest_gap")
+    plain = operations(bank, Simulator(Task(rewards=RewardConfig(preset="published"))))
+    assert asked == set()
+    rewards = RewardConfig(preset="published", lane_change=0.2, close=-0.1)
+    assert operations(bank, Simulator(Task(rewards=rewards))) > plain
+    assert asked == {"lane_passage", "nearest_gap"}
 
 
 @pytest.mark.parametrize(("traffic", "most"), [("log", 4096), ("idm", 16384)])

@@ -17,7 +17,7 @@ def look(bank, preset="optimal", step=10):
     return jax.jit(lambda b: simulator.observe(b, simulator.scene(b, 0, step)))(bank)
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize("preset", ["maximal", "minimal", "optimal", "standard"])
 def test_layout(preset):
     config = PRESETS[preset]
     seen = look(bank_of(straight_road([car(0, 0, 0, 9), car(20, 0, 0, 5)], light=RED)), preset)

@@ -10,7 +10,7 @@ import pytest
 
 import own_terms
 from drivax.learning.ppo import PpoConfig
-from drivax.networks.actor_critic import ActorCriticConfig
+from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.simple import ConstantVelocity, RandomActions
 from drivax.scenario.record import record
@@ -36,7 +36,7 @@ class Toy:
     def steps_per_iteration(self):
         return 0 if self.fault == "steps" else 5
 
-    def build(self, simulator, bank, iterations):
+    def build(self, environment, data, iterations):
         return object() if self.fault == "learner" else ToyLearner(self.fault)
 
 
@@ -96,7 +96,14 @@ def test_an_own_algorithm_passes():
 
 @pytest.mark.slow
 def test_ppo_passes():
-    network = ActorCriticConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
+    network = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
     check_algorithm(PpoConfig(network=network, environments=4, unroll=4, epochs=1, minibatches=2))
     with_own = replace(network, encoder=own_terms.MeanConfig())
     check_algorithm(PpoConfig(network=with_own, environments=4, unroll=4, epochs=1, minibatches=2))
+
+
+def test_an_own_algorithm_is_short(repository):
+    """The guide's takes at most 80 lines, whole."""
+    guide = (repository / "docs" / "guide" / "custom.md").read_text()
+    (code,) = re.findall(r"```python\n(# my_algorithm.py\n.*?)```", guide, re.S)
+    assert "class ReinforceConfig" in code and len(code.splitlines()) <= 80

@@ -12,6 +12,8 @@ import own_terms
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.steps import StepValue
 from drivax.networks.encoders import MlpConfig
+from drivax.networks.entity import EntityConfig
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from drivax.tasks.observations import View
 from drivax.tasks.rewards import TERMS
 from drivax.testing import BrokenContract, check_encoder, check_feature, check_metric, check_reward
@@ -139,10 +141,20 @@ def test_an_own_encoder():
     check_encoder("own_terms:MeanConfig")
 
 
+_TINY = {"width": 8, "heads": 2, "layers": 1}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("rows", [(), (8,)])
-def test_our_encoders(rows):
-    check_encoder(MlpConfig(rows=rows, hidden=(8,)))
+@pytest.mark.parametrize(
+    "config",
+    [
+        MlpConfig(rows=(), hidden=(8,)), MlpConfig(rows=(8,), hidden=(8,)), EntityConfig(width=8), LqConfig(**_TINY),
+        LqhConfig(**_TINY), MtrConfig(**_TINY, dtype="bfloat16"), WayformerConfig(**_TINY),
+        WayformerConfig(**_TINY, fusion="early", factorised=True), WayformerConfig(**_TINY, fusion="hierarchical"),
+    ],
+)  # fmt: skip
+def test_our_encoders(config):
+    check_encoder(config)
 
 
 class Wrong(nnx.Module):

@@ -179,3 +179,18 @@ def test_damage_is_told(tmp_path: Path):
     (path / "about.json").write_text("{")
     with pytest.raises(DataError, match=r"about\.json: is damaged"):
         checkpoints.restore(state)
+
+
+def test_scores_of_several_numbers_compare_by_the_first_that_differs(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path, keep=4)
+    for step, score in ((1, (0.5, 0.9)), (2, (0.75, 0.1)), (3, (0.75, 0.05)), (4, (float("nan"), 1.0))):
+        checkpoints.save(step, {"step": step}, score)
+    assert checkpoints.best() == 2 and checkpoints.about(4)["score"] is None
+
+
+def test_later_checkpoints_are_dropped(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path, keep=3)
+    for step in (10, 20, 30):
+        checkpoints.save(step, {"step": step})
+    checkpoints.drop_after(20)
+    assert checkpoints.steps() == [10, 20] and len(list(tmp_path.iterdir())) == 2

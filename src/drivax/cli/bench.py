@@ -1,4 +1,4 @@
-"""``drivax bench``: simulation speed on this machine, by part."""
+"""``drivax bench``: speed on this machine, of simulation by part or of encoders."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from drivax import settings
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
+from drivax.studies.bench_encoders import EncoderBench, bench_encoders
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.progress import Progress
 
@@ -24,6 +25,9 @@ class Bench:
 
     Without --data, scenarios of the built-in world are generated for it. What is simulated can be given behind as
     --task.key VALUE, as --task.metrics training.
+
+    With --encoders, what encoders take instead, on the observation `optimal`, and behind it the settings of that, as
+    --only "[lq small]" --batches "[1, 512]".
 
     Example: drivax bench --batch 512 --json
     """
@@ -38,6 +42,8 @@ class Bench:
     """Timed runs; the median counts."""
     metrics: bool = False
     """Compare the metric sets none, training and full at batch 32, 128 and the best one, instead of parts."""
+    encoders: bool = False
+    """Count the parameters of the encoders and time them, instead of the simulator."""
     traffic: str = "log"
     """How the others move: log, idm, or package.module:name."""
     json: bool = False
@@ -46,6 +52,10 @@ class Bench:
 
 def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Time and print."""
+    if args.encoders:
+        found = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
+        print(json.dumps(found, indent=1) if args.json else _encoders(found))
+        return 0
     given = {"batch": args.batch, "repeats": args.repeats, "traffic": args.traffic}
     config = settings.load(BenchConfig, given, overrides)
     use_all_cores()
@@ -90,4 +100,19 @@ def _sets(result: dict[str, Any]) -> str:
     for row in result["rows"]:
         batch = f"{row['batch']}{' (best)' if row['best'] else ''}"
         lines.append(f"  {row['metrics']:<9} {batch:>12} {row['steps_per_second']:9,} {row['relative']:6.2f}")
+    return "\n".join(lines)
+
+
+def _encoders(result: dict[str, Any]) -> str:
+    batches = list(result["rows"][0]["forward_us"])
+    heads = "".join(f" {f'batch {batch}':>10}" for batch in batches)
+    lines = [
+        f"encoders of an observation on {result['device']}; us per observation: forward, and forward and backward",
+        f"  {'encoder':<30} {'computes in':<11} {'parameters':>10} {'width':>5}{heads} {'backward':>10}",
+    ]
+    for row in result["rows"]:
+        times = "".join(f" {one:10.1f}" for one in (*row["forward_us"].values(), row["gradient_us"]))
+        lines.append(
+            f"  {row['encoder']:<30} {row['dtype']:<11} {row['parameters']:>10,} {row['width']:>5}{times}"
+        )
     return "\n".join(lines)

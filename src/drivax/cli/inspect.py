@@ -11,9 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from drivax.evaluation.observation_statistics import ObservationStatistics
     from drivax.show.inspection import Inspection
 
 _COLUMNS = 100
+#: Scenarios that --observations drives, evenly spread over those that are selected.
+_OBSERVED = 256
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,8 @@ class Inspect:
     Of several sets, one table that compares them.
 
     Example: drivax inspect sets/womd sets/nuplan --filter agents>=20 --html sets.html
+
+    Example: drivax inspect sets/womd --observations --planner runs/ppo --draw seen.png
     """
 
     sets: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
@@ -35,8 +42,16 @@ class Inspect:
     """Write a page with histograms to this file instead of printing tables."""
     no_check: bool = False
     """Leave the checksums untested (testing them reads the whole set)."""
+    observations: bool = False
+    """Describe what a policy observes: every feature's spread, what it has to do with collisions and actions."""
+    planner: str | None = None
+    """Who drives for --observations: a planner or the run folder of a training run; the log by default."""
+    task: str | None = None
+    """Whose observations: a training configuration (file or preset); a run brings its own."""
+    draw: Path | None = None
+    """Also draw what is seen of the first scenario at its current step, into this PNG file."""
     overwrite: bool = False
-    """Replace the file of --html."""
+    """Replace the file of --html or --draw."""
 
 
 def run(args: Inspect) -> int:
@@ -49,9 +64,12 @@ def run(args: Inspect) -> int:
         raise UsageError("no scenario set is named", cure="write drivax inspect SET")
     if args.json and args.html is not None:
         raise UsageError("--json and --html exclude each other", cure="call drivax inspect twice")
+    _refuse_misfits(args)
     selection = Selection.parse(args.filter)
     opened = [Inspection.open(path, selection, not args.no_check) for path in args.sets]
-    if args.json:
+    if args.observations:
+        _observe(args, opened[0])
+    elif args.json:
         found = [{"scenarios": [described(entry) for entry in one.entries]} for one in opened]
         named = [{"set": str(path), **one} for path, one in zip(args.sets, found, strict=True)]
         json.dump(found[0] if len(found) == 1 else named, sys.stdout, indent=1)
@@ -67,12 +85,9 @@ def run(args: Inspect) -> int:
 
 def _print(opened: list[Inspection]) -> None:
     """One set in full, or several side by side."""
-    from rich.console import Console
-
     from drivax.show import inspection_tables as tables
 
-    width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS
-    console = Console(width=width, highlight=False, markup=False)
+    console = _console()
     if len(opened) > 1:
         for table in tables.comparison(opened):
             console.print(table)
@@ -86,3 +101,64 @@ def _print(opened: list[Inspection]) -> None:
     console.print(tables.listing(one))
     if len(one) > tables.LISTED:
         console.print(f"{len(one) - tables.LISTED:,} more; --json lists all")
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    width = min(_COLUMNS, Console().width) if sys.stdout.isatty() else _COLUMNS
+    return Console(width=width, highlight=False, markup=False)
+
+
+def _refuse_misfits(args: Inspect) -> None:
+    from drivax.errors import UsageError
+
+    if args.observations and (len(args.sets) > 1 or args.html is not None):
+        raise UsageError(
+            "--observations describes one set, and makes no page", cure="name one set, and no --html"
+        )
+    for name in ("planner", "task", "draw"):
+        if getattr(args, name) is not None and not args.observations:
+            raise UsageError(f"--{name} needs --observations", cure="add --observations")
+    if args.planner is not None and args.task is not None and Path(args.planner.partition("@")[0]).is_dir():
+        raise UsageError("a trained policy has a task of its own", cure="leave out --task")
+    if args.draw is not None and args.draw.exists() and not args.overwrite:
+        raise UsageError("exists already", file=args.draw, cure="choose another name or pass --overwrite")
+
+
+def _observe(args: Inspect, inspection: Inspection) -> None:
+    """Drive, then print what was observed, and draw it."""
+    from drivax import settings
+    from drivax.api import find_planner
+    from drivax.evaluation.observation_statistics import observation_statistics
+    from drivax.learning.config import TrainConfig
+    from drivax.planners.simple import Expert
+    from drivax.scenario.bank import ScenarioBank
+    from drivax.show.observation_view import draw_moment
+
+    scenarios = list(inspection.sample(_OBSERVED))
+    bank = ScenarioBank.from_scenarios(scenarios)
+    given = None if args.task is None else settings.load(TrainConfig, args.task).task
+    planner, task = find_planner(args.planner or "expert", bank)
+    task = given or task
+    if args.planner is None:
+        planner = Expert(actions=task.actions)
+    found = observation_statistics(planner, bank, task, permute=not planner.replays)
+    if args.json:
+        json.dump(found.as_dict(), sys.stdout, indent=1)
+        print()
+    else:
+        _print_observations(found)
+    if args.draw is not None:
+        title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
+        draw_moment(task, bank, title).savefig(args.draw)
+        print(args.draw, file=sys.stderr if args.json else sys.stdout)
+
+
+def _print_observations(found: ObservationStatistics) -> None:
+    from drivax.show import observation_tables as tables
+
+    console = _console()
+    console.print(tables.observation_overview(found))
+    console.print()
+    console.print(tables.observation_table(found))

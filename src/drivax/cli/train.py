@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from drivax.scenario.store import ScenarioSet
 class Train:
     """Train a policy with reinforcement learning.
 
+    SIGTERM writes a checkpoint and ends the run; --resume goes on from there.
+
     CONFIG is a YAML file or the name of a preset; any of its settings can be given behind as --section.key VALUE.
 
     Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
@@ -32,6 +35,8 @@ class Train:
     """Run folder to write."""
     validation: Path | None = None
     """Scenario set that chooses the best checkpoint."""
+    seeds: int = 1
+    """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
     resume: bool = False
     """Continue the run in OUT from its newest checkpoint."""
     overwrite: bool = False
@@ -51,6 +56,8 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         validation=validation,
         resume=args.resume,
         overwrite=args.overwrite,
+        seeds=args.seeds,
+        say=lambda line: print(line, file=sys.stderr),
     )
     print(f"wrote {folder.path}")
     return 0

@@ -18,6 +18,7 @@ from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.types import SimState
 from drivax.tasks.task import Task
 
 #: What the key of an episode is folded with to draw its start.
@@ -82,13 +83,7 @@ def _episode(
 
     def one(now: Any, key: Array) -> Any:
         state, carry = now
-        situation = simulator.situation(bank, state)
-        observation = simulator.observe(bank, state.scene)
-        action, carry = planner.act(carry, bank, state, situation, observation, key)
-        if planner.replays:
-            state, _ = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        else:
-            state, _ = simulator.step(bank, state, action)
+        state, carry = advanced(simulator, planner, bank, state, carry, key)
         return (state, carry), (state.scene.history[-1], state.facts.offroad)
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
@@ -97,3 +92,15 @@ def _episode(
     return Episodes(
         episode_metrics(bank, final), first_steps(final.episode), motion, offroad.sum().astype(jnp.int32)
     )
+
+
+def advanced(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array
+) -> tuple[SimState, Any]:
+    """State and carry one step later, the planner driving or, where it replays, the log."""
+    situation = simulator.situation(bank, state)
+    observation = simulator.observe(bank, state.scene)
+    action, carry = planner.act(carry, bank, state, situation, observation, key)
+    if planner.replays:
+        return simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)[0], carry
+    return simulator.step(bank, state, action)[0], carry

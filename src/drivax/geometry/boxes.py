@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from drivax.geometry.vectors import root
+
 #: Corners in units of half length and half width: front left, front right, rear right, rear left.
 _CORNERS = ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0))
 X, Y, COS, SIN, LENGTH, WIDTH = range(6)
@@ -49,6 +51,57 @@ def overlap(a: Any, b: Any) -> Any:
         meets = abs(dx * axis_x + dy * axis_y) < reach
         result = meets if result is None else result & meets
     return result
+
+
+def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
+    """Where segments pass through boxes (slab test), as shares of the way from ``start`` to ``end``.
+
+    Args:
+        start: Points ``[..., 2]``.
+        end: Points ``[..., 2]``.
+        box: Boxes ``[..., 6]``.
+
+    Returns:
+        Shares in [0, 1] at which each segment enters and leaves; it passes through where the first is smaller.
+    """
+    xp = box.__array_namespace__()
+    cos, sin = box[..., COS], box[..., SIN]
+
+    def turned(point: Any) -> tuple[Any, Any]:
+        x, y = point[..., 0] - box[..., X], point[..., 1] - box[..., Y]
+        return x * cos + y * sin, y * cos - x * sin
+
+    enters, leaves = None, None
+    halves = (box[..., LENGTH] / 2, box[..., WIDTH] / 2)
+    for begin, stop, half in zip(turned(start), turned(end), halves, strict=True):
+        way = stop - begin
+        way = xp.where(abs(way) < 1e-9, xp.full_like(way, 1e-9), way)
+        first, second = (-half - begin) / way, (half - begin) / way
+        low, high = xp.minimum(first, second), xp.maximum(first, second)
+        enters = xp.maximum(low, xp.zeros_like(low)) if enters is None else xp.maximum(enters, low)
+        leaves = xp.minimum(high, xp.ones_like(high)) if leaves is None else xp.minimum(leaves, high)
+    return enters, leaves
+
+
+def gap(a: Any, b: Any) -> Any:
+    """Smallest distance between two boxes, m; 0 where they overlap.
+
+    Of two convex polygons that are apart, a corner of one of them is nearest to the other.
+    """
+    xp = a.__array_namespace__()
+    nearest = xp.minimum(_nearest_corner(a, b), _nearest_corner(b, a))
+    return root(xp.where(overlap(a, b), xp.zeros_like(nearest), nearest))
+
+
+def _nearest_corner(box: Any, other: Any) -> Any:
+    """Squared distance of the corner of ``other`` that is nearest to ``box``, which is filled."""
+    xp = box.__array_namespace__()
+    points, box = corners(other), box[..., None, :]
+    dx, dy = points[..., 0] - box[..., X], points[..., 1] - box[..., Y]
+    ahead, left = dx * box[..., COS] + dy * box[..., SIN], dy * box[..., COS] - dx * box[..., SIN]
+    beyond = xp.maximum(abs(ahead) - box[..., LENGTH] / 2, xp.zeros_like(ahead))
+    beside = xp.maximum(abs(left) - box[..., WIDTH] / 2, xp.zeros_like(left))
+    return xp.min(beyond * beyond + beside * beside, axis=-1)
 
 
 def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array
 
+from drivax.learning.environment import Environment
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
-from drivax.simulator.simulator import Simulator
+
+#: A further loss of a policy: from its parameters and a key to the loss, and what to log of it.
+Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
 @runtime_checkable
@@ -28,13 +31,13 @@ class LearnerState(Protocol):
 
 @runtime_checkable
 class Learner(Protocol):
-    """An algorithm on one simulator. Holds configuration; everything computed is in the state."""
+    """An algorithm in one environment. Holds configuration; everything computed is in the state."""
 
-    def init(self, bank: ScenarioBank, key: Array) -> Any:
+    def init(self, data: Any, key: Array) -> Any:
         """The state (:class:`LearnerState`) before the first iteration. Pure."""
         ...
 
-    def iterate(self, bank: ScenarioBank, state: Any) -> tuple[Any, dict[str, Array]]:
+    def iterate(self, data: Any, state: Any) -> tuple[Any, dict[str, Array]]:
         """The state after one iteration, and numbers to log by name.
 
         Pure; compiled with the state donated. Names are logged as they are, but for the sums that
@@ -56,6 +59,6 @@ class AlgorithmConfig(Protocol):
         """Environment steps that one iteration counts as."""
         ...
 
-    def build(self, simulator: Simulator, bank: ScenarioBank, iterations: int) -> Learner:
-        """The learner; of the bank only shapes may be looked at, ``iterations`` is the length of the whole run."""
+    def build(self, environment: Environment, data: Any, iterations: int) -> Learner:
+        """The learner; of the data only shapes may be looked at, ``iterations`` is the length of the whole run."""
         ...

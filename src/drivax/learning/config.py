@@ -6,10 +6,21 @@ from dataclasses import dataclass, field
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
+from drivax.learning.driving import Driving
+from drivax.learning.imitation import BcConfig
 from drivax.learning.ppo import PpoConfig
+from drivax.learning.sac import SacConfig
+from drivax.learning.validation import Rule
+from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.catalogue import make_traffic
+from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
+
+#: What ``algorithm`` can be: ``kind: ppo``, ``sac``, ``bc``, ``bc_ppo``, ``bc_sac``, or one's own.
+Algorithm = PpoConfig | SacConfig | BcConfig | BcPpoConfig | BcSacConfig | AlgorithmConfig
 
 
 @dataclass(frozen=True)
@@ -21,22 +32,47 @@ class TrainConfig:
         seed: Of networks, environments and exploration.
         task: Actions, observation, reward, termination, and the metrics that are logged on the way.
         algorithm: What learns, and how.
+        traffic: How the others move, while learning and in validation: ``log``, ``idm``, or ``package.module:name``.
         start: How episodes begin while learning; validation begins as logged.
+        latest_start: Episodes of learning begin at a random step of the log between 10 and this one.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
+        checkpoint_rule: What makes one checkpoint better than another in validation: the ``score``, or
+            ``lexicographic``: fewest failures, then progress, then comfort.
+        patience: Learning stops early after so many validations that were no better than the best; 0: never.
+        devices: How many of this machine's devices to use; None: all of them, as far as agents or their environments
+            divide.
     """
 
     total_steps: int = 2_000_000
     seed: int = 0
     task: Task = field(default_factory=lambda: Task(metrics="training"))
-    algorithm: PpoConfig | AlgorithmConfig = field(default_factory=PpoConfig)
+    algorithm: Algorithm = field(default_factory=PpoConfig)
+    traffic: str = "log"
     start: LogStart | NoisyStart = field(default_factory=LogStart)
+    latest_start: int = CURRENT_STEP
     evaluate_every: int = 0
     checkpoint_every: int = 20
+    checkpoint_rule: Rule = "score"
+    patience: int = 0
+    devices: int | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.task.actions, DirectState):
             raise UsageError("policies cannot learn in direct_state", cure="choose a space in [-1, 1]")
+        if self.evaluate_every < 0 or self.checkpoint_every < 1 or self.patience < 0:
+            raise UsageError(
+                "evaluate_every and patience are at least 0, checkpoint_every is at least 1",
+                cure="use patience 0 to go on to the end",
+            )
+        if self.patience and not self.evaluate_every:
+            raise UsageError("patience needs validations", cure="set evaluate_every")
+        # Refuses a traffic or a step that does not exist before any work is done.
+        self.environment()
+
+    def environment(self) -> Driving:
+        """What is learned in."""
+        return Driving(Simulator(self.task, make_traffic(self.traffic), self.start), self.latest_start)
 
     @property
     def iterations(self) -> int:

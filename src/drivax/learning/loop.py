@@ -1,45 +1,30 @@
-"""The training loop: iterate on the device, log, validate, checkpoint, resume."""
+"""The training loop: iterate on the device, log, validate, checkpoint, stop, resume."""
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.runner import evaluate
-from drivax.learning.algorithm import Learner, LearnerState
+from drivax.learning.agents import Agents
+from drivax.learning.algorithm import LearnerState
 from drivax.learning.config import TrainConfig
+from drivax.learning.folders import create_folders, resumed_folders
+from drivax.learning.journal import Journal
+from drivax.learning.program import Program
+from drivax.learning.stopping import Preempted, StopSignal
+from drivax.learning.validation import Validation, validate
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.simulator import Simulator
-from drivax.tracking.checkpoints import Checkpoints
+from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.tracking.progress import Progress
-from drivax.tracking.runs import RunFolder
-from drivax.tracking.sinks import MetricLog
-
-#: Metrics of a validation that are logged.
-_VALIDATION = ("success", "accuracy", "collision", "offroad", "red_light", "progress_ratio", "comfortable")
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Held-out scenarios that checkpoints are chosen by."""
-
-    bank: ScenarioBank
-    names: Sequence[Mapping[str, str]]
-
-    @classmethod
-    def of(cls, data: ScenarioSet) -> Validation:
-        """From a scenario set."""
-        scenarios = list(data)
-        return cls(ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
+from drivax.tracking.runs import RunFolder, refuse_existing
 
 
 def train(
@@ -50,6 +35,8 @@ def train(
     validation: ScenarioSet | None = None,
     resume: bool = False,
     overwrite: bool = False,
+    seeds: int = 1,
+    say: Callable[[str], None] = lambda line: None,
 ) -> RunFolder:
     """Trains a policy and writes the run folder: config, metrics, checkpoints of the full state.
 
@@ -58,124 +45,147 @@ def train(
         data: Scenarios to train on; all of them are held on the device.
         out: Run folder.
         validation: Scenarios that choose the best checkpoint.
-        resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device.
+        resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device; with the
+            configuration and the seeds that it began with.
         overwrite: Replace an existing run folder.
+        seeds: How many agents to train in one program, with ``config.seed`` and the following ones; of several each
+            has a run folder of its own inside ``out``: ``seed-0``, ``seed-1``, ...
+        say: Called with a line about memory before the start, and one about every agent that stops early.
 
     Raises:
-        UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, or a resumed run was trained
-            on other data.
+        UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on
+            other data, or it does not fit the device's memory.
+        Preempted: If SIGTERM stopped it, after a checkpoint.
     """
-    folder = _open(config, data, validation, Path(out), resume, overwrite)
+    out = Path(out)
+    folders: list[RunFolder] = []
     if resume:
-        config = folder.config(TrainConfig)
-    bank = ScenarioBank.from_scenarios(data)
-    learner = config.algorithm.build(Simulator(config.task, start=config.start), bank, config.iterations)
-    checkpoints = Checkpoints(folder.checkpoints)
-    state = _first_state(learner, bank, config, checkpoints if resume else None)
+        config, folders = resumed_folders(data, validation, out, seeds)
+    else:
+        refuse_existing(out, overwrite)
+    if config.patience and validation is None:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    if seeds < 1:
+        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+    numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
+    environment = config.environment()
+    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     held_out = None if validation is None else Validation.of(validation)
-    begin = int(state.iteration)
-    with (
-        MetricLog(folder.path, resume_step=_steps(config, begin) if resume else None) as log,
-        Progress("training", "steps", _steps(config, config.iterations)) as progress,
-    ):
-        progress.update(_steps(config, begin))
-        _iterate(config, learner, bank, state, _Outputs(log, progress, checkpoints, held_out))
-    return folder
+    learner = config.algorithm.build(environment, bank, config.iterations)
+    program = Program(Agents(learner, numbers), bank, config.devices)
+    memory = program.account(None if held_out is None else held_out.bank)
+    memory.refuse_too_much()
+    say(memory.text())
+    folders = folders or create_folders(config, data, validation, out, numbers, overwrite)
+    with contextlib.ExitStack() as stack:
+        journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
+        _learn(_Run(config, program, journals, held_out, say))
+    return RunFolder.open(out)
 
 
 @dataclass(frozen=True)
-class _Outputs:
-    log: MetricLog
-    progress: Progress
-    checkpoints: Checkpoints
+class _Run:
+    config: TrainConfig
+    program: Program
+    journals: Sequence[Journal]
     validation: Validation | None
+    say: Callable[[str], None]
+
+    def steps(self, iteration: int) -> int:
+        """Environment steps of each agent after so many iterations."""
+        return iteration * self.config.algorithm.steps_per_iteration
 
 
-def _iterate(
-    config: TrainConfig, learner: Learner, bank: ScenarioBank, state: LearnerState, outputs: _Outputs
+def _learn(run: _Run) -> None:
+    """All iterations that are left."""
+    config, program = run.config, run.program
+    begin, state = _begin(run)
+    with Progress("training", "steps", run.steps(config.iterations)) as progress, StopSignal() as stop:
+        progress.update(run.steps(begin))
+        for iteration in range(begin + 1, config.iterations + 1):
+            if all(journal.over for journal in run.journals):
+                break
+            began = time.perf_counter()
+            state, raw = program.step(state)
+            logs = jax.device_get(raw)
+            rate = config.algorithm.steps_per_iteration / (time.perf_counter() - began)
+            # Asked once, so that every agent has a checkpoint of the same iteration.
+            stops = stop.asked and iteration < config.iterations
+            rows = [
+                logged(program.agents.one(logs, number)) | {"steps_per_second": rate}
+                for number in range(len(run.journals))
+            ]
+            _record(run, iteration, state, rows, stops)
+            seen = [row["rollout/success"] for row in rows if "rollout/success" in row]
+            progress.update(run.steps(iteration), f"success {sum(seen) / len(seen):.2f}" if seen else "")
+            if stops:
+                raise Preempted(
+                    f"SIGTERM stopped the training after {run.steps(iteration):,} steps",
+                    cure="continue it with --resume",
+                )
+
+
+def _begin(run: _Run) -> tuple[int, Any]:
+    """Iterations done and the state after them: none, or where the newest checkpoint that all agents have is."""
+    program, journals = run.program, run.journals
+    learning = [set(journal.checkpoints.steps()) for journal in journals if not journal.over]
+    if not learning:
+        return run.config.iterations, None
+    step = max(set.intersection(*learning), default=None)
+    if step is None:
+        for journal in journals:
+            journal.begin(None)
+        return 0, program.first_state()
+    template = program.agents.shapes_of_one(program.shapes)
+    states = []
+    for journal in journals:
+        # An agent that has stopped early stays where it was; its part of the program runs on for nobody.
+        at = journal.newest if journal.over else step
+        journal.begin(at)
+        states.append(journal.checkpoints.restore(template, at))
+    return step // run.config.algorithm.steps_per_iteration, program.state_of(states)
+
+
+def _record(
+    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], stops: bool
 ) -> None:
-    step = jax.jit(learner.iterate, donate_argnums=1)
-    for iteration in range(int(state.iteration) + 1, config.iterations + 1):
-        began = time.perf_counter()
-        state, raw = step(bank, state)
-        row = logged(jax.device_get(raw))
-        row["steps_per_second"] = config.algorithm.steps_per_iteration / (time.perf_counter() - began)
-        done = _steps(config, iteration)
-        last = iteration == config.iterations
-        due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
-        score = None
-        if due and outputs.validation is not None:
-            score, seen = validate(config, learner, state, outputs.validation)
-            row |= seen
-        outputs.log.write(done, row)
-        note = f"success {row.get('rollout/success', float('nan')):.2f}"
-        outputs.progress.update(done, note)
-        if last or due or iteration % config.checkpoint_every == 0:
-            outputs.checkpoints.save(done, state, score)
-
-
-def validate(
-    config: TrainConfig, learner: Learner, state: LearnerState, validation: Validation
-) -> tuple[float, dict[str, float]]:
-    """Closed-loop score of the policy's mode on held-out scenarios, and what to log."""
-    planner = learner.planner(state.parameters, "policy", samples=False)
-    results = evaluate(planner, validation.bank, validation.names, task=config.task)
-    # Full scores where there are any; partial ones are never mixed with them.
-    name = next(n for n in ("vmax_score", "vmax_score_partial") if np.isfinite(results.metrics[n]).any())
-    score = float(np.nanmean(results.metrics[name]))
-    row = {f"validation/{name}": score}
-    for name in _VALIDATION:
-        values = results.metrics[name]
-        if np.isfinite(values).any():
-            row[f"validation/{name}"] = float(np.nanmean(values))
-    return score, row
+    """Writes what one iteration came to of every agent that still learns."""
+    config, agents, done = run.config, run.program.agents, run.steps(iteration)
+    last = iteration == config.iterations
+    due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
+    for number, journal in enumerate(run.journals):
+        if journal.over:
+            continue
+        row = rows[number]
+        if due and run.validation is not None:
+            # The other devices of a run have no part in driving.
+            parameters = jax.device_put(agents.one(state.parameters, number), run.program.devices[0])
+            planner = agents.learner.planner(parameters, "policy", samples=False)
+            row |= validate(planner, run.validation, config.task, make_traffic(config.traffic))
+        found = journal.write(done, row)
+        if last or due or stops or iteration % config.checkpoint_every == 0:
+            journal.save(done, agents.one(state, number), found)
+        if journal.over and not last:
+            run.say(
+                f"seed {agents.seeds[number]}: no better for {config.patience} validations, stopped at {done:,} steps"
+            )
 
 
 def logged(raw: Mapping[str, Any]) -> dict[str, float]:
-    """Means to log from the sums of an iteration: metrics per episode that defines them, rewards per step."""
-    sums = {name.removeprefix("rollout/"): float(v) for name, v in raw.items() if name.startswith("rollout/")}
-    row = {name: float(value) for name, value in raw.items() if not name.startswith("rollout/")}
-    if "episodes" in sums:
-        row["rollout/episodes"] = sums["episodes"]
-    for name, value in sums.items():
-        if name.startswith("reward/"):
-            row[name] = value / max(sums["steps"], 1.0)
-        elif sums.get(f"{name}/n", 0.0) > 0:
-            row[f"rollout/{name}"] = value / sums[f"{name}/n"]
+    """Means to log from the numbers of an iteration.
+
+    A name with ``<name>/n`` beside it is a sum over so many (episodes that define a metric, updates): its mean is
+    logged, and nothing where there were none. Sums of ``rollout/reward/*`` are over the steps. What else there is
+    is logged as it is.
+    """
+    values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
+    steps = values.pop("rollout/steps", 0.0)
+    row = {}
+    for name, value in values.items():
+        if name.startswith("rollout/reward/"):
+            name, count = name.removeprefix("rollout/"), steps
+        else:
+            count = float(raw.get(f"{name}/n", 1.0))
+        if count > 0:
+            row[name] = value / count
     return row
-
-
-def _steps(config: TrainConfig, iteration: int) -> int:
-    return iteration * config.algorithm.steps_per_iteration
-
-
-def _first_state(
-    learner: Learner, bank: ScenarioBank, config: TrainConfig, stored: Checkpoints | None
-) -> LearnerState:
-    if stored is not None and stored.steps():
-        template = jax.eval_shape(learner.init, bank, jax.random.key(config.seed))
-        return stored.restore(template)
-    return jax.jit(learner.init)(bank, jax.random.key(config.seed))
-
-
-def _open(
-    config: TrainConfig,
-    data: ScenarioSet,
-    validation: ScenarioSet | None,
-    out: Path,
-    resume: bool,
-    overwrite: bool,
-) -> RunFolder:
-    held_out = None if validation is None else validation.hash
-    if not resume:
-        notes = {"kind": "training", "validation": held_out}
-        return RunFolder.create(out, config, data=[data], overwrite=overwrite, **notes)
-    folder = RunFolder.open(out)
-    if folder.info.get("validation") != held_out:
-        raise UsageError(
-            "was validated on other scenarios", file=out, cure="resume with the same --validation"
-        )
-    trained_on = [entry.get("hash") for entry in folder.info.get("data", [])]
-    if trained_on != [data.hash]:
-        raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")
-    return folder

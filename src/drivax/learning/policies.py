@@ -6,13 +6,13 @@ from pathlib import Path
 
 import jax
 
+from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
-from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.runs import RunFolder
+from drivax.tracking.runs import RunFolder, seed_folders
 
 
 def load_policy(
@@ -27,11 +27,17 @@ def load_policy(
         samples: Whether to act by a sample instead of the mode.
 
     Raises:
+        UsageError: If the folder holds several agents.
         DataError: If the folder is no training run, or the checkpoint is missing or damaged.
     """
     folder = RunFolder.open(run)
+    if folder.info.get("kind") == "seeds":
+        inside = seed_folders(folder.path)
+        raise UsageError(
+            f"holds {len(inside)} agents", file=folder.path, cure=f"name one of them, as {inside[0]}"
+        )
     config = folder.config(TrainConfig)
-    learner = config.algorithm.build(Simulator(config.task), bank, config.iterations)
+    learner = config.algorithm.build(config.environment(), bank, config.iterations)
     checkpoints = Checkpoints(folder.checkpoints)
     template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
     chosen = checkpoints.best() if step is None else step

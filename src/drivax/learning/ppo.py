@@ -11,16 +11,17 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
-from drivax.learning.collector import Environments, Rollout, collect, start_environments
-from drivax.networks.actor_critic import ActorCritic, ActorCriticConfig
-from drivax.networks.encoders import group_spec
+from drivax.learning.algorithm import Also
+from drivax.learning.collector import Rollout, collect
+from drivax.learning.devices import divided
+from drivax.learning.environment import Environment, Environments
+from drivax.learning.optimisers import clipped_adam
+from drivax.networks.actor_critic import ActorCritic, NetworkConfig
+from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.advantages import generalised_advantages
 from drivax.rl.policy_gradients import clipped_surrogate_loss
-from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
-from drivax.scenario.schema import CURRENT_STEP, STEPS
-from drivax.simulator.simulator import Simulator
 
 
 @dataclass(frozen=True)
@@ -31,20 +32,19 @@ class PpoConfig:
         network: Policy and value.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
-        latest_start: Episodes begin at a random step of the log between 10 and this one.
         epochs, minibatches: Passes over the experience, and updates per pass.
         learning_rate: Of Adam, falling linearly to a tenth over the run.
         gamma, lambda_: Discount, and mixing of advantages.
         clip: Of the probability ratio.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        gradient_norm: Gradients are clipped to this global norm.
+        gradient_norm: Gradients are clipped to this global norm; those of policy and value apart, unless they share an
+            encoder.
     """
 
     kind: Literal["ppo"] = "ppo"
-    network: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     environments: int = 256
     unroll: int = 64
-    latest_start: int = 10
     epochs: int = 4
     minibatches: int = 8
     learning_rate: float = 3e-4
@@ -62,17 +62,15 @@ class PpoConfig:
             raise ValueError(
                 f"environments x unroll = {self.steps_per_iteration} is no multiple of {self.minibatches} minibatches"
             )
-        if not CURRENT_STEP <= self.latest_start < STEPS - 2:
-            raise ValueError(f"latest_start is {self.latest_start}; use {CURRENT_STEP} to {STEPS - 3}")
 
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps of one iteration."""
         return self.environments * self.unroll
 
-    def build(self, simulator: Simulator, bank: ScenarioBank, iterations: int) -> Ppo:
-        """PPO on a simulator."""
-        return Ppo(self, simulator, bank, iterations)
+    def build(self, environment: Environment, data: Any, iterations: int) -> Ppo:
+        """PPO in an environment."""
+        return Ppo(self, environment, data, iterations)
 
 
 @record
@@ -87,28 +85,29 @@ class PpoState:
 
 
 class Ppo:
-    """PPO on one simulator. Holds configuration and the network's graph; everything computed is in the state."""
+    """PPO in one environment. Holds configuration and the network's graph; everything computed is in the state."""
 
-    def __init__(self, config: PpoConfig, simulator: Simulator, bank: ScenarioBank, iterations: int) -> None:
-        self.config, self.simulator = config, simulator
-        scene = jax.eval_shape(lambda b: Simulator(simulator.task, simulator.traffic).scene(b, 0, 10), bank)
-        self.spec = group_spec(jax.eval_shape(simulator.observe, bank, scene))
-        self.actions = scene.action.shape[0]
-        updates = iterations * config.epochs * config.minibatches
-        schedule = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, max(updates, 1))
-        self.optimiser = optax.chain(
-            optax.clip_by_global_norm(config.gradient_norm), optax.adam(schedule, eps=1e-5)
+    def __init__(self, config: PpoConfig, environment: Environment, data: Any, iterations: int) -> None:
+        self.config, self.environment = config, environment
+        self.spec = environment.shapes(data)
+        self.optimiser = clipped_adam(
+            config.learning_rate,
+            config.gradient_norm,
+            updates=max(iterations * config.epochs * config.minibatches, 1),
+            eps=1e-5,
+            apart=not config.network.shared_encoder,
         )
         self.graph = nnx.graphdef(self._network(jax.random.key(0)))
 
     def _network(self, key: Array) -> ActorCritic:
-        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), self.actions)
+        actions = Actions(self.environment.action_size, self.environment.levels)
+        return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), actions)
 
-    def init(self, bank: ScenarioBank, key: Array) -> PpoState:
+    def init(self, data: Any, key: Array) -> PpoState:
         """The state before the first iteration."""
         network_key, environment_key, key = jax.random.split(key, 3)
         parameters = nnx.state(self._network(network_key), nnx.Param)
-        environments = start_environments(self.simulator, bank, environment_key, self.config.environments)
+        environments = self.environment.start(data, environment_key, self.config.environments)
         return PpoState(
             parameters, self.optimiser.init(parameters), environments, key, jnp.zeros((), jnp.int32)
         )
@@ -117,13 +116,24 @@ class Ppo:
         """The network with these parameters."""
         return nnx.merge(self.graph, parameters)
 
+    def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
+        """The policy with these parameters."""
+        return self.network(parameters).policy(observation)
+
     def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
         """The policy as a planner; the value network stays behind."""
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
-    def iterate(self, bank: ScenarioBank, state: PpoState) -> tuple[PpoState, dict[str, Array]]:
+    def iterate(
+        self, data: Any, state: PpoState, also: Also | None = None
+    ) -> tuple[PpoState, dict[str, Array]]:
         """One iteration: collect, then update. Pure; jit it with the state donated.
+
+        Args:
+            data: The environment's data.
+            state: The state.
+            also: A further loss of the parameters, added in every update.
 
         Returns:
             The next state, and sums (``rollout/*``, see ``collector.collect``) and means (``loss/*``) to log.
@@ -132,30 +142,22 @@ class Ppo:
         network = self.network(state.parameters)
 
         def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            policy = network.policy(observation)
+            policy, value = network.both(observation)
             choice = policy.sample(key)
-            extra = {"log_prob": policy.log_prob(choice), "value": network.value(observation)}
-            return choice, jnp.tanh(choice), extra
+            return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
 
         environments, rollout, totals = collect(
-            self.simulator,
-            bank,
-            state.environments,
-            actor,
-            collect_key,
-            self.config.unroll,
-            self.config.latest_start,
+            self.environment, data, state.environments, actor, collect_key, self.config.unroll
         )
-        last = network.value(environments.observation)
-        parameters, optimiser, losses = self._update(state, rollout, last, update_key)
+        batch = self._batch(rollout, network.value(environments.observation))
+        parameters, optimiser, losses = self._update(state, batch, update_key, also)
         following = PpoState(parameters, optimiser, environments, key, state.iteration + 1)
         return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
 
-    def _update(
-        self, state: PpoState, rollout: Rollout, last: Array, key: Array
-    ) -> tuple[Any, Any, dict[str, Array]]:
-        config = self.config
+    def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
+        """What is learned from, ``[time x batch]``; ``last`` is the value of where the rollout ends."""
         value_t = rollout.extra["value"]
+        # The row behind a truncated step holds its final state, so this is the value that it bootstraps.
         value_tp1 = jnp.concatenate([value_t[1:], last[None]])
         advantage, target = generalised_advantages(
             rollout.reward,
@@ -163,8 +165,8 @@ class Ppo:
             value_tp1,
             rollout.terminated,
             rollout.truncated,
-            config.gamma,
-            config.lambda_,
+            self.config.gamma,
+            self.config.lambda_,
         )
         batch = {
             "observation": rollout.observation,
@@ -174,20 +176,26 @@ class Ppo:
             "target": target,
             "alive": rollout.alive.astype(jnp.float32),
         }
-        batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
-        size = config.steps_per_iteration
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+
+    def _update(
+        self, state: PpoState, batch: dict[str, Any], key: Array, also: Also | None
+    ) -> tuple[Any, Any, dict[str, Array]]:
+        config = self.config
 
         def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
             order_key, noise_key = jax.random.split(key)
-            order = jax.random.permutation(order_key, size).reshape(config.minibatches, -1)
-            return jax.lax.scan(minibatch, carry, (order, jax.random.split(noise_key, config.minibatches)))
+            order = jax.random.permutation(order_key, config.steps_per_iteration)
+            order = order.reshape(config.minibatches, -1)
+            # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
+            shuffled = divided(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
+            return jax.lax.scan(minibatch, carry, (shuffled, jax.random.split(noise_key, config.minibatches)))
 
         def minibatch(
-            carry: tuple[Any, Any], now: tuple[Array, Array]
+            carry: tuple[Any, Any], now: tuple[dict[str, Any], Array]
         ) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            (parameters, optimiser), (rows, key) = carry, now
-            part = jax.tree.map(lambda leaf: leaf[rows], batch)
-            (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key)
+            (parameters, optimiser), (part, key) = carry, now
+            (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key, also)
             logs["gradient_norm"] = optax.tree.norm(gradient)
             change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
             return (optax.apply_updates(parameters, change), optimiser), logs
@@ -196,25 +204,27 @@ class Ppo:
         (parameters, optimiser), logs = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
         return parameters, optimiser, {f"loss/{name}": value.mean() for name, value in logs.items()}
 
-    def _loss(self, parameters: Any, part: dict[str, Any], key: Array) -> tuple[Array, dict[str, Array]]:
-        config, network, alive = self.config, self.network(parameters), part["alive"]
+    def _loss(
+        self, parameters: Any, part: dict[str, Any], key: Array, also: Also | None
+    ) -> tuple[Array, dict[str, Array]]:
+        config, alive = self.config, part["alive"]
+        entropy_key, also_key = jax.random.split(key)
 
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy = network.policy(part["observation"])
+        policy, value = self.network(parameters).both(part["observation"])
         log_prob = policy.log_prob(part["choice"])
         centre = mean(part["advantage"])
         spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
         advantage = (part["advantage"] - centre) / spread
         policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
-        value = network.value(part["observation"])
         value_loss = mean((value - part["target"]) ** 2)
-        # The entropy of a squashed Gaussian has no closed form: one fresh sample estimates it.
-        entropy = -mean(policy.log_prob(policy.sample(key)))
+        entropy = mean(policy.entropy_estimate(entropy_key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
+        further, logs = (0.0, {}) if also is None else also(parameters, also_key)
         ratio = jnp.exp(log_prob - part["log_prob"])
-        logs = {
+        return total + further, logs | {
             "policy": policy_loss,
             "value": value_loss,
             "entropy": entropy,
@@ -223,4 +233,3 @@ class Ppo:
             "explained_variance": 1.0
             - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
         }
-        return total, logs

@@ -1,78 +1,160 @@
-"""Policy and value networks for PPO."""
+"""Policies, values and critics: an encoder and a head each."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from drivax.networks.distributions import SquashedGaussian
-from drivax.networks.encoders import EncoderConfig, Groups, GroupSpec, MlpConfig
+from drivax.networks.distributions import (
+    Actions,
+    Distribution,
+    DistributionName,
+    distribution,
+    first_parameters,
+    parameters_of,
+)
+from drivax.networks.encoders import (
+    Encoder,
+    EncoderConfig,
+    Groups,
+    GroupSpec,
+    MlpConfig,
+    dense_layers,
+)
+from drivax.networks.entity import EntityConfig
+from drivax.networks.pooling import ACTIVATIONS, Activation
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+
+#: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or the
+#: dotted name of one's own.
+EncoderSettings = (
+    MlpConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig | EntityConfig | EncoderConfig
+)
 
 
 @dataclass(frozen=True)
-class ActorCriticConfig:
-    """Networks of a policy-gradient agent.
+class NetworkConfig:
+    """Networks of an agent.
 
     Attributes:
-        encoder: The encoder; policy and value have one each.
+        encoder: The encoder; policy, value and every critic have one each, but for ``shared_encoder``.
         head: Hidden layers between embedding and output.
-        first_scale: Standard deviation of an untrained policy before squashing.
+        activation: After every hidden layer of a head; outputs are linear.
+        first_scale: Standard deviation of an untrained policy: before squashing (gaussian), of the action (beta), or
+            of the Gaussian whose density gives the levels their probabilities (grid).
+        distribution: Of actions: a squashed Gaussian, a Beta, or a grid of levels, for ``discrete`` actions.
+        shared_encoder: Whether policy and value look through one encoder. Critics never share.
     """
 
-    encoder: MlpConfig | EncoderConfig = field(default_factory=MlpConfig)
+    encoder: EncoderSettings = field(default_factory=MlpConfig)
     head: tuple[int, ...] = (64,)
+    activation: Activation = "tanh"
     first_scale: float = 0.3
+    distribution: DistributionName = "gaussian"
+    shared_encoder: bool = False
+
+    def __post_init__(self) -> None:
+        if self.first_scale <= 0.0:
+            raise ValueError(f"first_scale is {self.first_scale:g}; use more than 0")
 
 
 class _Head(nnx.Module):
-    def __init__(self, width: int, hidden: tuple[int, ...], out: int, scale: float, rngs: nnx.Rngs) -> None:
-        layers = []
-        for size in hidden:
-            layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
-            width = size
-        self.hidden = nnx.List(layers)
+    def __init__(self, config: NetworkConfig, width: int, out: int, scale: float, rngs: nnx.Rngs) -> None:
+        self.activation = config.activation
+        self.hidden = dense_layers(width, config.head, rngs)
+        width = config.head[-1] if config.head else width
         self.out = nnx.Linear(width, out, kernel_init=nnx.initializers.orthogonal(scale), rngs=rngs)
 
     def __call__(self, x: Array) -> Array:
         for layer in self.hidden:
-            x = jnp.tanh(layer(x))
+            x = ACTIVATIONS[self.activation](layer(x))
         return self.out(x)
 
 
 class Policy(nnx.Module):
-    """Observation -> distribution over actions of so many numbers."""
+    """Observation -> distribution over actions."""
 
-    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: int = 2) -> None:
-        self.actions = actions
+    def __init__(
+        self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
+    ) -> None:
+        self.actions = actions or Actions()
+        self.kind: DistributionName = config.distribution
+        self.first_scale = config.first_scale
         self.encoder = config.encoder.build(spec, rngs)
-        self.head = _Head(self.encoder.width, config.head, 2 * actions, 0.01, rngs)
-        self.shift = math.log(math.expm1(config.first_scale))
+        self.head = _Head(config, self.encoder.width, parameters_of(self.kind, self.actions), 0.01, rngs)
 
-    def __call__(self, groups: Groups) -> SquashedGaussian:
-        """The action distribution; near zero mean and the first standard deviation before training."""
-        raw = self.head(self.encoder(groups))
-        return SquashedGaussian.from_parameters(raw.at[..., self.actions :].add(self.shift))
+    def __call__(self, groups: Groups) -> Distribution:
+        """The action distribution; around zero with the first standard deviation before training."""
+        return self.of(self.encoder(groups))
+
+    def of(self, embedding: Float[Array, "*batch width"]) -> Distribution:
+        """The distribution for what the encoder makes of an observation."""
+        first = first_parameters(self.kind, self.actions, self.first_scale)
+        return distribution(self.kind, self.head(embedding) + first, self.actions)
 
 
 class Value(nnx.Module):
     """Observation -> value."""
 
-    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
-        self.encoder = config.encoder.build(spec, rngs)
-        self.head = _Head(self.encoder.width, config.head, 1, 1.0, rngs)
+    def __init__(
+        self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, encoder: Encoder | None = None
+    ) -> None:
+        self.encoder = encoder or config.encoder.build(spec, rngs)
+        self.head = _Head(config, self.encoder.width, 1, 1.0, rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch"]:
         """Expected discounted return."""
-        return self.head(self.encoder(groups))[..., 0]
+        return self.of(self.encoder(groups))
+
+    def of(self, embedding: Float[Array, "*batch width"]) -> Float[Array, "*batch"]:
+        """The value for what the encoder makes of an observation."""
+        return self.head(embedding)[..., 0]
 
 
 class ActorCritic(nnx.Module):
-    """A policy and a value with an encoder each."""
+    """A policy and a value, with an encoder each or one for both."""
 
-    def __init__(self, config: ActorCriticConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: int = 2) -> None:
+    def __init__(
+        self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
+    ) -> None:
+        self.shared = config.shared_encoder
         self.policy = Policy(config, spec, rngs, actions)
-        self.value = Value(config, spec, rngs)
+        self.value = Value(config, spec, rngs, self.policy.encoder if self.shared else None)
+
+    def both(self, groups: Groups) -> tuple[Distribution, Float[Array, "*batch"]]:
+        """Action distribution and value; a shared encoder encodes once."""
+        if not self.shared:
+            return self.policy(groups), self.value(groups)
+        embedding = self.policy.encoder(groups)
+        return self.policy.of(embedding), self.value.of(embedding)
+
+
+class Critic(nnx.Module):
+    """Observation and action -> value of taking it, any real number: the output is linear."""
+
+    def __init__(
+        self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
+    ) -> None:
+        self.encoder = config.encoder.build(spec, rngs)
+        width = self.encoder.width + (actions or Actions()).size
+        self.head = _Head(config, width, 1, 1.0, rngs)
+
+    def __call__(self, groups: Groups, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+        """Expected discounted return of an action in [-1, 1]."""
+        return self.head(jnp.concatenate([self.encoder(groups), action], axis=-1))[..., 0]
+
+
+class TwinCritic(nnx.Module):
+    """Two critics that share nothing, so that the smaller of their values is a cautious one."""
+
+    def __init__(
+        self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
+    ) -> None:
+        self.critics = nnx.List([Critic(config, spec, rngs, actions) for _ in range(2)])
+
+    def __call__(self, groups: Groups, action: Float[Array, "*batch action"]) -> Float[Array, "2 *batch"]:
+        """Both values."""
+        return jnp.stack([critic(groups, action) for critic in self.critics])

@@ -7,16 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.networks.pooling import Activation, Layers, dense, largest
+
 Groups = Mapping[str, Array]
 #: Shapes of one observation, by group.
 GroupSpec = Mapping[str, tuple[int, ...]]
-
-_ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "gelu": jax.nn.gelu, "silu": jax.nn.silu}
 
 
 @runtime_checkable
@@ -56,7 +55,7 @@ class MlpConfig:
     kind: Literal["mlp"] = "mlp"
     rows: tuple[int, ...] = ()
     hidden: tuple[int, ...] = (256, 256)
-    activation: Literal["relu", "tanh", "gelu", "silu"] = "relu"
+    activation: Activation = "relu"
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MlpEncoder:
         """The encoder with fresh parameters."""
@@ -70,25 +69,25 @@ class MlpEncoder(nnx.Module):
         self.pools = bool(config.rows)
         self.names = group_names(spec)
         self.shapes = {name: tuple(spec[name]) for name in self.names}
-        self.activation = config.activation
+        self.activation: Activation = config.activation
         width, shared = 0, {}
         for name in self.names:
             masked = f"{name}_mask" in spec
             if masked and self.pools:
                 # One row is what the mask's first axis counts; times of one row go side by side with their masks.
                 one = math.prod(spec[name][1:]) + math.prod(spec[f"{name}_mask"][1:])
-                shared[name] = _layers(one, config.rows, rngs)
+                shared[name] = dense_layers(one, config.rows, rngs)
                 width += config.rows[-1]
             else:
                 width += math.prod(spec[name]) + (math.prod(spec[f"{name}_mask"]) if masked else 0)
         self.shared = nnx.Dict(shared)
-        self.layers = _layers(width, config.hidden, rngs)
+        self.layers = dense_layers(width, config.hidden, rngs)
         self.width = config.hidden[-1]
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
         """Encodes one observation or a batch of them."""
         x = jnp.concatenate([self._part(name, groups) for name in self.names], axis=-1)
-        return self._dense(self.layers, x)
+        return dense(self.activation, _weights(self.layers), x)
 
     def _part(self, name: str, groups: Groups) -> Float[Array, "*batch part"]:
         value, mask = groups[name].astype(jnp.float32), groups.get(f"{name}_mask")
@@ -103,23 +102,21 @@ class MlpEncoder(nnx.Module):
         rows = self.shapes[name][0]
         there = mask.reshape(*lead, rows, -1)
         row = jnp.concatenate([value.reshape(*lead, rows, -1), there.astype(jnp.float32)], axis=-1)
-        embedded = self._dense(self.shared[name], row)
         # A row counts when any of its times does; no row at all embeds as zero.
-        counts = there.any(axis=-1, keepdims=True)
-        return jnp.max(embedded, axis=-2, initial=0.0, where=counts)
-
-    def _dense(self, layers: Any, x: Array) -> Array:
-        for layer in layers:
-            x = _ACTIVATIONS[self.activation](layer(x))
-        return x
+        return largest(self.activation, _weights(self.shared[name]), row, there.any(axis=-1))
 
 
-def _layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
+def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
+    """Dense layers of these sizes, with orthogonal weights for what follows relu or tanh."""
     layers = []
     for size in sizes:
         layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
         width = size
     return nnx.List(layers)
+
+
+def _weights(layers: Any) -> Layers:
+    return tuple((layer.kernel[...], layer.bias[...]) for layer in layers)
 
 
 def group_spec(observation: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

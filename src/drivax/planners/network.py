@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
@@ -42,5 +41,4 @@ class NetworkPlanner(Memoryless):
     ) -> tuple[Float[Array, "2"], Any]:
         """The policy's action for the observation."""
         distribution = nnx.merge(self.graph, self.parameters)(observation)
-        action = jnp.tanh(distribution.sample(key)) if self.samples else distribution.mode()
-        return action, carry
+        return distribution.action(distribution.sample(key)) if self.samples else distribution.mode(), carry

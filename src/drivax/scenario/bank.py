@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.angles import wrap
+from drivax.scenario.lane_codes import lane_codes
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
 
@@ -55,6 +56,7 @@ class ScenarioBank:
         edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
         lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
             added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
+        lane_codes: Strand, neighbours and end of every lane of the graph (``scenario.lane_codes``).
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.sides.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
@@ -63,9 +65,11 @@ class ScenarioBank:
         log_ahead: Distance that the logged ego still drives.
         road: Observation pieces in order of rank: x, y, direction, length, layer (``ROAD_LANE``, ...), limit (-1).
         road_at: What decides which of them are seen: x, y, layer.
+        road_curvature: Turn of each piece per metre, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
         paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
+        driver: Planner that drives others than ego (``planners.driven.with_driver``), None where nobody does.
         given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
@@ -80,6 +84,7 @@ class ScenarioBank:
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
     lanes: Float[Array, "N 8 C"]
+    lane_codes: Float[Array, "N G 6"]
     grid_edge: Int[Array, "N cells1"]
     grid_lane: Int[Array, "N cells1"]
     grid_side: Int[Array, "N cells"]
@@ -92,6 +97,7 @@ class ScenarioBank:
     log_ahead: Float[Array, "N T"]
     road: Float[Array, "N O 7"]
     road_at: Float[Array, "N 3 O"]
+    road_curvature: Float[Array, "N O"]
     flags: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
     cell_m: float = static()
@@ -101,6 +107,7 @@ class ScenarioBank:
     trimmed: bool = static()
     paths: Any = None
     given: Any = None
+    driver: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -328,9 +335,11 @@ def _stack_maps(
         points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
+    graphs = max(1, _used(_column(scenarios, "lane_length") > 0, trim))
     arrays = {
         "edges": edges,
         "lanes": lanes,
+        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, :graphs],
         "grid_edge": grid_edge,
         "grid_lane": grid_lane,
         "grid_side": _column(scenarios, "grid_side"),
@@ -343,9 +352,9 @@ def _stack_maps(
 def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     rows = _column(scenarios, "road_rows").astype(np.int32)
     used = max(1, int(rows.max())) if trim else scenarios[0].capacity.road_rows
-    xy, direction, length, kind, limit = (
+    xy, direction, length, kind, limit, curvature = (
         _column(scenarios, f"road_{name}")[:, :used]
-        for name in ("xy", "direction", "length", "kind", "limit")
+        for name in ("xy", "direction", "length", "kind", "limit", "curvature")
     )
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
     there = np.arange(used) < rows[:, None]
@@ -354,6 +363,7 @@ def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarr
     return {
         "road": np.concatenate(columns, -1, dtype=np.float32),
         "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1, dtype=np.float32),
+        "road_curvature": curvature.astype(np.float32),
     }
 
 

@@ -189,6 +189,22 @@ def around_lanes(
     )
 
 
+def aligned_lanes(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
+    z: Float[Array, ""],
+) -> tuple[Int[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:  # fmt: skip
+    """Segments of lanes around a point that run its way: lane, squared distance, signed distance to the line (left +).
+
+    Those that do not count have lane -1 and are very far away.
+    """
+    grid = _grid_side(bank)
+    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, xy), grid)
+    squared, side = _to_segments(rows, xy[None])
+    aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
+    counts = inside & aligned & (jnp.abs(rows[4] - z) <= LEVEL_M)
+    return jnp.where(counts, rows[7], -1.0).astype(jnp.int32), jnp.where(counts, squared[0], _FAR), side[0]
+
+
 def _outside_lanes(
     squared: Float[Array, "P K"], aligned: Bool[Array, " K"], half: Float[Array, " K"]
 ) -> Bool[Array, " P"]:

@@ -2,7 +2,8 @@
 
 A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
 carry a ``kind`` key in YAML (:func:`kind_of`). What a section leaves out keeps the default of the record that holds
-the section. Nothing is guessed: an unknown key or a value of the wrong type is a
+the section; in a record that has presets (a class method ``preset(name)``) the key ``preset`` names one to start from
+instead, and a dumped record holds what came of it. Nothing is guessed: an unknown key or a value of the wrong type is a
 :class:`~drivax.errors.UsageError` that names the dotted path and, where there is one, the nearest valid name. YAML is
 read by the 1.2 core rules, so ``3e-4`` is a number and ``no`` is a word.
 """

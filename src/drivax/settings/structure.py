@@ -239,6 +239,10 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
             raise _refuse(
                 value, f"a section of settings ({', '.join(f.name for f in dataclasses.fields(cls))})"
             )
+        if _names_preset(cls, value):
+            base = cls.preset(str(value["preset"]))
+            rest = {name: given for name, given in value.items() if name != "preset"}
+            value = _completed(_plain(base, cls), base, rest)
         return build(_on_defaults(cls, value), cls)
 
     return hook
@@ -260,8 +264,16 @@ def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
+def _names_preset(cls: Any, given: Mapping[str, Any]) -> bool:
+    """Whether a section says from which preset of its record it starts: ``cls.preset(name)`` is one."""
+    named = {field.name for field in dataclasses.fields(cls)}
+    return "preset" in given and "preset" not in named and callable(getattr(cls, "preset", None))
+
+
 def _completed(base: dict[str, Any], default: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     if "kind" in given and str(given["kind"]) != kind_of(type(default)):
+        return dict(given)
+    if _names_preset(type(default), given):
         return dict(given)
     result = base | dict(given)
     for name, value in given.items():

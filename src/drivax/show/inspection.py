@@ -91,9 +91,10 @@ class Inspection:
         """How the set was made, and what was read and is not in it; empty for sets that were written by hand."""
         return self.scenarios.manifest["source"]
 
-    def sample(self) -> Iterator[Scenario]:
-        """At most ``SAMPLE`` of the selected scenarios, evenly spread."""
-        places = np.unique(np.linspace(0, len(self.rows) - 1, min(SAMPLE, len(self.rows))).round())
+    def sample(self, most: int | None = None) -> Iterator[Scenario]:
+        """At most so many (``SAMPLE`` otherwise) of the selected scenarios, evenly spread."""
+        most = SAMPLE if most is None else most
+        places = np.unique(np.linspace(0, len(self.rows) - 1, min(most, len(self.rows))).round())
         return (self.scenarios[self.rows[int(place)]] for place in places)
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from drivax.errors import DataError, UsageError
+from drivax.tracking.runs import seed_folders
 
 #: Columns of ``episodes.csv`` that say which episode it was; all others are metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
@@ -123,10 +124,13 @@ class Training:
 def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]]:
     """Read run folders of either kind; names that repeat get the folder's name as a suffix.
 
+    The folder of several agents stands for those of all of them.
+
     Raises:
         DataError: A folder or file is missing or damaged, or is no run.
         UsageError: No folder was given, or one was given twice.
     """
+    folders = [inside for folder in folders for inside in seed_folders(folder)]
     resolved = [folder.resolve() for folder in folders]
     if not folders or len(set(resolved)) < len(resolved):
         raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")

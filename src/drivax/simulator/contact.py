@@ -7,12 +7,14 @@ import enum
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, overlap, time_to_overlap
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, gap, overlap, time_to_overlap
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 
 TTC_HORIZON_S = 5.0
+#: Gaps are told up to here, m.
+FARTHEST_GAP_M = 50.0
 #: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
 #: Rear axle behind the box centre, as a share of the length (nuPlan's vehicle: 1.461 m of 5.176 m).
@@ -166,3 +168,18 @@ def time_to_collision(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, 
     counts &= (ahead + reach > -REAR_AXLE * me[LENGTH]) & (jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M)
     times = time_to_overlap(me, frame.velocity[slot], frame.box, frame.velocity, TTC_HORIZON_S)
     return jnp.min(jnp.where(counts, times, TTC_HORIZON_S))
+
+
+def nearest_gap(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, " S"]) -> Float[Array, ""]:
+    """Distance between the agent's box and the nearest other on its level, m, at most 50; 0 where they overlap.
+
+    Args:
+        frame: Everyone now.
+        slot: The agent.
+        left_out: Who does not count: those that overlapped it when they appeared, until they part.
+    """
+    counts = frame.valid & ~left_out & (jnp.arange(frame.valid.shape[0]) != slot)
+    counts &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
+    # Boxes of empty slots may hold anything; the agent's own one, pushed away, keeps gradients finite.
+    gaps = gap(frame.box[slot], jnp.where(counts[:, None], frame.box, frame.box[slot]))
+    return jnp.min(jnp.where(counts, jnp.minimum(gaps, FARTHEST_GAP_M), FARTHEST_GAP_M))

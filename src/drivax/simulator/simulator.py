@@ -15,7 +15,7 @@ from drivax.scenario.bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import nothing_crossed, remember_lights
-from drivax.simulator.situation import measure, surroundings
+from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.together import is_driven
 from drivax.simulator.traffic import LogTraffic, alone, frame_of
@@ -194,6 +194,7 @@ class Simulator:
         scene = jax.tree.map(partial(jnp.where, over), fresh.scene, moved)
         before = replace(
             state,
+            facts=forget_strand(state.facts, over),
             contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
             lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
             start=jnp.where(over, fresh.scene.step, state.start),
@@ -241,7 +242,7 @@ class Simulator:
         """Measures an agent after everyone has moved on from a frame, and turns the step into a transition."""
         now = self.frame(bank, moved, cast, 0)
         found, contacts, lights = measure(
-            bank, moved, now, seen, before.contacts, before.lights, self.task.reads
+            bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
         terminated, truncated = self.task.ended(bank, found.scene, found.facts)
         terms = self.task.reward(before.facts, found.facts, found.surroundings)

@@ -13,6 +13,7 @@ from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.passages import lane_passage
 from drivax.scenario.queries import (
     OFFROAD_TOLERANCE_M,
     LaneHits,
@@ -28,6 +29,7 @@ from drivax.simulator.contact import (
     Contact,
     first_contacts,
     judge_contacts,
+    nearest_gap,
     next_contacts,
     overlaps,
     time_to_collision,
@@ -35,7 +37,9 @@ from drivax.simulator.contact import (
 from drivax.simulator.lights import judge_lights
 from drivax.simulator.types import (
     FACTS,
+    MOTION_HEADING,
     MOTION_SPEED,
+    ON_REQUEST,
     Facts,
     Frame,
     LightMemory,
@@ -48,12 +52,14 @@ from drivax.simulator.types import (
 _ON_ROUTE_M = 2.0
 #: Facts that need to know who touches the agent, and those that need to know whose fault it is.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
-_CONTACTS = _FAULTS | {"collision", "ignored"}
+_CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
+#: Facts that need to know from which lane to which the agent passes.
+_PASSAGES = frozenset({"strand", "lane_changed", "merged"})
 
 
 def measure(
     bank: ScenarioBank, scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], lights: LightMemory,
-    reads: frozenset[str] = FACTS,
+    reads: frozenset[str] = FACTS, strand: Any = None,
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measures the driven agent of a scene.
 
@@ -65,16 +71,15 @@ def measure(
         contacts: Contact codes of the step before.
         lights: What is remembered about stop lines.
         reads: Names of the facts that are wanted; the others are None, and what only they need is not computed.
+        strand: The fact of that name of the step before; None where an episode begins.
 
     Returns:
         The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
     """
     around = surroundings(bank, scene, frame)
-    lanes, route, me = around.lanes, around.route, frame.box[scene.slot]
-    ground = _ground(bank, scene, frame)
+    lanes, route, me, ground = around.lanes, around.route, frame.box[scene.slot], _ground(bank, scene, frame)
     beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
-    half = bank.agent_box[scene.index, scene.slot, 2] / 2
-    z = jnp.where(lanes.near, lanes.z + half, frame.z[scene.slot])
+    z = jnp.where(lanes.near, lanes.z + bank.agent_box[scene.index, scene.slot, 2] / 2, frame.z[scene.slot])
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
     codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
@@ -109,8 +114,18 @@ def measure(
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
+        **_requested(bank, scene, frame, codes, reads, strand),
     )
     return Situation(scene, _kept(facts, reads), around), codes, lights
+
+
+def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
+    """The same facts, without where the agent came from if its episode is ``over``."""
+
+    def forget(path: tuple[Any, ...], fact: Array) -> Array:
+        return jnp.where(over, jnp.int16(-1), fact) if path[0].name == "strand" else fact
+
+    return jax.tree_util.tree_map_with_path(forget, facts)
 
 
 def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings:
@@ -155,13 +170,40 @@ def _touch(
     return codes, fault.any(), kind, ttc
 
 
+def _requested(
+    bank: ScenarioBank,
+    scene: Scene,
+    frame: Frame,
+    codes: Int[Array, " S"],
+    reads: frozenset[str],
+    strand: Any,
+) -> dict[str, Array]:
+    """The facts that are measured on request; what ``reads`` does not ask for is zero."""
+    none, no = jnp.int16(-1), jnp.zeros((), bool)
+    found: dict[str, Array] = {"gap_m": jnp.zeros(()), "strand": none, "lane_changed": no, "merged": no}
+    if "gap_m" in reads:
+        found["gap_m"] = nearest_gap(frame, scene.slot, codes == Contact.IGNORED)
+    if reads & _PASSAGES:
+        ground, me = _ground(bank, scene, frame), frame.box[scene.slot]
+        if strand is None:
+            # Whoever is changing lanes as the episode begins has come from where it was 1.5 s ago.
+            x, y, psi = scene.history[0, : MOTION_HEADING + 1]
+            heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
+            strand = lane_passage(bank, scene.index, jnp.stack([x, y]), heading, ground, -1).strand
+        passage = lane_passage(bank, scene.index, me[:2], me[2:4], ground, strand)
+        found |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
+    return found
+
+
 def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
     """The facts that are wanted; None in place of the others."""
+    # The next passage is judged from the strand of this one.
+    wanted = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
     def keep(path: tuple[Any, ...], fact: Array) -> Array | None:
-        return fact if path[0].name in reads else None
+        return fact if path[0].name in wanted else None
 
-    return facts if reads == FACTS else jax.tree_util.tree_map_with_path(keep, facts)
+    return facts if wanted >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
 
 
 def _off_the_road(

@@ -69,6 +69,9 @@ class Facts:
     agent has a route of its own (ego, on lanes), without which progress and ``off_route`` mean nothing; ``logged``
     whether the log has the agent at this step; ``ignored`` counts overlaps that do not count. A fact that the task does
     not ask for (``Task.reads``) is neither measured nor carried: it is None.
+
+    The last four are measured for who names them only (``ON_REQUEST``): ``gap_m`` to the nearest other, at most 50 m;
+    ``strand`` of lanes that the agent is on (``scenario.passages``), and whether it changed lanes or merged just now.
     """
 
     collision: Bool[Array, "*batch"]
@@ -96,10 +99,16 @@ class Facts:
     lateral_acceleration_mps2: Float[Array, "*batch"]
     acceleration_mps2: Float[Array, "*batch"]
     jerk_mps3: Float[Array, "*batch"]
+    gap_m: Any = None
+    strand: Any = None
+    lane_changed: Any = None
+    merged: Any = None
 
 
-#: Names of all facts.
-FACTS = frozenset(field.name for field in fields(cast(Any, Facts)))
+#: Facts that few look at, measured only where they are asked for by name.
+ON_REQUEST = frozenset({"gap_m", "strand", "lane_changed", "merged"})
+#: Names of all other facts.
+FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
 
 
 @record

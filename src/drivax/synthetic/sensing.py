@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from drivax.errors import UsageError
 from drivax.geometry.angles import wrap
-from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, corners
+from drivax.geometry.boxes import LENGTH, WIDTH, corners, passage
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 
@@ -201,22 +201,7 @@ def _cuts(
     top_m: Float64[np.ndarray, " pair"],
 ) -> Bool[np.ndarray, "pair point"]:
     """Whether rays from an eye to points, at two heights, pass through upright boxes (slab test)."""
-    cos, sin = box[:, COS], box[:, SIN]
-
-    def turned(xy: Float64[np.ndarray, "..."]) -> tuple[Float64[np.ndarray, "..."], ...]:
-        """In the frame of the box."""
-        x, y = xy[..., 0] - box[:, X, None], xy[..., 1] - box[:, Y, None]
-        return x * cos[:, None] + y * sin[:, None], y * cos[:, None] - x * sin[:, None]
-
-    enters, leaves = np.zeros(points.shape[:2]), np.ones(points.shape[:2])
-    for start, end, half in zip(
-        turned(eye[:, None]), turned(points), (box[:, LENGTH, None] / 2, box[:, WIDTH, None] / 2), strict=True
-    ):
-        way = end - start
-        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
-        first, second = (-half - start) / way, (half - start) / way
-        enters = np.maximum(enters, np.minimum(first, second))
-        leaves = np.minimum(leaves, np.maximum(first, second))
+    enters, leaves = passage(eye[:, None], points, box[:, None])
     high, low = heights_m[0], heights_m[1][:, None]
     lowest = np.minimum(high + (low - high) * enters, high + (low - high) * leaves)
     return (enters < leaves) & (lowest < top_m[:, None])

@@ -7,14 +7,16 @@ Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths b
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import rotate
+from drivax.errors import UsageError
+from drivax.named import nearest
 from drivax.scenario.bank import (
     LIGHT_ARC,
     LIGHT_COS,
@@ -30,48 +32,33 @@ from drivax.scenario.bank import (
     ScenarioBank,
 )
 from drivax.scenario.queries import route_ahead
-from drivax.scenario.record import record
-from drivax.scenario.schema import Flag, LightState
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.scenario.schema import DT_S, LightState
+from drivax.simulator.types import HISTORY, Scene
+from drivax.tasks.features import (
+    COLUMNS,
+    Features,
+    columns_of,
+    cut_rows,
+    goal_ahead,
+    has_route,
+    joined,
+    recommended_speed,
+    route_curvature,
+    shown_curvature,
+)
 from drivax.tasks.own import own_name, refuse_taken
+from drivax.tasks.perception import Perception, lights_seen, moved_lights, moved_road, perceived
+from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Frames, View
 
-POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
-#: Reach of the road group ahead, behind and to each side, m.
-ROAD_AHEAD_M, ROAD_BEHIND_M, ROAD_SIDE_M = 70.0, 10.0, 25.0
 #: Places of a block of the running count.
 _BLOCK = 8
 #: A stop line so far behind the ego is passed, m.
 _PASSED_M = 5.0
 Observation = dict[str, Array]
 #: Names of the groups of this module.
-GROUPS = ("ego", "ego_static", "agents", "road", "lights", "route")
+GROUPS = tuple(COLUMNS)
 
 
-@record
-class View:
-    """The ego frame: x ahead, y to the left."""
-
-    xy: Float[Array, " 2"]
-    cos: Float[Array, ""]
-    sin: Float[Array, ""]
-
-    @classmethod
-    def of(cls, scene: Scene) -> View:
-        """The frame of the driven agent now."""
-        now = scene.history[-1]
-        return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
-
-    def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """A place of the world, m."""
-        return rotate(xy - self.xy, self.cos, -self.sin)
-
-    def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """A direction or velocity of the world."""
-        return rotate(xy, self.cos, -self.sin)
-
-
-#: Everyone's frame so many steps ago, 0 to 15; the number is a plain one, known when the program is compiled.
-Frames = Callable[[int], Frame]
 #: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
 Feature = Callable[[ScenarioBank, Scene, Frames], Any]
 
@@ -103,60 +90,112 @@ class OwnGroup:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """Which groups, how many rows, how many past steps.
+    """Which groups, how many rows, how many past steps, which features of each.
+
+    In YAML the key ``preset`` names one of ``PRESETS`` to start from instead of these defaults.
 
     Attributes:
         agents: How many of the nearest others.
         steps: Past steps of ego and agents, the present one included; at most 10.
         road: Rows of the road group; 0 leaves it out.
-        edges: Whether the road group shows road edges beside lanes and crosswalks.
+        lanes, edges, crosswalks: Which layers the road group shows.
+        road_ahead_m, road_behind_m, road_side_m: Reach of the road group ahead, behind and to each side.
+        road_cut: Into how many equal rows each piece of road (of at most 10 m) is cut along its chord.
         lights: How many of the nearest lights on or near the route.
         route: Points of the route, ``route_step_m`` apart.
+        features: Columns of each group.
+        perception: Faults of what ego sees; none by default.
         own: Groups beside those of this module.
     """
 
     agents: int = 16
     steps: int = 5
     road: int = 200
+    lanes: bool = True
     edges: bool = True
+    crosswalks: bool = True
+    road_ahead_m: float = 70.0
+    road_behind_m: float = 10.0
+    road_side_m: float = 25.0
+    road_cut: int = 1
     lights: int = 5
     route: int = 10
     route_step_m: float = 5.0
+    features: Features = field(default_factory=Features)
+    perception: Perception = field(default_factory=Perception)
     own: tuple[OwnGroup, ...] = ()
 
     def __post_init__(self) -> None:
         refuse_taken("observation.own", [group.name for group in self.own], GROUPS)
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
+        if self.road_cut < 1 or self.road % self.road_cut:
+            raise ValueError(
+                f"observation.road_cut is {self.road_cut}; use a number that divides road ({self.road})"
+            )
+
+    @classmethod
+    def preset(cls, name: str) -> ObservationConfig:
+        """One of ``PRESETS``.
+
+        Raises:
+            UsageError: There is none of that name.
+        """
+        if name not in PRESETS:
+            raise UsageError(f"there is no observation preset {name!r}", cure=nearest(name, list(PRESETS)))
+        return PRESETS[name]
 
 
-PRESETS = {
-    "minimal": ObservationConfig(agents=8, steps=1, edges=False),
-    "standard": ObservationConfig(edges=False),
-    "optimal": ObservationConfig(),
-    "maximal": ObservationConfig(agents=32, steps=10),
-}
+#: ``published`` is the observation of the published description as far as a layer of pieces of at most 10 m has it:
+#: 2,000 rows are 400 pieces, each cut into five, and a box of 100 m takes the place of the circle.
+PRESETS = MappingProxyType(
+    {
+        "minimal": ObservationConfig(agents=8, steps=1, edges=False),
+        "standard": ObservationConfig(edges=False),
+        "optimal": ObservationConfig(),
+        "maximal": ObservationConfig(agents=32, steps=10),
+        "published": ObservationConfig(
+            road=2000,
+            road_ahead_m=100.0,
+            road_behind_m=100.0,
+            road_side_m=100.0,
+            road_cut=5,
+            features=Features(
+                ego_static=("length", "width", "height"),
+                agents=("position", "heading", "velocity", "length", "width", "height", "type"),
+                route=("position", "heading", "recommended_speed"),
+            ),
+        ),
+    }
+)
 
 
 def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
     """The observation of a scene.
 
     Args:
-        config: Groups and sizes.
+        config: Groups, sizes and features.
         bank: The scenarios.
         scene: The scene.
         frames: Everyone ``back`` steps ago.
 
     Returns:
-        ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last action.
-        ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
+        By default ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last
+        action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
         ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's own groups.
     """
-    view = View.of(scene)
-    result = _ego(config, bank, scene, view) | _agents(config, scene, view, frames)
-    if config.road:
-        result |= _road(config, bank, scene, view)
-    result |= _lights(config, bank, scene, view) | _route(config, bank, scene, view)
+    view, features = View.of(scene), config.features
+    if config.perception.of_agents:
+        frames = perceived(config.perception, scene, frames)
+    result = _ego(config, bank, scene, view)
+    if features.agents:
+        result |= _agents(config, bank, scene, view, frames)
+    if config.road and features.road:
+        result |= _shown_road(config, bank, scene, view)
+    if features.lights:
+        result |= _lights(config, bank, scene, view)
+    if features.route:
+        result |= _route(config, bank, scene, view)
     for group in config.own:
         result |= group.observe(bank, scene, frames)
     return result
@@ -168,13 +207,25 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
 
 def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     past = scene.history[HISTORY - config.steps :]
-    direction = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
-    turned = view.vector(direction)
-    rows = jnp.concatenate(
-        [view.point(past[:, :2]) / POSITION_M, turned[:, ::-1], turned * past[:, 3:4] / SPEED_MPS], axis=-1
-    )
-    size = bank.agent_box[scene.index, scene.slot, :2] / SIZE_M
-    return {"ego": rows, "ego_static": jnp.concatenate([size, scene.action])}
+    turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
+    size = bank.agent_box[scene.index, scene.slot]
+    moving = {
+        "position": lambda: view.point(past[:, :2]) / POSITION_M,
+        "heading": lambda: turned[:, ::-1],
+        "velocity": lambda: turned * past[:, 3:4] / SPEED_MPS,
+        "time": lambda: -DT_S * jnp.arange(config.steps - 1, -1, -1, dtype=jnp.float32)[:, None],
+    }
+    static = {
+        "length": lambda: size[0:1] / SIZE_M,
+        "width": lambda: size[1:2] / SIZE_M,
+        "height": lambda: size[2:3] / SIZE_M,
+        "last_action": lambda: scene.action,
+    }
+    result = {}
+    for name, parts in (("ego", moving), ("ego_static", static)):
+        if chosen := getattr(config.features, name):
+            result[name] = joined(chosen, parts, ())
+    return result
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
@@ -184,8 +235,10 @@ def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
     return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
 
 
-def _agents(config: ObservationConfig, scene: Scene, view: View, frames: Frames) -> Observation:
-    now = frames(0)
+def _agents(
+    config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, frames: Frames
+) -> Observation:
+    now, chosen_features = frames(0), config.features.agents
     slots = now.valid.shape[0]
     seen = now.valid & (jnp.arange(slots) != scene.slot)
     dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
@@ -193,21 +246,33 @@ def _agents(config: ObservationConfig, scene: Scene, view: View, frames: Frames)
     chosen = _nearest(distance, config.agents)
     there = seen[chosen] & (jnp.arange(config.agents) < slots)
 
-    def row(back: int) -> tuple[Float[Array, "K 6"], Bool[Array, " K"]]:
+    def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
         frame = now if back == 0 else frames(back)
-        box = frame.box[chosen]
-        direction = view.vector(box[:, 2:4])
-        parts = [view.point(box[:, :2]) / POSITION_M, direction[:, ::-1]]
-        parts.append(view.vector(frame.velocity[chosen]) / SPEED_MPS)
-        return jnp.concatenate(parts, axis=-1), frame.valid[chosen]
+        box, x = frame.box[chosen], scene.history[HISTORY - 1 - back]
+
+        def relative() -> Float[Array, "K 2"]:
+            own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
+            return view.vector(frame.velocity[chosen] - own) / SPEED_MPS
+
+        parts = {
+            "position": lambda: view.point(box[:, :2]) / POSITION_M,
+            "heading": lambda: view.vector(box[:, 2:4])[:, ::-1],
+            "velocity": lambda: view.vector(frame.velocity[chosen]) / SPEED_MPS,
+            "relative_velocity": relative,
+            "time": lambda: jnp.full((config.agents, 1), -DT_S * back),
+        }
+        return joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
 
     rows = [row(back) for back in range(config.steps - 1, -1, -1)]
     moving = jnp.stack([one for one, _ in rows], axis=1)
     mask = jnp.stack([valid for _, valid in rows], axis=1) & there[:, None]
-    kind = now.kind[chosen]
-    static = jnp.concatenate(
-        [now.box[chosen, 4:6] / SIZE_M, (kind[:, None] == jnp.arange(1, 5)).astype(jnp.float32)], axis=-1
-    )
+    parts = {
+        "length": lambda: now.box[chosen, 4:5] / SIZE_M,
+        "width": lambda: now.box[chosen, 5:6] / SIZE_M,
+        "height": lambda: bank.agent_box[scene.index, chosen, 2:3] / SIZE_M,
+        "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
+    }
+    static = joined(chosen_features, parts, (config.agents,))
     static = jnp.broadcast_to(static[:, None], (*moving.shape[:2], static.shape[-1]))
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
@@ -216,8 +281,11 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
     x, y, layer = bank.road_at[scene.index]
     dx, dy = x - view.xy[0], y - view.xy[1]
     ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
-    inside = (ahead < ROAD_AHEAD_M) & (ahead > -ROAD_BEHIND_M) & (jnp.abs(left) < ROAD_SIDE_M)
-    inside &= (layer != ROAD_NONE) if config.edges else (layer != ROAD_NONE) & (layer != ROAD_EDGE)
+    inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
+    inside &= (jnp.abs(left) < config.road_side_m) & (layer != ROAD_NONE)
+    layers = ((config.lanes, ROAD_LANE), (config.edges, ROAD_EDGE), (config.crosswalks, ROAD_AREA))
+    for hidden in [kind for shown, kind in layers if not shown]:
+        inside &= layer != hidden
     # Compact without sorting: the running count says where each row inside goes.
     running = running_count(inside)
     place = jnp.where(inside, running - 1, config.road)
@@ -232,6 +300,8 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
         jnp.maximum(limit, 0.0) / SPEED_MPS,
         (limit > 0).astype(jnp.float32),
     ]
+    if "curvature" in config.features.road:
+        parts.append(shown_curvature(bank.road_curvature[scene.index, take])[:, None])
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
@@ -252,20 +322,47 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     return jnp.stack([row + before for row in within], axis=-1).reshape(-1)[:count].astype(jnp.int32)
 
 
+def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+    """The road group as configured: pieces cut, moved by noise, of the chosen columns."""
+    wanted, noisy = config.features.road, config.perception.noise_m > 0
+    pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
+    found = _road(pieces, bank, scene, view)
+    if config.road_cut == 1 and wanted == Features().road and not noisy:
+        return found
+    rows, mask = found["road"], found["road_mask"]
+    if config.road_cut > 1:
+        rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
+    if noisy:
+        rows = rows.at[:, :2].add(moved_road(config.perception, scene, config.road) / POSITION_M)
+    columns = columns_of("road", wanted) + ([rows.shape[-1] - 1] if "curvature" in wanted else [])
+    return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
+
+
 def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     line = bank.light_line[scene.index]
     state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
     dx, dy = line[LIGHT_X] - view.xy[0], line[LIGHT_Y] - view.xy[1]
     # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
     seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
-    on_route = line[LIGHT_ARC] < NEVER_M
+    perception, on_route = config.perception, line[LIGHT_ARC] < NEVER_M
+    if perception.of_lights:
+        seen &= lights_seen(perception, scene, jnp.sqrt(dx * dx + dy * dy))
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
-    colour = _colour(state[chosen])
-    middle = line[LIGHT_X : LIGHT_Y + 1, chosen].T
-    parts = [view.point(middle) / POSITION_M, colour, on_route[chosen, None].astype(jnp.float32)]
-    return _masked("lights", jnp.concatenate(parts, axis=-1), there)
+
+    def place() -> Float[Array, "K 2"]:
+        middle = view.point(line[LIGHT_X : LIGHT_Y + 1, chosen].T)
+        if perception.noise_m > 0:
+            middle = middle + moved_lights(perception, scene, state.shape[0])[chosen]
+        return middle / POSITION_M
+
+    parts = {
+        "position": place,
+        "state": lambda: _colour(state[chosen]),
+        "on_route": lambda: on_route[chosen, None].astype(jnp.float32),
+    }
+    return _masked("lights", joined(config.features.lights, parts, ()), there)
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
@@ -279,13 +376,19 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
 def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    # Without a route on lanes the bank holds the log's own path, which nobody may see.
-    there &= ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
-    direction = view.vector(rows[:, 3:5])
+    there &= has_route(bank, scene)
     limit = rows[:, ROUTE_LIMIT : ROUTE_LIMIT + 1]
-    parts = [
-        view.point(rows[:, :2]) / POSITION_M,
-        direction[:, ::-1],
-        jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
-    ]
-    return _masked("route", jnp.concatenate(parts, axis=-1), there)
+
+    def curvature() -> Float[Array, "K 1"]:
+        return route_curvature(bank, scene.index, scene.route_m + offsets)[:, None]
+
+    goal = bank.goal[scene.index]
+    parts = {
+        "position": lambda: view.point(rows[:, :2]) / POSITION_M,
+        "heading": lambda: view.vector(rows[:, 3:5])[:, ::-1],
+        "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
+        "curvature": lambda: shown_curvature(curvature()),
+        "recommended_speed": lambda: recommended_speed(curvature()) / SPEED_MPS,
+        "goal": lambda: jnp.broadcast_to(goal_ahead(view.point(goal)), (config.route, 2)),
+    }
+    return _masked("route", joined(config.features.route, parts, ()), there)

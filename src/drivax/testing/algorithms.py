@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState
+from drivax.learning.driving import Driving
 from drivax.named import find_named
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
@@ -53,7 +54,7 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
         "count environment steps as a whole number",
     )
     bank, simulator = worlds.worlds(), Simulator(_TASK)
-    learner = found.build(simulator, bank, _ITERATIONS)
+    learner = found.build(Driving(simulator), bank, _ITERATIONS)
     expect(isinstance(learner, Learner), f"{what} builds no Learner", "give it init, iterate and planner")
     state = _check_iterations(what, learner, bank)
     _check_planner(what, learner, bank, simulator, state.parameters)

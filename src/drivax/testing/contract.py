@@ -57,8 +57,21 @@ def compiled(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
     Raises:
         BrokenContract: It cannot be compiled.
     """
-    with _told(what):
-        return jax.device_get(jax.jit(lambda *values: function(*values))(*arguments))
+    return program(what, function)(*arguments)
+
+
+def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function under ``jit``, traced once for all arguments of one form, that gives numpy arrays.
+
+    It raises :class:`BrokenContract` where the function cannot be compiled.
+    """
+    run = jax.jit(lambda *values: function(*values))
+
+    def call(*arguments: Any) -> Any:
+        with _told(what):
+            return jax.device_get(run(*arguments))
+
+    return call
 
 
 class Program:

@@ -11,7 +11,7 @@ from flax import nnx
 
 from drivax.named import find_named
 from drivax.networks.encoders import EncoderConfig
-from drivax.testing.contract import CLOSE, check_numbers, compiled, expect, same
+from drivax.testing.contract import CLOSE, check_numbers, expect, program, same
 from drivax.testing.worlds import GARBAGE
 
 #: Groups with one and two axes of rows, with and without masks; the second set lacks some.
@@ -45,7 +45,8 @@ def check_encoder(config: EncoderConfig | str) -> None:
     for number, spec in enumerate(_SPECS):
         encoder: Any = found.build(spec, nnx.Rngs(0))
         batch = _observations(spec, number)
-        embedding = compiled(what, encoder, batch)
+        run = program(what, encoder)
+        embedding = run(batch)
         width = getattr(encoder, "width", None)
         expect(
             embedding.shape == (_BATCH, width) and embedding.dtype == jnp.float32,
@@ -54,8 +55,8 @@ def check_encoder(config: EncoderConfig | str) -> None:
         )
         check_numbers(what, embedding)
         _check_state(what, found, spec, encoder)
-        _check_rows(what, encoder, batch, embedding)
-        _check_masks(what, encoder, spec, batch, embedding)
+        _check_rows(what, encoder if number == 0 else run, run, batch, embedding)
+        _check_masks(what, run, spec, batch, embedding)
         _check_gradients(what, encoder, batch)
 
 
@@ -85,10 +86,9 @@ def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> N
     )
 
 
-def _check_rows(what: str, encoder: Any, batch: Any, embedding: Any) -> None:
+def _check_rows(what: str, encoder: Any, run: Any, batch: Any, embedding: Any) -> None:
     one = jax.tree.map(lambda leaf: leaf[0], batch)
-    for result in (encoder(one), jax.tree.map(lambda leaf: leaf[None, None], one)):
-        result = encoder(result)[0, 0] if isinstance(result, dict) else result
+    for result in (encoder(one), run(jax.tree.map(lambda leaf: leaf[None, None], one))[0, 0]):
         expect(
             same(embedding[0], jax.device_get(result), CLOSE),
             f"{what} embeds an observation differently alone and in a batch",
@@ -98,22 +98,20 @@ def _check_rows(what: str, encoder: Any, batch: Any, embedding: Any) -> None:
     expect(spread > 0, f"{what} embeds all observations alike", "let it read the groups")
 
 
-def _check_masks(what: str, encoder: Any, spec: Any, batch: Any, embedding: Any) -> None:
+def _check_masks(what: str, run: Any, spec: Any, batch: Any, embedding: Any) -> None:
     masked = [name for name in spec if f"{name}_mask" in spec]
     littered, nobody = dict(batch), dict(batch)
     for name in masked:
         there = batch[f"{name}_mask"][..., None]
         littered[name] = jnp.where(there, batch[name], GARBAGE)
         nobody[f"{name}_mask"] = jnp.zeros_like(batch[f"{name}_mask"])
-    other = compiled(what, encoder, littered)
+    other = run(littered)
     expect(
         same(embedding, other, CLOSE),
         f"{what} changes with what masked rows hold",
         "use jnp.where(mask[..., None], rows, 0) first, and mask after every bias",
     )
-    check_numbers(
-        f"{what} without any row", compiled(what, encoder, nobody), "a mean or softmax over no rows"
-    )
+    check_numbers(f"{what} without any row", run(nobody), "a mean or softmax over no rows")
 
 
 def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
@@ -123,8 +121,9 @@ def _check_gradients(what: str, encoder: Any, batch: Any) -> None:
     def loss(parameters: Any, batch: Any) -> Any:
         return jnp.mean(nnx.merge(graph, parameters)(batch) ** 2)
 
+    run = program(what, jax.grad(loss))
     for groups in (batch, nobody):
-        gradient = compiled(what, jax.grad(loss), parameters, groups)
+        gradient = run(parameters, groups)
         finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
         expect(
             finite, f"{what} has gradients that are not finite", "guard roots and divisions on their input"

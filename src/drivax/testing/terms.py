@@ -14,7 +14,7 @@ from drivax.metrics.outcomes import Ending
 from drivax.metrics.scores import Value
 from drivax.metrics.steps import Moment
 from drivax.named import find_named
-from drivax.simulator.types import FACTS
+from drivax.simulator.types import FACTS, ON_REQUEST
 from drivax.tasks.own import own_name
 from drivax.tasks.rewards import Term
 from drivax.testing import worlds
@@ -126,7 +126,7 @@ def _check_rows(what: str, value: Any) -> None:
 
 def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[str]) -> None:
     """Whether a value computes when the facts that it does not name are missing, as they are in a lean run."""
-    unknown = sorted(reads - FACTS)
+    unknown = sorted(reads - FACTS - ON_REQUEST)
     expect(not unknown, f"{what} reads {unknown[:1]}, which is no fact", "see simulator.types.Facts")
     moments = worlds.without_facts(worlds.moments(), reads)
     try:

@@ -26,7 +26,7 @@ from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
 from drivax.simulator.traffic import alone
-from drivax.simulator.types import Facts, Frame, Situation, Surroundings
+from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Situation, Surroundings
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task
 
@@ -114,7 +114,7 @@ def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Si
     scene = replace(scene, history=jnp.concatenate([shifted, moved], axis=-1))
     now, previous = (simulator.frame(bank, scene, alone(scene), back) for back in (0, 1))
     apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
-    return measure(bank, scene, now, previous, apart, remember_lights(bank, scene))[0]
+    return measure(bank, scene, now, previous, apart, remember_lights(bank, scene), FACTS | ON_REQUEST)[0]
 
 
 def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:

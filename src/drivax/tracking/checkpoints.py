@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -52,7 +53,8 @@ class Checkpoints:
     def best(self) -> int | None:
         """The step with the highest score (the later one of equals), None when no checkpoint has a score."""
         scores = [(self.about(step)["score"], step) for step in self.steps()]
-        known = [(score, step) for score, step in scores if score is not None]
+        # One number, or several of which the first that differs decides.
+        known = [(tuple(np.atleast_1d(score)), step) for score, step in scores if score is not None]
         return max(known)[1] if known else None
 
     def about(self, step: int) -> dict[str, Any]:
@@ -72,19 +74,20 @@ class Checkpoints:
         except ValueError as error:
             raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
 
-    def save(self, step: int, state: Any, score: float | None = None) -> Path:
+    def save(self, step: int, state: Any, score: float | Sequence[float] | None = None) -> Path:
         """Store a state and drop checkpoints that need not stay.
 
         Args:
             step: Training step; an existing checkpoint of it is replaced.
             state: Pytree of JAX or numpy arrays (typed keys too) and Python numbers.
-            score: What "best" compares; higher is better. NaN counts as none.
+            score: What "best" compares; higher is better. Of several numbers the first that differs decides. NaN
+                counts as none.
 
         Returns:
             The folder of the checkpoint.
         """
         arrays, leaves = _describe(state)
-        score = None if score is None or np.isnan(score) else float(score)
+        score = None if score is None or np.isnan(score).any() else np.asarray(score, float).tolist()
         final = self._path(step)
         partial = self.folder / f".step-{step}.partial-{os.getpid()}"
         shutil.rmtree(partial, ignore_errors=True)
@@ -101,6 +104,12 @@ class Checkpoints:
             shutil.rmtree(partial, ignore_errors=True)
         self._drop()
         return final
+
+    def drop_after(self, step: int) -> None:
+        """Drop all checkpoints of later steps: they belong to a run that was cut off."""
+        for later in self.steps():
+            if later > step:
+                self._remove(later)
 
     def restore(self, template: State, step: int | None = None, part: str = "") -> State:
         """The stored state, or a part of it.
@@ -142,10 +151,13 @@ class Checkpoints:
             stay.add(self.best() or steps[-1])
         for step in steps:
             if step not in stay:
-                # Renamed first: a half-deleted folder must not look like a checkpoint.
-                doomed = self.folder / f".step-{step}.old-{os.getpid()}"
-                self._path(step).rename(doomed)
-                shutil.rmtree(doomed, ignore_errors=True)
+                self._remove(step)
+
+    def _remove(self, step: int) -> None:
+        # Renamed first: a half-deleted folder must not look like a checkpoint.
+        doomed = self.folder / f".step-{step}.old-{os.getpid()}"
+        self._path(step).rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
 
 
 def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[str, Any]]]:

@@ -127,6 +127,19 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
 
+def seed_folders(path: str | Path) -> list[Path]:
+    """The run folders that a path stands for: those that ``drivax train --seeds`` wrote inside it, or itself."""
+    path = Path(path)
+    try:
+        info = json.loads((path / RUN_FILE).read_bytes())
+    except (OSError, ValueError):
+        return [path]  # whoever opens it tells what is wrong
+    if not isinstance(info, dict) or info.get("kind") != "seeds":
+        return [path]
+    found = path.glob("seed-*/" + RUN_FILE)
+    return sorted((file.parent for file in found), key=lambda folder: int(folder.name.removeprefix("seed-")))
+
+
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
     """Facts about this process, its program, its data and its machine, as plain JSON values."""
     return {

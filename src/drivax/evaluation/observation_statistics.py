@@ -1,0 +1,316 @@
+"""What the features of an observation are like, and which of them matter: for failures, and to a policy.
+
+Moments of closed-loop episodes are looked at, ``every`` steps apart. Of each column of each group: mean, spread and
+extremes over all valid rows; how many entries are not finite; how it goes with collisions; how much the planner's
+action depends on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.evaluation.rollout import advanced, judging
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.types import SimState
+from drivax.tasks.features import feature_names
+from drivax.tasks.task import Task
+
+#: Steps between two looks, scenarios that run side by side, and states on which features are permuted.
+EVERY, BATCH, PERMUTED = 10, 64, 512
+Values = np.ndarray[Any, Any]
+
+
+@record
+class Looks:
+    """Moments of episodes, ``[episode, look]``.
+
+    Attributes:
+        state, carry: What the planner acts on beside the observation.
+        key: What it draws from.
+        observation: The observation.
+        hit: Whether ego has collided by then.
+        collides: Whether it collides at all until the end of the log, ``[episode]``.
+    """
+
+    state: SimState
+    carry: Any
+    key: Array
+    observation: dict[str, Array]
+    hit: Bool[Array, "*batch look"]
+    collides: Bool[Array, "*batch"]
+
+
+@dataclass(frozen=True)
+class FeatureStatistics:
+    """One column of one group. What cannot be said is NaN.
+
+    Attributes:
+        group, name: The group and the column.
+        count: Finite entries of valid rows.
+        broken: Entries that are NaN or infinite, of masked rows too.
+        mean, std, low, high: Of the finite entries of valid rows.
+        collision: Correlation with collisions (:func:`collision_correlation`).
+        importance: Change of the planner's action when the column is permuted (:func:`importances`).
+    """
+
+    group: str
+    name: str
+    count: int
+    broken: int
+    mean: float
+    std: float
+    low: float
+    high: float
+    collision: float
+    importance: float
+
+
+@dataclass(frozen=True)
+class ObservationStatistics:
+    """Statistics of all columns.
+
+    Attributes:
+        planner: Who drove.
+        episodes, collisions: How many episodes, and how many of them with a collision.
+        states: Moments that were looked at.
+        permuted: Moments on which features were permuted; 0 for none.
+        features: Statistics of each column, group by group.
+        groups: Importance of each group as a whole, where features were permuted.
+    """
+
+    planner: str
+    episodes: int
+    collisions: int
+    states: int
+    permuted: int
+    features: tuple[FeatureStatistics, ...]
+    groups: Mapping[str, float]
+
+    @property
+    def broken(self) -> int:
+        """Entries that are NaN or infinite."""
+        return sum(feature.broken for feature in self.features)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; what cannot be said is null."""
+        rows = [{name: _plain(value) for name, value in asdict(one).items()} for one in self.features]
+        about = {
+            name: getattr(self, name) for name in ("planner", "episodes", "collisions", "states", "permuted")
+        }
+        return about | {"groups": {n: _plain(v) for n, v in self.groups.items()}, "features": rows}
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def observation_statistics(
+    planner: Planner, bank: ScenarioBank, task: Task, *, permute: bool, every: int = EVERY, seed: int = 0
+) -> ObservationStatistics:
+    """Drives every scenario of a bank from its current step to the end, and describes what was observed on the way.
+
+    Args:
+        planner: The driver; ``expert`` for the log itself.
+        bank: The scenarios.
+        task: Whose observations, and whose actions.
+        permute: Whether to measure the importance of features to the planner.
+        every: Steps between two looks.
+        seed: Of the planner, as in an evaluation, and of the permutations.
+
+    Raises:
+        UsageError: The planner acts in another action space than the task.
+    """
+    if getattr(planner, "actions", task.actions) != task.actions:
+        raise UsageError(
+            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
+        )
+    simulator = Simulator(judging(task))
+    looks = look_at(simulator, planner, bank, every, seed)
+    seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
+    hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
+    names = feature_names(task.observation.features, {name: leaf.shape[2:] for name, leaf in seen.items()})
+    columns, groups, permuted = {}, {}, 0
+    if permute:
+        rows = np.unique(np.linspace(0, hit.size - 1, min(PERMUTED, hit.size)).round().astype(int))
+        known, permuted = (looks.state, looks.carry, looks.key, looks.observation), len(rows)
+        *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], known)
+        act = partial(_actions, simulator, planner, bank, *rest)
+        columns, groups = importances(act, jax.device_get(shown), seed)
+    features = []
+    for group, parts in names.items():
+        mask = seen.get(f"{group}_mask")
+        for column, name in enumerate(parts):
+            values = seen[group][..., column]
+            valid = np.ones(values.shape, bool) if mask is None else mask
+            correlation = collision_correlation(values, valid & ~_wide(hit, valid), collides)
+            importance = columns.get((group, column), float("nan"))
+            features.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, importance))
+    return ObservationStatistics(
+        planner.name, len(collides), int(collides.sum()), hit.size, permuted, tuple(features), groups
+    )
+
+
+def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0) -> Looks:
+    """Moments of one episode per scenario; the episodes are those of an evaluation with this seed."""
+    root, parts = jax.random.key(seed), []
+    for first in range(0, len(bank), BATCH):
+        rows = np.arange(first, min(first + BATCH, len(bank)))
+        size = min(BATCH, len(bank))
+        # A short last batch repeats its last scenario, so that one compilation serves all.
+        index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
+        keys = jax.vmap(lambda row: jax.random.fold_in(root, row))(index)
+        found = _looks(simulator, planner, bank, index, keys, every)
+        kept = len(rows)
+        parts.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], found))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+@partial(jax.jit, static_argnames=("simulator", "every"))
+def _looks(
+    simulator: Simulator,
+    planner: Planner,
+    bank: ScenarioBank,
+    index: Int[Array, " B"],
+    keys: Array,
+    every: int,
+) -> Looks:
+    return jax.vmap(partial(_episode, simulator, planner, bank, every))(index, keys)
+
+
+def _episode(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, index: Array, key: Array
+) -> Looks:
+    state = simulator.reset(bank, index)
+    begin_key, key = jax.random.split(key)
+    carry = planner.init(bank, state, begin_key)
+    actions = bank.steps - 1 - CURRENT_STEP
+    keys = jax.random.split(key, actions)
+
+    def step(now: Any, key: Array) -> tuple[Any, None]:
+        state, carry, hit = now
+        state, carry = advanced(simulator, planner, bank, state, carry, key)
+        return (state, carry, hit | state.facts.collision), None
+
+    def look(now: Any, keys: Array) -> tuple[Any, Any]:
+        state, carry, hit = now
+        seen = state, carry, keys[0], dict(simulator.observe(bank, state.scene)), hit
+        return jax.lax.scan(step, now, keys)[0], seen
+
+    whole = actions - actions % every
+    first = (state, carry, state.facts.collision)
+    now, seen = jax.lax.scan(look, first, keys[:whole].reshape(-1, every))
+    (_, _, hit), _ = jax.lax.scan(step, now, keys[whole:])
+    return Looks(*seen, collides=hit)
+
+
+@partial(jax.jit, static_argnames=("simulator",))
+def _actions(
+    simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array,
+    observation: dict[str, Array],
+) -> Float[Array, "M D"]:  # fmt: skip
+    """What the planner would do in these states, had it observed this."""
+
+    def act(state: SimState, carry: Any, key: Array, observation: dict[str, Array]) -> Array:
+        return planner.act(carry, bank, state, simulator.situation(bank, state), observation, key)[0]
+
+    return jax.vmap(act)(state, carry, key, observation)
+
+
+def _wide(flags: Values, like: Values) -> Values:
+    """Flags ``[episode, look]`` with the row axes of a mask."""
+    return flags.reshape(*flags.shape, *(1,) * (like.ndim - flags.ndim))
+
+
+def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:
+    """How many entries count and how many are broken; mean, standard deviation, smallest and largest of the former."""
+    finite = np.isfinite(values)
+    kept, broken = values[valid & finite].astype(np.float64), int((~finite).sum())
+    if not kept.size:
+        nothing = float("nan")
+        return 0, broken, nothing, nothing, nothing, nothing
+    return kept.size, broken, float(kept.mean()), float(kept.std()), float(kept.min()), float(kept.max())
+
+
+def collision_correlation(values: Values, valid: Values, collides: Values) -> float:
+    """Point-biserial correlation of a column with collisions, over episodes.
+
+    Correlated are, per episode, the mean of the column over the valid rows of its looks before the first collision, and
+    whether the episode has a collision (1) or none (0). Episodes in which nothing counts are left out.
+
+    Args:
+        values: ``[episode, look, ...]``.
+        valid: Which entries count, same shape.
+        collides: ``[episode]``.
+
+    Returns:
+        Pearson's r, which for a quantity of two values is the point-biserial one (Tate 1954); NaN where all episodes
+        are of one kind or have the same mean.
+    """
+    counts = (valid & np.isfinite(values)).reshape(len(values), -1)
+    total = np.where(counts, values.reshape(len(values), -1), 0.0).sum(axis=1, dtype=np.float64)
+    there = counts.any(axis=1)
+    mean = total[there] / counts.sum(axis=1)[there]
+    outcome = collides[there].astype(np.float64)
+    # A column that is constant but for rounding correlates with nothing.
+    if len(mean) < 3 or outcome.std() == 0 or mean.std() <= 1e-6 * max(np.abs(mean).max(), 1e-6):
+        return float("nan")
+    return float(((mean - mean.mean()) * (outcome - outcome.mean())).mean() / (mean.std() * outcome.std()))
+
+
+def importances(
+    act: Callable[[dict[str, Any]], Any], observation: Mapping[str, Values], seed: int = 0
+) -> tuple[dict[tuple[str, int], float], dict[str, float]]:
+    """How much actions change when a feature is permuted (Breiman 2001; of the action, not of a loss).
+
+    A column's entries in valid rows change places among all states, rows and past steps; masks stay. A group as a whole
+    is exchanged between states, mask included. The change is the root mean square over states and action numbers of the
+    difference to the action for what was really observed, each number divided by its standard deviation over the
+    states: 0 means that the feature does not matter, 1.41 that the action is as good as that of another state.
+
+    Args:
+        act: From a batch of observations to actions ``[state, D]``.
+        observation: What was observed, ``[state, ...]`` by group.
+        seed: Of the permutations.
+
+    Returns:
+        The change by (group, column), and by group; NaN where the action never changes from state to state.
+    """
+    rng = np.random.default_rng(seed)
+    before = np.asarray(act(dict(observation)), np.float64)
+    std = before.std(axis=0)
+    varies = std > 1e-6
+
+    def change(altered: dict[str, Values]) -> float:
+        if not varies.any():
+            return float("nan")
+        apart = (np.asarray(act(dict(observation) | altered), np.float64) - before)[:, varies] / std[varies]
+        return float(np.sqrt(np.mean(apart**2)))
+
+    columns, groups = {}, {}
+    for group, values in observation.items():
+        own = f"{group}_mask"
+        if group.removesuffix("_mask") in observation and group.endswith("_mask"):
+            continue
+        order = rng.permutation(len(values))
+        groups[group] = change(
+            {name: observation[name][order] for name in (group, own) if name in observation}
+        )
+        valid = observation.get(own, np.ones(values.shape[:-1], bool))
+        for column in range(values.shape[-1]):
+            permuted = np.array(values)
+            permuted[valid, column] = rng.permutation(values[valid, column])
+            columns[group, column] = change({group: permuted})
+    return columns, groups

@@ -1,0 +1,188 @@
+"""Driving as an environment: scenarios drawn from a bank, episodes from anywhere in the log to its end or a failure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.learning.branches import in_any
+from drivax.learning.environment import Environments, Outcome
+from drivax.metrics.catalogue import CODES
+from drivax.metrics.episode import episode_metrics
+from drivax.planners.simple import expert_action
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP, STEPS
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.sparse import map_where
+from drivax.simulator.starts import LogStart
+from drivax.simulator.types import Beginning, Frame, Scene, SimState
+from drivax.tasks.actions import Discrete
+from drivax.tasks.task import Task
+
+
+@dataclass(frozen=True)
+class Driving:
+    """A simulator whose scenarios are drawn with replacement.
+
+    Attributes:
+        simulator: Task, traffic and kind of start.
+        latest_start: Episodes begin at a random step of the log between 10 and this one.
+    """
+
+    simulator: Simulator
+    latest_start: int = CURRENT_STEP
+
+    def __post_init__(self) -> None:
+        if not CURRENT_STEP <= self.latest_start < STEPS - 2:
+            raise UsageError(
+                f"latest_start is {self.latest_start}", cure=f"use {CURRENT_STEP} to {STEPS - 3}"
+            )
+
+    @property
+    def task(self) -> Task:
+        """The task, with its action space.
+
+        Raises:
+            UsageError: The simulator's is not of our kind.
+        """
+        if not isinstance(self.simulator.task, Task):
+            raise UsageError(
+                f"{type(self.simulator.task).__name__} has no actions", cure="use drivax.tasks.task.Task"
+            )
+        return self.simulator.task
+
+    @property
+    def action_size(self) -> int:
+        """Numbers in an action."""
+        return self.task.actions.size
+
+    @property
+    def levels(self) -> tuple[tuple[float, ...], ...] | None:
+        """The levels of the action space ``discrete``."""
+        actions = self.task.actions
+        if not isinstance(actions, Discrete):
+            return None
+        return tuple(tuple(float(level) for level in levels) for levels in actions.levels())
+
+    def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
+        """Shapes of one observation by group."""
+        # How an episode begins changes no shape; as logged is the quickest to trace.
+        simulator = replace(self.simulator, start=LogStart())
+        seen = jax.eval_shape(
+            lambda bank: simulator.observe(bank, simulator.scene(bank, 0, CURRENT_STEP)), data
+        )
+        return {name: tuple(value.shape) for name, value in seen.items()}
+
+    def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
+        """Environments at random steps of the log, so that their ends are staggered."""
+        index, step, keys = _draw(data, key, count, data.steps - 3)
+        state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
+        observation = self.observe_all(data, state.scene)
+        return Environments(state, jnp.zeros(count, bool), observation)
+
+    def stored(self, state: SimState) -> Scene:
+        """The scene: index, step, history, and the traffic where it reacts."""
+        return state.scene
+
+    def observe(self, data: ScenarioBank, stored: Scene) -> dict[str, Array]:
+        """The task's observation of a scene."""
+        return dict(self.simulator.observe(data, stored))
+
+    def observe_all(self, data: ScenarioBank, stored: Scene) -> dict[str, Array]:
+        """The task's observations of a batch of scenes."""
+        return jax.vmap(self.observe, (None, 0))(data, stored)
+
+    def look(self, data: ScenarioBank, state: SimState) -> Frame:
+        """Everyone: the next step moves on from the frame that the present observation was made of."""
+        return jax.vmap(self.simulator.now, (None, 0))(data, state.scene)
+
+    def step(
+        self, data: ScenarioBank, now: Environments, looked: Frame, action: Float[Array, "B D"], key: Array
+    ) -> tuple[Environments, Outcome]:
+        """One step of every environment; those that are over begin with another scenario instead."""
+        count = now.over.shape[0]
+        index, step, keys = _draw(data, key, count, self.latest_start)
+        fresh = map_where(now.over, partial(self._beginning, data), index, step, keys)
+        step_all = jax.vmap(self.simulator.step_or_begin, (None, 0, 0, 0, 0, 0))
+        state, made = step_all(data, now.state, action, now.over, fresh, looked)
+        over = made.terminated | made.truncated
+        outcome = Outcome(
+            reward=made.reward,
+            terminated=made.terminated,
+            truncated=made.truncated,
+            looked=self.look(data, state),
+            totals=_totals(data, state, made.reward_terms, over, now.over),
+        )
+        return Environments(state, over, self.observe_all(data, state.scene)), outcome
+
+    def _beginning(self, data: ScenarioBank, index: Array, step: Array, key: Array) -> Beginning:
+        return self.simulator.beginning(data, index, step, 0, key)
+
+    def demonstrations(
+        self, data: ScenarioBank, key: Array, count: int
+    ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
+        """Random moments of the log, and what the expert did there.
+
+        Moments lie between the current step and the last but one (an expert's action looks two steps ahead), in
+        scenarios drawn with replacement. A moment is as if the expert had driven there in the simulator: its last
+        action is what the action space makes of the log, as carried out.
+
+        Returns:
+            Observations, the expert's actions within the bounds, and whether it took clipping to get them there.
+        """
+        index, step, _ = _draw(data, key, count, data.steps - 3)
+        return jax.vmap(self._demonstration, (None, 0, 0))(data, index, step)
+
+    def _demonstration(
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]
+    ) -> tuple[dict[str, Array], Float[Array, " D"], Bool[Array, ""]]:
+        space = self.task.actions
+        simulator = replace(self.simulator, start=LogStart())
+        scene, before = simulator.scene(bank, index, step), simulator.scene(bank, index, step - 1)
+        did = space.actuated(before.history[-1], expert_action(bank, before, space), before.action)
+        scene = replace(scene, action=did)
+        action = expert_action(bank, scene, space)
+        bounded = space.actuated(scene.history[-1], action, scene.action)
+        return self.observe(bank, scene), bounded, space.clipped(action)
+
+
+def _draw(
+    bank: ScenarioBank, key: Array, count: int, latest: int
+) -> tuple[Int[Array, " B"], Int[Array, " B"], Array]:
+    """Scenarios, steps from the current one to ``latest`` at which the ego is in the log, and keys for starts."""
+    index_key, step_key = jax.random.split(key)
+    index = jax.random.randint(index_key, (count,), 0, len(bank))
+    step = jax.random.randint(step_key, (count,), CURRENT_STEP, latest + 1)
+    # The ego is always there at the current step.
+    step = jnp.where(bank.agents[index, step, 0, AGENT_VALID] > 0, step, CURRENT_STEP)
+    keys = jax.random.split(jax.random.fold_in(step_key, 1), count)  # not computed where starts are logged
+    return index, step, keys
+
+
+def _totals(
+    bank: ScenarioBank, state: SimState, terms: dict[str, Array], done: Array, over: Array
+) -> dict[str, Array]:
+    """Sums over the batch: the task's metrics of episodes that end now, reward terms of steps that count."""
+    logged = [name for name in state.episode.selection.names if name not in CODES]
+
+    def of_episodes() -> dict[str, Array]:
+        values = jax.vmap(episode_metrics, (None, 0))(bank, state)
+        sums = {}
+        for name in logged:
+            counts = done & values[name].defined
+            sums[name] = jnp.sum(jnp.where(counts, values[name].value, 0.0))
+            sums[f"{name}/n"] = counts.sum().astype(jnp.float32)
+        return sums
+
+    # Most steps end no episode; the branch is on all batches of the program, so it really is skipped.
+    nothing = {name: jnp.zeros(()) for metric in logged for name in (metric, f"{metric}/n")}
+    totals: dict[str, Any] = jax.lax.cond(in_any(done), of_episodes, lambda: nothing)
+    for name, term in terms.items():
+        totals[f"reward/{name}"] = jnp.sum(jnp.where(over, 0.0, term))
+    return totals

@@ -1,0 +1,57 @@
+"""Run folders of training: one per agent; those of agents that learn side by side lie together in one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from drivax.errors import UsageError
+from drivax.learning.config import TrainConfig
+from drivax.scenario.store import ScenarioSet
+from drivax.tracking.runs import RunFolder, seed_folders
+
+
+def create_folders(
+    config: TrainConfig,
+    data: ScenarioSet,
+    validation: ScenarioSet | None,
+    out: Path,
+    seeds: tuple[int, ...],
+    overwrite: bool,
+) -> list[RunFolder]:
+    """The folder of each agent: ``out``, or for several ``out/seed-<seed>``.
+
+    Raises:
+        UsageError: ``out`` exists and ``overwrite`` is not given.
+    """
+    notes: dict[str, Any] = {"validation": None if validation is None else validation.hash}
+    if len(seeds) == 1:
+        return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
+    RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
+    return [
+        RunFolder.create(out / f"seed-{seed}", replace(config, seed=seed), [data], kind="training", **notes)
+        for seed in seeds
+    ]
+
+
+def resumed_folders(
+    data: ScenarioSet, validation: ScenarioSet | None, out: Path, seeds: int
+) -> tuple[TrainConfig, list[RunFolder]]:
+    """The configuration that a run began with, and the folder of each of its agents.
+
+    Raises:
+        UsageError: It was trained or validated on other scenarios, or with other seeds.
+    """
+    folder = RunFolder.open(out)
+    if folder.info.get("validation") != (None if validation is None else validation.hash):
+        raise UsageError(
+            "was validated on other scenarios", file=out, cure="resume with the same --validation"
+        )
+    trained_on = [entry.get("hash") for entry in folder.info.get("data", [])]
+    if trained_on != [data.hash]:
+        raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")
+    folders = [RunFolder.open(path) for path in seed_folders(out)]
+    if seeds not in (1, len(folders)):
+        raise UsageError(f"holds {len(folders)} agents, not {seeds}", file=out, cure="resume without --seeds")
+    return folder.config(TrainConfig), folders

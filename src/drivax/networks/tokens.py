@@ -1,0 +1,125 @@
+"""Groups of an observation as rows of tokens, by their shapes alone.
+
+A group with a mask is a set of rows; axes behind the rows are times, in order. A group without a mask is one row that
+is always there, with its times in order. So agents ``[rows, time, F]`` are a set of series, the points of a route
+``[rows, F]`` a set (their features say where they lie), and the ego's history ``[time, F]`` is one series.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Bool, Float
+
+from drivax.networks.attention import Dtype
+from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_names
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a group is.
+
+    Attributes:
+        shape: Its own axes, features last.
+        masked: Whether it has a mask.
+    """
+
+    shape: tuple[int, ...]
+    masked: bool
+
+    @property
+    def features(self) -> int:
+        """Numbers in one token."""
+        return self.shape[-1]
+
+    @property
+    def rows(self) -> int:
+        """How many rows may be there."""
+        return self.shape[0] if self.masked else 1
+
+    @property
+    def series(self) -> bool:
+        """Whether there is an axis of times, even with one time only."""
+        return len(self.shape) > (2 if self.masked else 1)
+
+    @property
+    def times(self) -> int:
+        """Tokens of a row."""
+        return math.prod(self.shape[:-1]) // self.rows
+
+
+class Rows(NamedTuple):
+    """Rows of tokens, and which of these are there."""
+
+    value: Float[Array, "*batch rows time width"]
+    mask: Bool[Array, "*batch rows time"]
+
+    def flat(self) -> tuple[Float[Array, "*batch tokens width"], Bool[Array, "*batch tokens"]]:
+        """All tokens side by side."""
+        *lead, rows, times, width = self.value.shape
+        return self.value.reshape(*lead, rows * times, width), self.mask.reshape(*lead, rows * times)
+
+
+def forms(spec: GroupSpec) -> dict[str, Form]:
+    """What every group is."""
+    return {name: Form(tuple(spec[name]), f"{name}_mask" in spec) for name in group_names(spec)}
+
+
+def raw_rows(groups: Groups, name: str, form: Form) -> Rows:
+    """A group's features as rows of times; those that are not there are zero."""
+    value = groups[name].astype(jnp.float32)
+    axes = (*value.shape[: value.ndim - len(form.shape)], form.rows, form.times)
+    value = value.reshape(*axes, form.features)
+    mask = groups[f"{name}_mask"].reshape(axes) if form.masked else jnp.ones(axes, bool)
+    return Rows(jnp.where(mask[..., None], value, 0.0) if form.masked else value, mask)
+
+
+def time_code(times: int, width: int) -> Float[np.ndarray, "time width"]:
+    """Sines and cosines of the time counted back from the last one, which is 0 (Vaswani et al. 2017, section 3.5)."""
+    back = np.arange(times - 1, -1, -1)[:, None]
+    angle = back / 10_000 ** (2 * np.arange((width + 1) // 2) / width)
+    return np.stack([np.sin(angle), np.cos(angle)], axis=-1).reshape(times, -1)[:, :width].astype(np.float32)
+
+
+class Embedding(nnx.Module):
+    """Features -> normalised tokens: dense layers of each group's own, plus a code of the time where there is one.
+
+    Features are embedded in float32, whatever the encoder computes in: eight bits would move a point 50 m away by
+    20 cm.
+    """
+
+    def __init__(
+        self, spec: GroupSpec, width: int, hidden: tuple[int, ...], rngs: nnx.Rngs, dtype: Dtype
+    ) -> None:
+        self.forms = forms(spec)
+        self.dtype = dtype
+        self.hidden, self.out, self.norms = nnx.Dict(), nnx.Dict(), nnx.Dict()
+        for name, form in self.forms.items():
+            self.hidden[name] = dense_layers(form.features, hidden, rngs)
+            self.out[name] = nnx.Linear(hidden[-1] if hidden else form.features, width, rngs=rngs)
+            self.norms[name] = nnx.LayerNorm(width, rngs=rngs)
+        self.width = width
+
+    def __call__(self, groups: Groups) -> dict[str, Rows]:
+        """The tokens of every group, by its name."""
+        return {name: self._rows(groups, name) for name in self.forms}
+
+    def _rows(self, groups: Groups, name: str) -> Rows:
+        form = self.forms[name]
+        x, mask = raw_rows(groups, name, form)
+        for layer in self.hidden[name]:
+            x = nnx.relu(layer(x))
+        x = self.out[name](x)
+        if form.series:
+            x = x + jnp.asarray(time_code(form.times, self.width))
+        return Rows(self.norms[name](x).astype(self.dtype), mask)
+
+
+def side_by_side(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Tokens and masks of several groups as one."""
+    return jnp.concatenate([x for x, _ in parts], axis=-2), jnp.concatenate([m for _, m in parts], axis=-1)

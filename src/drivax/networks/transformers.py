@@ -1,0 +1,280 @@
+"""Attention encoders over groups with masks: latent queries (``lq``, ``lqh``, ``wayformer``) and ``mtr``.
+
+Layers normalise before they act (pre-norm) and rows that are not there are never looked at. See
+``docs/algorithms/encoders.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float
+
+from drivax.networks.attention import Attend, Dtype, FeedForward, SelfAttention, masked_mean
+from drivax.networks.encoders import Groups, GroupSpec
+from drivax.networks.tokens import Embedding, Rows, forms, side_by_side
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a transformer; see :class:`TransformerConfig`."""
+
+    width: int
+    heads: int
+    layers: int
+    latents: int
+    embedding: tuple[int, ...]
+    dtype: Dtype = "float32"
+
+
+SIZES = {
+    "published": Sizes(width=256, heads=8, layers=4, latents=16, embedding=()),
+    "small": Sizes(width=64, heads=4, layers=2, latents=8, embedding=(64,)),
+}
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """What all transformers have. Sizes that are not given are those of ``size``.
+
+    Attributes:
+        kind: Which encoder.
+        size: ``published`` (width 256, 8 heads, 4 layers, 16 latents, linear embedding) or ``small`` (64, 4, 2, 8, one
+            hidden layer of 64).
+        width: Of tokens and of the encoder's result; a multiple of ``heads``.
+        heads: Of every attention.
+        layers: Depth.
+        embedding: Hidden layers, with relu, between a row's features and its token; empty: a linear map.
+        dtype: Of the products of matrices; parameters, softmax and norms are float32.
+    """
+
+    kind: str = ""
+    size: Literal["published", "small"] = "small"
+    width: int | None = None
+    heads: int | None = None
+    layers: int | None = None
+    embedding: tuple[int, ...] | None = None
+    dtype: Dtype = "float32"
+
+    def __post_init__(self) -> None:
+        sizes = self.sizes
+        counts = (sizes.width, sizes.heads, sizes.layers, sizes.latents, *sizes.embedding)
+        if min(counts) < 1:
+            raise ValueError(f"sizes of the encoder are {counts}; use at least 1")
+        if sizes.width % sizes.heads:
+            raise ValueError(f"width {sizes.width} is no multiple of {sizes.heads} heads")
+
+    @property
+    def sizes(self) -> Sizes:
+        """The sizes, none left open."""
+        given = {one.name: getattr(self, one.name, None) for one in fields(Sizes)}
+        return replace(
+            SIZES[self.size], **{name: value for name, value in given.items() if value is not None}
+        )
+
+
+@dataclass(frozen=True)
+class LatentConfig(TransformerConfig):
+    """A transformer with latent queries.
+
+    Attributes:
+        latents: How many.
+    """
+
+    latents: int | None = None
+
+
+@dataclass(frozen=True)
+class LqConfig(LatentConfig):
+    """Latent queries (Perceiver; Jaegle et al. 2021, arXiv 2103.03206): latents look at all tokens in every layer."""
+
+    kind: Literal["lq"] = "lq"
+
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
+        """The encoder with fresh parameters."""
+        return LatentEncoder(self.sizes, Fusion(0, self.sizes.layers, again=True), spec, rngs)
+
+
+@dataclass(frozen=True)
+class LqhConfig(LatentConfig):
+    """Latent queries per group, then latent queries over all of theirs.
+
+    Attributes:
+        local_layers: Depth per group; ``layers`` is that of what joins them.
+    """
+
+    kind: Literal["lqh"] = "lqh"
+    local_layers: int = 1
+
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
+        """The encoder with fresh parameters."""
+        fusion = Fusion(max(self.local_layers, 1), self.sizes.layers, again=True)
+        return LatentEncoder(self.sizes, fusion, spec, rngs)
+
+
+@dataclass(frozen=True)
+class WayformerConfig(LatentConfig):
+    """Wayformer (Nayakanti et al. 2022, arXiv 2207.05844): latents look once, then at each other.
+
+    Attributes:
+        fusion: ``early``: one encoder over all tokens; ``late``: one per group, whose latents are averaged;
+            ``hierarchical``: one layer per group, then ``layers`` over all their latents.
+        factorised: Whether tokens attend to each other first: times of a row, then rows of a time, within each group.
+    """
+
+    kind: Literal["wayformer"] = "wayformer"
+    fusion: Literal["early", "late", "hierarchical"] = "late"
+    factorised: bool = False
+
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
+        """The encoder with fresh parameters."""
+        layers = self.sizes.layers
+        local, whole = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}[self.fusion]
+        fusion = Fusion(local, whole, again=False, factorised=self.factorised)
+        return LatentEncoder(self.sizes, fusion, spec, rngs)
+
+
+@dataclass(frozen=True)
+class MtrConfig(TransformerConfig):
+    """After the Motion Transformer (Shi et al. 2022, arXiv 2209.13508).
+
+    Every mover attends to its own times, then in each layer to the other movers and to the map. Movers are the series
+    and whatever has no mask; the map are the other groups.
+    """
+
+    kind: Literal["mtr"] = "mtr"
+
+    def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MtrEncoder:
+        """The encoder with fresh parameters."""
+        return MtrEncoder(self.sizes, spec, rngs)
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """How latent queries come together.
+
+    Attributes:
+        local: Layers of latents that each group has for itself; 0: none.
+        whole: Layers of latents over everything so far; 0: none.
+        again: Whether latents look at the tokens before every layer, or before the first only.
+        factorised: Whether tokens of a group attend to each other first, over times, then over rows.
+    """
+
+    local: int
+    whole: int
+    again: bool
+    factorised: bool = False
+
+
+class _Latents(nnx.Module):
+    """Learned queries that look at tokens and at each other."""
+
+    def __init__(self, sizes: Sizes, layers: int, again: bool, rngs: nnx.Rngs) -> None:
+        width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
+        self.first = nnx.Param(nnx.initializers.normal(0.02)(rngs.params(), (sizes.latents, width)))
+        looks = layers if again else 1
+        self.looks = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(looks)])
+        self.layers = nnx.List([SelfAttention(width, heads, rngs, dtype) for _ in range(layers)])
+        self.norm = nnx.LayerNorm(width, rngs=rngs)
+
+    def __call__(
+        self, tokens: Float[Array, "*batch k width"], mask: Bool[Array, "*batch k"]
+    ) -> Float[Array, "*batch latent width"]:
+        x = self.first[...]
+        for number, layer in enumerate(self.layers):
+            if number < len(self.looks):
+                x = self.looks[number](x, tokens, mask)
+            x = layer(x)
+        return self.norm(x)
+
+
+class _Factorised(nnx.Module):
+    """Attention over the times of each row, then over the rows of each time."""
+
+    def __init__(self, sizes: Sizes, rngs: nnx.Rngs) -> None:
+        self.time = SelfAttention(sizes.width, sizes.heads, rngs, sizes.dtype)
+        self.space = SelfAttention(sizes.width, sizes.heads, rngs, sizes.dtype)
+        self.norm = nnx.LayerNorm(sizes.width, rngs=rngs)
+        self.dtype = sizes.dtype
+
+    def __call__(self, rows: Rows) -> Rows:
+        x = self.time(rows.value, rows.mask)
+        x = self.space(jnp.swapaxes(x, -3, -2), jnp.swapaxes(rows.mask, -2, -1))
+        return Rows(self.norm(jnp.swapaxes(x, -3, -2)).astype(self.dtype), rows.mask)
+
+
+class LatentEncoder(nnx.Module):
+    """Latent queries over each group, over everything, or over both one after the other; their mean."""
+
+    def __init__(self, sizes: Sizes, fusion: Fusion, spec: GroupSpec, rngs: nnx.Rngs) -> None:
+        self.width = sizes.width
+        self.embedding = Embedding(spec, sizes.width, sizes.embedding, rngs, sizes.dtype)
+        names = tuple(self.embedding.forms)
+        self.before = nnx.Dict({name: _Factorised(sizes, rngs) for name in names if fusion.factorised})
+        self.local = nnx.Dict(
+            {name: _Latents(sizes, fusion.local, fusion.again, rngs) for name in names if fusion.local}
+        )
+        self.whole = nnx.List(
+            [_Latents(sizes, fusion.whole, fusion.again, rngs) for _ in range(min(fusion.whole, 1))]
+        )
+
+    def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
+        """The embedding of one observation or a batch; float32."""
+        parts = []
+        for name, rows in self.embedding(groups).items():
+            x, mask = (self.before[name](rows) if name in self.before else rows).flat()
+            if name in self.local:
+                x = self.local[name](x, mask)
+                mask = jnp.ones(x.shape[:-1], bool)
+            parts.append((x, mask))
+        x, mask = side_by_side(parts)
+        for latents in self.whole:
+            x = latents(x, mask)
+        return jnp.mean(x.astype(jnp.float32), axis=-2)
+
+
+class MtrEncoder(nnx.Module):
+    """Times of each mover, then movers and map; the mean of the movers that have no mask (the ego)."""
+
+    def __init__(self, sizes: Sizes, spec: GroupSpec, rngs: nnx.Rngs) -> None:
+        width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
+        self.width = width
+        self.embedding = Embedding(spec, width, sizes.embedding, rngs, dtype)
+        kinds = forms(spec)
+        movers = tuple(name for name, form in kinds.items() if form.series or not form.masked)
+        # Where nothing moves, all rows are on a par.
+        self.movers = movers or tuple(kinds)
+        self.map = tuple(name for name in kinds if name not in self.movers)
+        self.own = tuple(name for name in self.movers if not kinds[name].masked)
+        self.time = SelfAttention(width, heads, rngs, dtype)
+        self.among = nnx.List([Attend(width, heads, rngs, dtype) for _ in range(sizes.layers)])
+        self.around = nnx.List(
+            [Attend(width, heads, rngs, dtype) for _ in range(sizes.layers if self.map else 0)]
+        )
+        self.feed_forward = nnx.List([FeedForward(width, rngs, dtype) for _ in range(sizes.layers)])
+        self.norm = nnx.LayerNorm(width, rngs=rngs)
+
+    def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
+        """The embedding of one observation or a batch; float32."""
+        tokens = self.embedding(groups)
+        movers = {name: self._mover(name, tokens[name]) for name in self.movers}
+        x, mask = side_by_side(list(movers.values()))
+        around = side_by_side([tokens[name].flat() for name in self.map]) if self.map else None
+        for number, layer in enumerate(self.feed_forward):
+            x = self.among[number](x, mask=mask)
+            if around is not None:
+                x = self.around[number](x, *around)
+            x = layer(x)
+        asked = [
+            m if name in self.own or not self.own else jnp.zeros_like(m) for name, (_, m) in movers.items()
+        ]
+        return masked_mean(self.norm(x), jnp.concatenate(asked, axis=-1))
+
+    def _mover(self, name: str, rows: Rows) -> tuple[Array, Array]:
+        """One token for every row: the mean over its times after they attended to each other."""
+        if not self.embedding.forms[name].series:
+            return rows.flat()
+        return masked_mean(self.time(rows.value, rows.mask), rows.mask), rows.mask.any(axis=-1)

@@ -1,0 +1,164 @@
+"""How large and how fast encoders are: parameters, time of a forward and of a backward pass per observation."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array
+
+from drivax.errors import UsageError
+from drivax.learning.driving import Driving
+from drivax.named import nearest
+from drivax.networks.encoders import EncoderConfig, GroupSpec, MlpConfig
+from drivax.networks.entity import EntityConfig
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, TransformerConfig, WayformerConfig
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.observations import PRESETS, ObservationConfig
+from drivax.tasks.task import Task
+from drivax.tracking.runs import versions
+
+#: What is compared, by name: an encoder and its size. All but the MLP also in bfloat16, unless it is a mere variant.
+ENCODERS: Mapping[str, MlpConfig | TransformerConfig | EntityConfig] = {
+    "mlp": MlpConfig(),
+    "mlp rows": MlpConfig(rows=(64, 64)),
+    "entity small": EntityConfig(),
+    "entity published": EntityConfig(size="published"),
+    "lq small": LqConfig(),
+    "lq published": LqConfig(size="published"),
+    "lqh small": LqhConfig(),
+    "lqh published": LqhConfig(size="published"),
+    "mtr small": MtrConfig(),
+    "mtr published": MtrConfig(size="published"),
+    "wayformer small": WayformerConfig(),
+    "wayformer published": WayformerConfig(size="published"),
+}
+VARIANTS: Mapping[str, WayformerConfig] = {
+    "wayformer small, early": WayformerConfig(fusion="early"),
+    "wayformer small, hierarchical": WayformerConfig(fusion="hierarchical"),
+    "wayformer small, factorised": WayformerConfig(factorised=True),
+}
+#: Calls of a timing; one alone is too short for the clock.
+_CALLS = 10
+
+
+@dataclass(frozen=True)
+class EncoderBench:
+    """What is timed.
+
+    Attributes:
+        only: Names of :data:`ENCODERS` and :data:`VARIANTS`; none: all.
+        batches: Observations of a forward pass; the last one's are also those of a backward pass.
+        repeats: Timings; the median counts.
+        observation: What is encoded.
+    """
+
+    only: tuple[str, ...] = ()
+    batches: tuple[int, ...] = (1, 256)
+    repeats: int = 7
+    observation: ObservationConfig = field(default_factory=lambda: PRESETS["optimal"])
+
+    def __post_init__(self) -> None:
+        for name in self.only:
+            if name not in ENCODERS and name not in VARIANTS:
+                raise UsageError(f"there is no encoder {name!r}", cure=nearest(name, [*ENCODERS, *VARIANTS]))
+        if not self.batches or min(*self.batches, self.repeats, 1) < 1:
+            raise UsageError(
+                f"batches {self.batches}, repeats {self.repeats}", cure="use at least one, of 1 or more"
+            )
+
+
+def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) -> dict[str, Any]:
+    """Sizes and times of encoders.
+
+    Args:
+        config: Which, and how.
+        times: Whether to time them; sizes alone take no computation.
+
+    Returns:
+        The contract of ``drivax bench --encoders --json``: ``observation`` with the shapes of the groups, ``device``,
+        and ``rows`` of ``encoder``, ``dtype``, ``parameters``, ``width`` (of the embedding) and, in microseconds per
+        observation, ``forward_us`` by batch and ``gradient_us``, a forward and a backward pass for all parameters at
+        the last batch.
+    """
+    config = config or EncoderBench()
+    spec = observation_shapes(config.observation)
+    rows = []
+    for name, encoder in (ENCODERS | VARIANTS).items():
+        if config.only and name not in config.only:
+            continue
+        both = name in ENCODERS and not isinstance(encoder, MlpConfig)
+        for dtype in ("float32", "bfloat16") if both else ("float32",):
+            one = replace(encoder, dtype=dtype) if both else encoder
+            row = {"encoder": name, "dtype": dtype} | encoder_sizes(one, spec)
+            rows.append(row | (_times(one, spec, config) if times else {}))
+    return {
+        "observation": {group: list(shape) for group, shape in spec.items()},
+        "device": jax.devices()[0].device_kind,
+        "rows": rows,
+        "versions": versions(),
+    }
+
+
+def observation_shapes(config: ObservationConfig) -> dict[str, tuple[int, ...]]:
+    """Shapes of one observation, by group."""
+    bank = ScenarioBank.from_scenarios([assemble(generate_recording(seed=0, index=0))])
+    return Driving(Simulator(Task(observation=config))).shapes(bank)
+
+
+def encoder_sizes(config: EncoderConfig, spec: GroupSpec) -> dict[str, int]:
+    """Number of parameters and width of the embedding; nothing is computed."""
+    encoder: Any = nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0)))
+    leaves = jax.tree.leaves(nnx.state(encoder, nnx.Param))
+    return {"parameters": sum(leaf.size for leaf in leaves), "width": encoder.width}
+
+
+def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
+    """Observations of noise in which about half of the rows are there."""
+    found = {}
+    for number, (name, shape) in enumerate(sorted(spec.items())):
+        noise = jax.random.normal(jax.random.key(number), (batch, *shape))
+        found[name] = noise > 0 if name.endswith("_mask") else noise
+    return found
+
+
+def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
+    graph, parameters = nnx.split(config.build(spec, nnx.Rngs(0)))
+
+    def encode(parameters: Any, groups: Any) -> Array:
+        encoder: Any = nnx.merge(graph, parameters)
+        return encoder(groups)
+
+    def loss(parameters: Any, groups: Any) -> Array:
+        return jnp.mean(encode(parameters, groups) ** 2)
+
+    forward, gradient = jax.jit(encode), jax.jit(jax.grad(loss))
+    by_batch = {}
+    for batch in bench.batches:
+        by_batch[str(batch)] = _microseconds(
+            forward, parameters, random_observations(spec, batch), bench.repeats
+        )
+    groups = random_observations(spec, bench.batches[-1])
+    return {"forward_us": by_batch, "gradient_us": _microseconds(gradient, parameters, groups, bench.repeats)}
+
+
+def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repeats: int) -> float:
+    """Time per observation; the median of the repeats, after one that compiles."""
+    batch = next(iter(groups.values())).shape[0]
+    jax.block_until_ready(function(parameters, groups))
+    seen = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        for _ in range(_CALLS):
+            jax.block_until_ready(function(parameters, groups))
+        seen.append((time.perf_counter() - began) / _CALLS / batch)
+    return round(1e6 * statistics.median(seen), 2)

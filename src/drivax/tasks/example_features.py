@@ -1,0 +1,110 @@
+"""Features that are no part of the groups of ``tasks.observations``: examples of groups of one's own, ready to use.
+
+In YAML ``observation: {own: [{feature: drivax.tasks.example_features:lane_curvature}]}``, from Python
+``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, scene and frames; ``frames(k)`` is
+everyone k steps ago as ego perceives them.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drivax.geometry.vectors import first_smallest, norm
+from drivax.scenario.bank import LIGHT_ARC, NEVER_M, ROAD_LANE, ScenarioBank
+from drivax.scenario.queries import route_ahead
+from drivax.scenario.schema import LightState
+from drivax.simulator.types import Scene
+from drivax.tasks import features
+from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
+
+#: How many others have a relative velocity; how far apart the route is looked at, m, and how often.
+_OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
+#: Half the width of the stripe ahead in which a leader drives, m; the longest gap that is told apart, s.
+_STRIPE_M, _LONGEST_S = 1.5, 10.0
+#: A car that is slower keeps the time gap of this speed, m/s.
+_SLOWEST_MPS = 1.0
+
+
+def relative_velocity(
+    bank: ScenarioBank, scene: Scene, frames: Frames
+) -> tuple[Float[Array, "K 2"], Bool[Array, " K"]]:
+    """Velocity of the eight nearest others relative to ego's, ego frame, in units of 15 m/s.
+
+    The rows are those of the group ``agents``, as far as they go.
+    """
+    now, view, ego = frames(0), View.of(scene), scene.history[-1]
+    there = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    distance = jnp.where(there, norm(now.box[:, :2] - view.xy), jnp.inf)
+    rank = jnp.arange(_OTHERS)
+    order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
+    own = jnp.stack([ego[3], jnp.zeros(())])
+    return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
+
+
+def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+    """Curvature of the lane that ego is on, in units of 0.1 1/m (left positive), and whether it is on one.
+
+    It is that of the piece of lane within 2.5 m and 60 degrees that fits place and heading best, a metre weighing as
+    much as 15 degrees. No route is needed. Bridges are not told apart from what is under them.
+    """
+    view = View.of(scene)
+    rows, layer = bank.road[scene.index], bank.road_at[scene.index, 2]
+    middle, direction = view.point(rows[:, :2]), view.vector(rows[:, 2:4])
+    half = rows[:, 4] / 2
+    along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
+    apart = norm(middle + along[:, None] * direction)
+    fits = (layer == ROAD_LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
+    best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
+    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[scene.index, best]), 0.0)
+    return jnp.stack([curvature, fits[best].astype(jnp.float32)])
+
+
+def recommended_speed(
+    bank: ScenarioBank, scene: Scene, frames: Frames
+) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
+    """Speed for the curvature k of the route at ten points 5 m apart: ``clip(30 - 25 |k|, 5, 30)``, in 15 m/s."""
+    offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
+    _, there = route_ahead(bank, scene.index, scene.route_m, offsets)
+    curvature = features.route_curvature(bank, scene.index, scene.route_m + offsets)
+    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(bank, scene)
+
+
+def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+    """Seconds to the leader's bumper at ego's speed, of ten at most, as a share of ten; and whether there is a leader.
+
+    The leader is the nearest agent whose centre lies in the stripe of 3 m width straight ahead of ego. An ego slower
+    than 1 m/s counts as driving 1 m/s. Without a leader the share is 1.
+    """
+    now, view = frames(0), View.of(scene)
+    place = view.point(now.box[:, :2])
+    others = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
+    half = bank.agent_box[scene.index, scene.slot, 0] / 2
+    gap = jnp.where(
+        leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
+    )
+    time = jnp.min(gap) / jnp.maximum(scene.history[-1, 3], _SLOWEST_MPS)
+    share = jnp.minimum(time / _LONGEST_S, 1.0)
+    return jnp.stack([share, leading.any().astype(jnp.float32)])
+
+
+def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Array, " S"]:
+    """How far boxes of these directions (ego frame) reach back from their centres along ego's heading, m."""
+    return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
+
+
+def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 3"]:
+    """The next stop line on the route: distance from the front bumper in 50 m, whether it is red, whether there is one.
+
+    Lines further than 50 m, or passed by the bumper, are not there; the distance is then 1.
+    """
+    ahead = bank.light_line[scene.index, LIGHT_ARC] - scene.route_m
+    gap = ahead - bank.agent_box[scene.index, scene.slot, 0] / 2
+    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
+    real = bank.light_line[scene.index, LIGHT_ARC] < NEVER_M
+    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
+    next_one = jnp.argmin(jnp.where(there, gap, jnp.inf))
+    red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
+    distance = jnp.where(there.any(), gap[next_one] / POSITION_M, 1.0)
+    return jnp.stack([distance, *((there & kind)[next_one].astype(jnp.float32) for kind in (red, True))])

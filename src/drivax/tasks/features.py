@@ -1,0 +1,195 @@
+"""Which features the groups of an observation are made of: their names, columns and order, and the optional ones.
+
+The columns of a group stand in the order of :data:`COLUMNS`, whatever the order in a configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.named import nearest
+from drivax.scenario.bank import ROUTE_COS, ROUTE_SIN, ScenarioBank
+from drivax.scenario.queries import route_ahead
+from drivax.scenario.schema import Flag
+from drivax.simulator.types import Scene
+from drivax.tasks.view import PIECE_M, POSITION_M
+
+#: What curvatures are divided by, 1/m: a turn of 10 m radius is 1.
+CURVATURE_PM = 0.1
+#: No curvature is shown larger than this, in these units.
+_MOST_CURVED = 3.0
+#: Distance on each side over which the curvature of the route is measured, m.
+_ARM_M = 2.0
+
+_PLACE = {"position": ("x", "y"), "heading": ("sin", "cos"), "velocity": ("ahead", "left")}
+#: Columns of every feature of every group; one name "" where a feature is one number.
+COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "ego": {**_PLACE, "time": ("",)},
+        # The last action has as many columns as the action space has numbers.
+        "ego_static": {"length": ("",), "width": ("",), "height": ("",), "last_action": ()},
+        "agents": {
+            **_PLACE,
+            "relative_velocity": ("ahead", "left"),
+            **dict.fromkeys(("time", "length", "width", "height"), ("",)),
+            "type": ("vehicle", "pedestrian", "cyclist", "other"),
+        },
+        "road": {
+            "position": ("x", "y"),
+            "direction": ("cos", "sin"),
+            "length": ("",),
+            "type": ("lane", "edge", "crosswalk"),
+            "limit": ("", "known"),
+            "curvature": ("",),
+        },
+        "lights": {
+            "position": ("x", "y"),
+            "state": ("unknown", "green", "yellow", "red"),
+            "on_route": ("",),
+        },
+        "route": {
+            "position": ("x", "y"),
+            "heading": ("sin", "cos"),
+            **dict.fromkeys(("limit", "curvature", "recommended_speed"), ("",)),
+            "goal": ("x", "y"),
+        },
+    }
+)
+
+
+@dataclass(frozen=True)
+class Features:
+    """The features of each group; a group without any is left out. Columns: ``COLUMNS``.
+
+    Attributes:
+        ego: Of the driven agent at each past step.
+        ego_static: Of the driven agent now.
+        agents: Of each other agent at each past step.
+        road: Of each piece of road.
+        lights: Of each light.
+        route: Of each point of the route.
+    """
+
+    ego: tuple[str, ...] = ("position", "heading", "velocity")
+    ego_static: tuple[str, ...] = ("length", "width", "last_action")
+    agents: tuple[str, ...] = ("position", "heading", "velocity", "length", "width", "type")
+    road: tuple[str, ...] = ("position", "direction", "length", "type", "limit")
+    lights: tuple[str, ...] = ("position", "state", "on_route")
+    route: tuple[str, ...] = ("position", "heading", "limit")
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            chosen, known = getattr(self, field.name), tuple(COLUMNS[field.name])
+            place = f"observation.features.{field.name}"
+            for number, name in enumerate(chosen):
+                if name not in known:
+                    raise UsageError(f"{place} has no {name!r}", cure=nearest(name, known))
+                if name in chosen[:number]:
+                    raise UsageError(f"{place} names {name!r} twice", cure="name it once")
+            object.__setattr__(self, field.name, tuple(name for name in known if name in chosen))
+
+
+def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> dict[str, tuple[str, ...]]:
+    """Names of the columns of every group that has any, masks aside.
+
+    Args:
+        features: The features of our own groups.
+        shapes: Shapes of one observation, by group.
+
+    Returns:
+        By group a name per column, as ``velocity ahead``; the columns of the user's own groups are numbered.
+    """
+    names = {}
+    for group, shape in shapes.items():
+        if group.endswith("_mask") and group.removesuffix("_mask") in shapes:
+            continue
+        if group not in COLUMNS:
+            names[group] = tuple(str(column) for column in range(shape[-1]))
+            continue
+        columns = [(name, COLUMNS[group][name]) for name in getattr(features, group)]
+        rest = shape[-1] - sum(len(parts) for _, parts in columns)
+        columns = [(name, parts or tuple(map(str, range(rest)))) for name, parts in columns]
+        names[group] = tuple(f"{name} {part}".strip() for name, parts in columns for part in parts)
+    return names
+
+
+def joined(
+    chosen: Sequence[str], parts: Mapping[str, Callable[[], Array]], rows: tuple[int, ...]
+) -> Float[Array, "... F"]:
+    """The columns of the chosen features side by side; parts that are not chosen are not computed.
+
+    Args:
+        chosen: Features; those without a part are somebody else's.
+        parts: What computes each, ``[*rows, columns]``.
+        rows: Shape of the rows, for when nothing is chosen.
+    """
+    found = [parts[name]() for name in chosen if name in parts]
+    return jnp.concatenate(found, axis=-1) if found else jnp.zeros((*rows, 0))
+
+
+def columns_of(group: str, chosen: Sequence[str]) -> list[int]:
+    """Where the columns of the chosen features stand among those of all features that are on by default."""
+    place, found = 0, []
+    for name in getattr(Features(), group):
+        width = len(COLUMNS[group][name])
+        found += range(place, place + width) if name in chosen else ()
+        place += width
+    return found
+
+
+def shown_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A curvature (1/m) in units of 0.1 1/m, at most 3 of them."""
+    return jnp.clip(curvature / CURVATURE_PM, -_MOST_CURVED, _MOST_CURVED)
+
+
+def has_route(bank: ScenarioBank, scene: Scene) -> Bool[Array, ""]:
+    """Whether the driven agent has a route on lanes; else the bank holds the log's own path, which nobody may see."""
+    return ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
+
+
+def route_curvature(
+    bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, " K"]
+) -> Float[Array, " K"]:
+    """Curvature of the route to the goal, 1/m, left positive: its turn from 2 m before to 2 m behind a place.
+
+    At the ends of the route what there is of these 4 m counts.
+    """
+    last = (bank.route_points[index, 0] - 1).astype(jnp.float32)
+    before, behind = jnp.clip(along_m - _ARM_M, 0.0, last), jnp.clip(along_m + _ARM_M, 0.0, last)
+    zero = jnp.zeros(())
+    one, _ = route_ahead(bank, index, zero, before)
+    other, _ = route_ahead(bank, index, zero, behind)
+    (c0, s0), (c1, s1) = ((rows[:, ROUTE_COS], rows[:, ROUTE_SIN]) for rows in (one, other))
+    apart = behind - before
+    # Without a route its rows are zero, of which there is no angle.
+    turn = jnp.where(
+        apart > 0, jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(apart > 0, c0 * c1 + s0 * s1, 1.0)), 0.0
+    )
+    return turn / jnp.maximum(apart, 1.0)
+
+
+def recommended_speed(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A speed for a curvature k in 1/m: ``clip(30 - 25 |k|, 5, 30)`` m/s, as published (semantics, Observation)."""
+    return jnp.clip(30.0 - 25.0 * jnp.abs(curvature), 5.0, 30.0)
+
+
+def goal_ahead(goal_m: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    """The goal, given in the ego frame in m, in units of 50 m, at most 5 of them each way."""
+    return jnp.clip(goal_m / POSITION_M, -5.0, 5.0)
+
+
+def cut_rows(rows: Float[Array, "P F"], count: int) -> Float[Array, "R F"]:
+    """Pieces of road (position, direction, length, ...), each cut into equal ones along its chord."""
+    place = ((jnp.arange(count) + 0.5) / count - 0.5)[:, None]
+    position, direction, length = rows[:, None, :2], rows[:, None, 2:4], rows[:, None, 4:5]
+    middle = position + direction * length * (PIECE_M / POSITION_M) * place
+    shape = (*middle.shape[:2], rows.shape[1] - 5)
+    parts = [middle, jnp.broadcast_to(direction, middle.shape)]
+    parts += [jnp.broadcast_to(length / count, (*shape[:2], 1)), jnp.broadcast_to(rows[:, None, 5:], shape)]
+    return jnp.concatenate(parts, axis=-1).reshape(-1, rows.shape[1])

@@ -1,0 +1,173 @@
+"""What ego perceives: range, lines of sight, drop-out and noise. Observations only; metrics use the truth.
+
+It works as a tracker would. At every step a sensor on ego reports who is in range, in free view and not missed by
+chance, each at a place with that step's error; the tracker keeps what was reported. So a past step of an agent is shown
+as it was seen then, from where ego was then, the same in every observation that holds it; a step at which the agent was
+not seen is masked; and an agent that is not seen now is not there, history included.
+
+All chance follows from the state: the key is the seed with scenario index, step, driven slot and the other's slot
+folded in. A replayed observation therefore equals the live one, and nothing has to be carried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drivax.geometry.angles import rotate
+from drivax.geometry.boxes import corners, passage
+from drivax.geometry.vectors import norm
+from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.schema import AgentKind
+from drivax.simulator.types import HISTORY, Frame, Scene
+
+#: What the key of a step is folded with, by what is drawn from it.
+_DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
+
+
+@dataclass(frozen=True)
+class Perception:
+    """Faults of perception; all of them are off by default, and then cost nothing.
+
+    Attributes:
+        range_m: Agents and stop lines further than this from ego are not seen, m.
+        occlusion: Whether vehicles hide agents behind them (:func:`in_view`).
+        dropout_m: Agents and lights are seen with probability exp(-distance / dropout_m), drawn at every step; 200 m
+            as published.
+        noise_m: Standard deviation, in each direction, of the error of the places of agents, stop lines and pieces of
+            road, drawn at every step, m; 0.1 m as published.
+        seed: Of all chance.
+    """
+
+    range_m: float | None = None
+    occlusion: bool = False
+    dropout_m: float | None = None
+    noise_m: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("range_m", "dropout_m"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(
+                    f"observation.perception.{name} is {value}; use a positive number, or null for none"
+                )
+        if not 0.0 <= self.noise_m < math.inf:
+            raise ValueError(f"observation.perception.noise_m is {self.noise_m}; use 0 or a positive number")
+
+    @property
+    def of_agents(self) -> bool:
+        """Whether agents are perceived otherwise than they are."""
+        return self.occlusion or self.of_lights or self.noise_m > 0
+
+    @property
+    def of_lights(self) -> bool:
+        """Whether some lights are not seen."""
+        return self.range_m is not None or self.dropout_m is not None
+
+
+def perceived(config: Perception, scene: Scene, frames: Callable[[int], Frame]) -> Callable[[int], Frame]:
+    """Everyone as ego perceived them at each step; ego itself is as it is.
+
+    Args:
+        config: The faults.
+        scene: The scene.
+        frames: The truth: everyone so many steps ago.
+
+    Returns:
+        Frames in which who was not seen is not valid, and places have their errors.
+    """
+
+    @cache
+    def seen(back: int) -> Frame:
+        return _sensed(config, scene, frames(back), back)
+
+    return seen
+
+
+def _sensed(config: Perception, scene: Scene, frame: Frame, back: int) -> Frame:
+    eye, slots = scene.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
+    others, seen, place = slots != scene.slot, frame.valid, frame.box[:, :2]
+    distance = norm(place - eye[:2])
+    key = _key(config, scene, back)
+    seen &= _reported(config, jax.random.fold_in(key, _DROPPED), distance)
+    if config.occlusion:
+        level = jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
+        slim = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
+        seen &= in_view(eye[:2], frame.box, frame.valid & others & level & ~slim)
+    if config.noise_m > 0:
+        # Drawn in the frame of ego, so that it does not depend on how the map lies.
+        error = config.noise_m * _each(jax.random.fold_in(key, _MOVED), len(slots))
+        place = place + rotate(error, jnp.cos(eye[2]), jnp.sin(eye[2]))
+    place = jnp.where(others[:, None], place, frame.box[:, :2])
+    box = jnp.concatenate([place, frame.box[:, 2:]], axis=-1)
+    return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid))
+
+
+def in_view(
+    eye: Float[Array, " 2"], box: Float[Array, "S 6"], blocks: Bool[Array, " S"]
+) -> Bool[Array, " S"]:
+    """Who is in free view of a point: whose centre or any corner it sees past all others that block.
+
+    A line of sight is cut by a box whose inside it passes through; touching is not cutting. Nobody hides himself, and a
+    box in which the eye itself is hides nobody. All of S x S x 5 pairs are tested: some 40 operations each.
+
+    Args:
+        eye: Where it is seen from, m.
+        box: Everyone (``geometry.boxes``).
+        blocks: Who hides what is behind.
+    """
+    dx, dy = eye[0] - box[:, 0], eye[1] - box[:, 1]
+    along, across = dx * box[:, 2] + dy * box[:, 3], dy * box[:, 2] - dx * box[:, 3]
+    inside = (jnp.abs(along) < box[:, 4] / 2) & (jnp.abs(across) < box[:, 5] / 2)
+    points = jnp.concatenate([corners(box), box[:, None, :2]], axis=1)
+    enters, leaves = passage(eye, points[:, :, None], box)
+    others = ~jnp.eye(len(box), dtype=bool)
+    cut = (enters < leaves) & (blocks & ~inside) & others[:, None]
+    return ~cut.any(axis=2).all(axis=1)
+
+
+def lights_seen(config: Perception, scene: Scene, distance_m: Float[Array, " L"]) -> Bool[Array, " L"]:
+    """Which stop lines at these distances are seen."""
+    key = jax.random.fold_in(_key(config, scene), _DROPPED_LIGHTS)
+    return _reported(config, key, distance_m)
+
+
+def moved_lights(config: Perception, scene: Scene, count: int) -> Float[Array, "count 2"]:
+    """Errors of the places of this many lights in the ego frame, m."""
+    return config.noise_m * _each(jax.random.fold_in(_key(config, scene), _MOVED_LIGHTS), count)
+
+
+def moved_road(config: Perception, scene: Scene, count: int) -> Float[Array, "count 2"]:
+    """Errors of the places of this many pieces of road in the ego frame, m."""
+    return config.noise_m * _each(jax.random.fold_in(_key(config, scene), _MOVED_ROAD), count)
+
+
+def _key(config: Perception, scene: Scene, back: int = 0) -> Array:
+    key = jax.random.key(config.seed)
+    for number in (scene.index, scene.step - back + HISTORY, scene.slot):
+        key = jax.random.fold_in(key, number)
+    return key
+
+
+def _reported(config: Perception, key: Array, distance_m: Float[Array, " S"]) -> Bool[Array, " S"]:
+    """Who is in range and not missed by chance."""
+    seen = jnp.ones(distance_m.shape, bool)
+    if config.range_m is not None:
+        seen &= distance_m <= config.range_m
+    if config.dropout_m is not None:
+        draw = jax.vmap(lambda slot: jax.random.uniform(jax.random.fold_in(key, slot)))
+        seen &= draw(jnp.arange(len(distance_m))) < jnp.exp(-distance_m / config.dropout_m)
+    return seen
+
+
+def _each(key: Array, count: int) -> Float[Array, "count 2"]:
+    """Two standard normal numbers per slot, the same however many slots there are."""
+    draw = jax.vmap(lambda slot: jax.random.normal(jax.random.fold_in(key, slot), (2,)))
+    return draw(jnp.arange(count))

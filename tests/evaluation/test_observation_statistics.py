@@ -1,0 +1,182 @@
+"""Statistics of observations against numpy and scipy, and episodes whose course is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from drivax.errors import UsageError
+from drivax.evaluation.observation_statistics import (
+    collision_correlation,
+    importances,
+    look_at,
+    observation_statistics,
+)
+from drivax.evaluation.rollout import judging
+from drivax.planners.planner import Memoryless
+from drivax.planners.simple import Expert
+from drivax.scenario.record import record, static
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import Physical, Published
+from drivax.tasks.observations import ObservationConfig, OwnGroup
+from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
+
+STARE_M = 30.0
+
+
+def faulty(bank, scene, frames):
+    """A feature of one number that is not one at steps 20 and 50 of the first scenario."""
+    broken = (scene.index == 0) & ((scene.step == 20) | (scene.step == 50))
+    return jnp.where(broken, jnp.nan, scene.step / 100.0)[None]
+
+
+@record
+class Shy(Memoryless):
+    """Hardly does a thing, by the place ahead of the first agent; looks at nothing else."""
+
+    actions: Any = static(default=Physical())
+    name: str = static(default="shy")
+    replays: bool = static(default=False)
+
+    def act(self, carry, bank, state, situation, observation, key):
+        return jnp.stack([1e-3 * observation["agents"][0, -1, 0], jnp.zeros(())]), carry
+
+
+TASK = Task(
+    observation=ObservationConfig(agents=2, steps=2, road=0, lights=1, route=1, own=(OwnGroup(faulty),))
+)
+
+
+@pytest.fixture(scope="module")
+def bank():
+    """One scenario in which ego at 9 m/s meets a standing car, two in which nobody is on its lane."""
+    standing = car(STARE_M, 0, 0, 0)
+    scenes = [[car(0, 0, 0, 9), standing], *([car(0, 0, 0, 9), car(-20 - k, 3.7, 0, 5)] for k in range(2))]
+    return bank_of(*(replace(straight_road(cars), scenario_id=f"s{k}") for k, cars in enumerate(scenes)))
+
+
+@pytest.fixture(scope="module")
+def shy(bank):
+    return observation_statistics(Shy(), bank, TASK, permute=True)
+
+
+def column(found, group, name):
+    (one,) = [one for one in found.features if (one.group, one.name) == (group, name)]
+    return one
+
+
+def test_episodes_are_looked_at_until_and_after_the_collision(bank):
+    looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
+    assert looks.state.scene.step.tolist() == [[*range(10, 81, 10)]] * 3
+    # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
+    assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
+    assert looks.collides.tolist() == [True, False, False]
+
+
+def test_a_column_is_described_by_its_valid_rows(shy):
+    assert (shy.planner, shy.episodes, shy.collisions, shy.states, shy.permuted) == (
+        "shy",
+        3,
+        shy.collisions,
+        24,
+        24,
+    )
+    length = column(shy, "agents", "length")
+    # One other agent, at both steps of every look.
+    assert length.count == 48 and length.broken == 0
+    np.testing.assert_allclose(
+        [length.mean, length.std, length.low, length.high], [0.96, 0, 0.96, 0.96], atol=1e-6
+    )
+    assert column(shy, "lights", "on_route").count == 0 and np.isnan(column(shy, "lights", "on_route").mean)
+
+
+def test_what_is_not_finite_is_found(shy):
+    one = column(shy, "faulty", "0")
+    assert (one.broken, shy.broken, one.count) == (2, 2, 22)
+    steps = np.array([*range(10, 81, 10)] * 3)[[k for k in range(24) if k not in (1, 4)]] / 100
+    np.testing.assert_allclose(
+        [one.mean, one.std, one.low, one.high], [steps.mean(), steps.std(), 0.1, 0.8], rtol=1e-5
+    )
+    rows = shy.as_dict()["features"]
+    assert [row["broken"] for row in rows if row["group"] == "faulty"] == [2]
+    (light,) = [row for row in rows if (row["group"], row["name"]) == ("lights", "on_route")]
+    assert light["mean"] is None and light["count"] == 0
+
+
+def test_only_what_the_planner_looks_at_matters(shy):
+    found = {(one.group, one.name): one.importance for one in shy.features}
+    assert found.pop(("agents", "position x")) > 0.5 and shy.groups["agents"] > 0.5
+    assert set(found.values()) == {0.0}
+    assert {value for name, value in shy.groups.items() if name != "agents"} == {0.0}
+
+
+def test_a_planner_of_another_action_space_is_refused(bank):
+    with pytest.raises(UsageError, match="another action space"):
+        observation_statistics(Expert(), bank, replace(TASK, actions=Published()), permute=False)
+
+
+def test_correlation_is_scipys_point_biserial():
+    rng = np.random.default_rng(5)
+    collides = rng.random(40) < 0.4
+    values = rng.normal(size=(40, 6, 3)) + 0.8 * collides[:, None, None]
+    valid = rng.random(values.shape) < 0.6
+    valid[3] = False  # nobody is there in the whole episode
+    values[7, 2, 1] = np.nan
+    means = [values[k][valid[k] & np.isfinite(values[k])].mean() for k in range(40) if k != 3]
+    wanted = stats.pointbiserialr(np.delete(collides, 3), means).statistic
+    assert abs(wanted) > 0.3
+    assert collision_correlation(values, valid, collides) == pytest.approx(wanted, abs=1e-9)
+    assert np.isnan(collision_correlation(values, valid, np.zeros(40, bool)))
+    assert np.isnan(collision_correlation(np.full((40, 2), 0.3), np.ones((40, 2), bool), collides))
+
+
+def test_importance_of_a_linear_policy_is_known():
+    """For a = 3 x + 4 y of independent x, y of variance 1, permuting x changes a by 3 sqrt(2), of its std 5."""
+    rng = np.random.default_rng(1)
+    count = 4000
+    seen = {
+        "g": rng.normal(size=(count, 3)).astype(np.float32),
+        "h": rng.normal(size=(count, 2)).astype(np.float32),
+    }
+
+    def act(observation):
+        x, y = observation["g"][:, 0], observation["h"][:, 1]
+        return np.stack([3 * x + 4 * y, np.full(count, 0.25)], axis=-1)
+
+    columns, groups = importances(act, seen)
+    root2 = np.sqrt(2)
+    assert columns[("g", 0)] == pytest.approx(0.6 * root2, rel=0.05) == groups["g"]
+    assert columns[("h", 1)] == pytest.approx(0.8 * root2, rel=0.05) == groups["h"]
+    assert columns[("g", 1)] == columns[("g", 2)] == columns[("h", 0)] == 0.0
+    still = importances(lambda observation: np.ones((count, 2)), seen)[0]
+    assert all(np.isnan(value) for value in still.values())
+
+
+def test_permuting_keeps_masks_and_moves_only_valid_entries():
+    rng = np.random.default_rng(2)
+    mask = rng.random((50, 4)) < 0.5
+    mask[:, 0] = True
+    values = np.where(mask[..., None], rng.normal(size=(50, 4, 2)), 0.0)
+    asked = []
+
+    def act(observation):
+        asked.append(observation)
+        return rng.normal(size=(50, 1))
+
+    importances(act, {"g": values, "g_mask": mask})
+    _, whole, first, second = asked
+    order = [int(np.flatnonzero((values == row).all(axis=(1, 2)))[0]) for row in whole["g"]]
+    assert sorted(order) == list(range(50)) and order != list(range(50))
+    np.testing.assert_array_equal(whole["g_mask"], mask[order])
+    for number, one in enumerate((first, second)):
+        np.testing.assert_array_equal(one["g_mask"], mask)
+        assert not one["g"][~mask].any()
+        np.testing.assert_array_equal(one["g"][..., 1 - number], values[..., 1 - number])
+        np.testing.assert_array_equal(np.sort(one["g"][mask, number]), np.sort(values[mask, number]))
+        assert (one["g"][mask, number] != values[mask, number]).mean() > 0.9

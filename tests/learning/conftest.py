@@ -1,0 +1,13 @@
+"""What tests of learning share."""
+
+import pytest
+
+from drivax.scenario.store import ScenarioSet
+from drivax.synthetic.generate import Generation, generate
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("learning") / "set"
+    generate(path, 3, 11, Generation(workers=1))
+    return ScenarioSet.open(path)

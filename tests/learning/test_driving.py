@@ -1,0 +1,131 @@
+"""Driving as an environment: what rows of experience hold, and what the expert did."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.learning.collector import collect
+from drivax.learning.driving import Driving
+from drivax.learning.environment import Environment
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, ScenarioBank
+from drivax.simulator.dynamics import bicycle
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.actions import Discrete
+from drivax.tasks.observations import ObservationConfig, OwnGroup
+from drivax.tasks.task import Task
+
+
+def moment(bank, scene, frames):
+    """A feature that tells where it was made: scenario, step, last action."""
+    place = jnp.stack([scene.index, scene.step]).astype(jnp.float32)
+    return jnp.concatenate([place, scene.action])[None]
+
+
+OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2, own=(OwnGroup(moment),))
+LATEST = 30
+
+
+@pytest.fixture(scope="module")
+def bank(data):
+    return ScenarioBank.from_scenarios(data)
+
+
+@pytest.fixture(scope="module")
+def driving():
+    return Driving(Simulator(Task(observation=OBSERVATION, metrics=("steps", "red_light"))), LATEST)
+
+
+@pytest.fixture(scope="module")
+def experience(bank, driving):
+    """120 steps of 6 environments that swerve, with what the actor saw."""
+    environments = jax.jit(driving.start, static_argnums=2)(bank, jax.random.key(0), 6)
+
+    def actor(observation, key):
+        choice = 0.5 * jax.random.normal(key, (6, 2))
+        return choice, jnp.tanh(choice), {"seen": observation["route"]}
+
+    run = jax.jit(lambda b, e, k: collect(driving, b, e, actor, k, 120, "state"))
+    return jax.device_get(run(bank, environments, jax.random.key(1)))
+
+
+def test_it_is_an_environment(bank, driving):
+    assert isinstance(driving, Environment)
+    assert driving.action_size == 2 and driving.levels is None
+    assert driving.shapes(bank)["moment"] == (1, 4)
+    grid = Driving(Simulator(Task(actions=Discrete(accelerations=3, curvatures=5))))
+    assert grid.levels == ((-1.0, 0.0, 1.0), (-1.0, -0.25, 0.0, 0.25, 1.0))
+    for step in (9, 89):
+        with pytest.raises(UsageError, match="use 10 to 88"):
+            Driving(driving.simulator, step)
+
+
+def test_the_row_behind_an_end_holds_the_final_state(experience):
+    after, rollout, _ = experience
+    ended, alive = rollout.terminated | rollout.truncated, rollout.alive
+    assert ended.sum() >= 6 and rollout.terminated.any() and rollout.observation is None
+    # Every end is followed by exactly one row that only begins an episode, and by nothing else.
+    np.testing.assert_array_equal(~alive[1:], ended[:-1])
+    np.testing.assert_array_equal(after.over, ended[-1])
+    assert not (ended & ~alive).any() and (rollout.reward[~alive] == 0).all()
+    scene = rollout.state
+    # Whatever happens, what a step led to is the same scenario one step later, seen with the same past.
+    lived = alive[:-1]
+    np.testing.assert_array_equal(scene.index[1:][lived], scene.index[:-1][lived])
+    np.testing.assert_array_equal(scene.step[1:][lived], scene.step[:-1][lived] + 1)
+    np.testing.assert_array_equal(scene.history[1:][lived][:, :-1], scene.history[:-1][lived][:, 1:])
+    # Nothing of that reaches the episode that begins behind it.
+    begun = scene.step[1:][~lived]
+    assert (begun >= 10).all() and (begun <= LATEST).all() and len(np.unique(begun)) > 2
+    assert (scene.action[1:][~lived] == 0).all() and (scene.route_m[1:][~lived] >= 0).all()
+
+
+def test_new_episodes_begin_as_logged(experience, bank):
+    scene, alive = experience[1].state, experience[1].alive
+    rows = np.argwhere(~alive[:-1]) + np.array([1, 0])
+    for time, number in rows:
+        step, history = scene.step[time, number], scene.history[time, number]
+        logged = np.asarray(bank.agents)[scene.index[time, number], step - 9 : step + 1, 0]
+        np.testing.assert_allclose(history[-10:, :2], logged[:, :2], atol=1e-4)
+
+
+def test_stored_states_are_observed_as_they_were_seen(experience, bank, driving):
+    _, rollout, _ = experience
+    rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rollout.state)
+    again = jax.jit(driving.observe_all)(bank, rows)
+    np.testing.assert_allclose(again["route"], rollout.extra["seen"].reshape(again["route"].shape), atol=1e-5)
+    one = jax.jit(driving.observe)(bank, jax.tree.map(lambda leaf: leaf[7], rows))
+    np.testing.assert_allclose(one["route"], again["route"][7], atol=1e-5)
+
+
+def test_sums_are_over_what_counts(experience, driving):
+    _, rollout, totals = experience
+    ended = rollout.terminated | rollout.truncated
+    assert totals["episodes"] == ended.sum() == totals["steps/n"] == totals["red_light/n"]
+    terms = [totals[f"reward/{name}"] for name in driving.task.rewards.weights()]
+    assert sum(terms) == pytest.approx(rollout.reward.sum(), rel=1e-4, abs=1e-3)
+
+
+def test_demonstrations_follow_the_log(bank, driving):
+    observation, action, clipped = jax.device_get(
+        jax.jit(driving.demonstrations, static_argnums=2)(bank, jax.random.key(3), 256)
+    )
+    index, step = observation["moment"][:, 0, :2].astype(int).T
+    assert step.min() >= 10 and step.max() <= bank.steps - 3 and set(index) == {0, 1, 2}
+    assert (np.abs(action) <= 1).all()
+    # Driven through the dynamics, every action leads to where the log goes.
+    rows = np.asarray(bank.agents)[index[:, None], step[:, None] + np.arange(2), 0]
+    speed = (rows[..., 5:7] * rows[..., 3:5]).sum(-1).clip(0)
+    motion = np.stack(
+        [rows[..., 0], rows[..., 1], np.arctan2(rows[..., AGENT_SIN], rows[..., AGENT_COS]), speed], axis=-1
+    )
+    reached = jax.vmap(bicycle)(motion[:, 0], 6.0 * action[:, 0], 0.3 * action[:, 1])
+    off = np.linalg.norm(reached[:, :2] - motion[:, 1, :2], axis=-1)
+    assert (~clipped).mean() > 0.9 and off[~clipped].max() < 0.05
+    # The last action that is seen is what the expert did a step before.
+    did = {(i, s): a for i, s, a in zip(index, step, action, strict=True)}
+    pairs = [(did[i, s - 1], o[0, 2:]) for i, s, o in zip(index, step, observation["moment"], strict=True)
+             if (i, s - 1) in did]  # fmt: skip
+    assert len(pairs) > 20
+    np.testing.assert_allclose(*map(np.array, zip(*pairs, strict=True)), atol=1e-5)

@@ -1,0 +1,132 @@
+"""Cloning against NumPy, and imitation beside learning by reward."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from drivax.errors import UsageError
+from drivax.learning.imitation import BcConfig, Cloning
+from drivax.learning.ppo import PpoConfig
+from drivax.learning.sac import SacConfig
+from drivax.learning.warm_start import BcPpoConfig, WarmStart
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.distributions import Grid, SquashedGaussian
+from drivax.networks.encoders import MlpConfig
+from pendulum import Demonstrations, Pendulum
+
+TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
+CLONING = Cloning(batch=16, updates=3)
+PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
+
+
+@dataclass(frozen=True)
+class Told(Pendulum):
+    """Always the same moments."""
+
+    def demonstrations(self, data, key, count):
+        return data
+
+
+@pytest.fixture(scope="module")
+def shown():
+    """What a pendulum's expert might do: push against the rate."""
+    angle, rate = jax.random.uniform(jax.random.key(0), (2, 500), minval=-3.0, maxval=3.0)
+    return Demonstrations({"angle": angle, "rate": rate}, jnp.tanh(-rate)[:, None])
+
+
+def gaussian(parameters, observation):
+    return SquashedGaussian(parameters["loc"], parameters["scale"])
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_losses_against_numpy(mask):
+    rng = np.random.default_rng(0)
+    loc, action = rng.normal(size=(2, 6, 2)).astype(np.float32)
+    scale = rng.uniform(0.2, 1.0, size=(6, 2)).astype(np.float32)
+    action, clipped = np.tanh(action), np.array([0, 1, 0, 0, 1, 0], bool)
+    counts = ~clipped if mask else np.ones(6, bool)
+    data = ({"pendulum": jnp.zeros((6, 3))}, jnp.asarray(action), jnp.asarray(clipped))
+    parameters = {"loc": jnp.asarray(loc), "scale": jnp.asarray(scale)}
+    error = np.tanh(loc) - action
+    # By change of variables from the normal density of SciPy; the derivative of arctanh is 1 / (1 - a^2).
+    density = stats.norm.logpdf(np.arctanh(action.astype(float)), loc, scale) - np.log1p(-(action**2.0))
+    for loss, expected in (("mse", (error**2).mean(axis=-1)), ("likelihood", -density.sum(axis=-1))):
+        cloning = Cloning(loss=loss, mask_clipped=mask)
+        found, logs = cloning.of_batch(gaussian, parameters, Told(), data, jax.random.key(0))
+        assert float(found) == pytest.approx(expected[counts].mean(), rel=1e-4)
+        assert float(logs["imitation_error"]) == pytest.approx(np.abs(error)[counts].mean(), rel=1e-4)
+        assert float(logs["left_out"]) == pytest.approx(2 / 6 if mask else 0.0, abs=1e-6)
+
+
+def test_clipped_moments_teach_nothing():
+    clipped = jnp.array([True, False])
+    data = ({"pendulum": jnp.zeros((2, 3))}, jnp.array([[1.0], [0.3]]), clipped)
+    parameters = {"loc": jnp.zeros((2, 1)), "scale": jnp.full((2, 1), 0.3)}
+    for loss in ("mse", "likelihood"):
+
+        def of(parameters, loss=loss):
+            return Cloning(loss=loss).of_batch(gaussian, parameters, Told(), data, jax.random.key(0))[0]
+
+        slope = jax.grad(of)(parameters)["loc"][:, 0]
+        assert slope[0] == 0.0 and slope[1] < 0.0
+
+
+def test_the_likelihood_fits_the_spread(shown):
+    """Of an expert that acts by N(0.4, 0.2) before squashing, whatever it sees."""
+    action = jnp.tanh(0.4 + 0.2 * jax.random.normal(jax.random.key(1), shown.action.shape))
+    data = replace(shown, action=action)
+    config = BcConfig(loss="likelihood", batch=256, updates=300, learning_rate=1e-2, network=TINY)
+    learner = config.build(Pendulum(), data, 1)
+    state, _ = jax.jit(learner.iterate)(data, jax.jit(learner.init)(data, jax.random.key(0)))
+    policy = learner.distribution(state.parameters, Pendulum().observe_all(data, data.stored))
+    drawn = np.arctanh(np.asarray(action))
+    assert float(policy.loc.mean()) == pytest.approx(drawn.mean(), abs=0.03)
+    assert float(policy.scale.mean()) == pytest.approx(drawn.std(), rel=0.1)
+
+
+def test_a_grid_and_missing_experts_are_refused(shown):
+    levels = (tuple(np.linspace(-1, 1, 5)),)
+    environment = Pendulum(levels=levels)
+    network = replace(TINY, distribution="grid")
+    with pytest.raises(UsageError, match="use loss: likelihood"):
+        BcConfig(network=network).build(environment, shown, 1)
+    learner = BcConfig(network=network, loss="likelihood", batch=8, updates=2).build(environment, shown, 1)
+    state = jax.jit(learner.init)(shown, jax.random.key(0))
+    assert isinstance(learner.distribution(state.parameters, {"pendulum": jnp.zeros(3)}), Grid)
+    with pytest.raises(UsageError, match="gradient through its samples"):
+        SacConfig(network=network)
+
+
+def test_imitation_fades():
+    weights = [float(WarmStart(weight=0.8, half_life=10).weight_at(jnp.asarray(i))) for i in (0, 10, 30)]
+    np.testing.assert_allclose(weights, [0.8, 0.4, 0.1], rtol=1e-6)
+    assert float(WarmStart(weight=0.8).weight_at(jnp.asarray(1000))) == pytest.approx(0.8)
+    with pytest.raises(UsageError, match="use 0 or more"):
+        WarmStart(weight=-1.0)
+    with pytest.raises(UsageError, match="raise total_steps"):
+        WarmStart(iterations=5).rest(5)
+    assert WarmStart(iterations=5).rest(8) == 3
+
+
+@pytest.mark.slow
+def test_imitation_beside_pulls_the_policy_toward_the_expert(shown):
+    """From the same clone, learning by reward with a large weight stays nearer to the expert than without."""
+    errors = {}
+    for weight in (0.0, 30.0):
+        start = WarmStart(iterations=1, cloning=replace(CLONING, updates=100), weight=weight)
+        ppo = replace(PPO, learning_rate=1e-2)
+        learner = BcPpoConfig(warm_start=start, ppo=ppo).build(Pendulum(), shown, 21)
+        state = jax.jit(learner.init)(shown, jax.random.key(0))
+
+        def run(state, learner=learner):
+            return jax.lax.scan(lambda s, _: learner.iterate(shown, s), state, None, 21)[0]
+
+        state = jax.jit(run)(state)
+        seen = Pendulum().observe_all(shown, shown.stored)
+        policy = learner.online.distribution(state.parameters, seen)
+        errors[weight] = float(jnp.abs(policy.mode() - shown.action).mean())
+    assert errors[30.0] < 0.5 * errors[0.0], errors

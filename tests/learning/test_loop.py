@@ -1,0 +1,156 @@
+"""The loop, with an algorithm that compiles at once: seeds, resuming, early stops, what is refused."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from drivax import settings
+from drivax.cli import main
+from drivax.errors import UsageError
+from drivax.learning.config import TrainConfig
+from drivax.learning.loop import train
+from drivax.learning.policies import load_policy
+from drivax.learning.stopping import patience_is_up
+from drivax.learning.validation import rank
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.show.runs import read_runs
+from drivax.synthetic.generate import Generation, generate
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.runs import seed_folders
+from drivax.tracking.sinks import read_rows
+from toy_learner import Toy, ToyConfig, ToyState
+
+VALUES = {
+    "algorithm": {"kind": "toy_learner:ToyConfig"},
+    "task": {"observation": {"agents": 1, "steps": 1, "road": 0, "lights": 1, "route": 2}},
+    "seed": 4,
+    "total_steps": 60,
+    "checkpoint_every": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def config():
+    return settings.load(TrainConfig, VALUES)
+
+
+def last_state(folder):
+    key = jax.random.key(0)
+    return Checkpoints(folder / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, key))
+
+
+def numbers(state: ToyState):
+    return np.asarray(state.parameters), np.asarray(jax.random.key_data(state.key)), int(state.iteration)
+
+
+def test_seeds_are_runs_of_their_own(data, config, tmp_path):
+    lines = []
+    folder = train(config, data, tmp_path / "three", seeds=3, say=lines.append)
+    inside = seed_folders(folder.path)
+    assert [path.name for path in inside] == ["seed-4", "seed-5", "seed-6"]
+    assert len(lines) == 1 and lines[0].startswith("memory: ") and "scenarios" in lines[0]
+    for seed, path in zip((4, 5, 6), inside, strict=True):
+        alone = train(replace(config, seed=seed), data, tmp_path / f"alone-{seed}").path
+        assert settings.load(TrainConfig, path / "config.yaml") == replace(config, seed=seed)
+        assert [row["step"] for row in read_rows(path / "metrics.jsonl")] == [10, 20, 30, 40, 50, 60]
+        for one, other in zip(
+            read_rows(path / "metrics.jsonl"), read_rows(alone / "metrics.jsonl"), strict=True
+        ):
+            assert one["loss/toy"] == pytest.approx(other["loss/toy"], rel=1e-6)
+            assert one["loss/sum"] == pytest.approx(other["loss/sum"], rel=1e-6)
+        for one, other in zip(numbers(last_state(path)), numbers(last_state(alone)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6)
+    bank = ScenarioBank.from_scenarios(data)
+    assert load_policy(inside[0], bank)[1] == config.task
+    with pytest.raises(UsageError, match=r"holds 3 agents; name one of them, as .*seed-4"):
+        load_policy(folder.path, bank)
+    _, trainings = read_runs([folder.path])
+    assert [training.name for training in trainings] == ["seed-4", "seed-5", "seed-6"]
+
+
+def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_path):
+    whole = train(config, data, tmp_path / "whole", seeds=2)
+    cut = train(config, data, tmp_path / "cut", seeds=2)
+    # As if the machine had gone while checkpoints were written: one agent is a checkpoint behind.
+    shutil.rmtree(cut.path / "seed-5" / "checkpoints" / "step-000000060")
+    resumed = train(config, data, tmp_path / "cut", resume=True)
+    for path, other in zip(seed_folders(whole.path), seed_folders(resumed.path), strict=True):
+        assert [row["step"] for row in read_rows(other / "metrics.jsonl")] == [10, 20, 30, 40, 50, 60]
+        for one, again in zip(numbers(last_state(path)), numbers(last_state(other)), strict=True):
+            np.testing.assert_array_equal(one, again)
+    with pytest.raises(UsageError, match="holds 2 agents, not 3; resume without --seeds"):
+        train(config, data, tmp_path / "cut", resume=True, seeds=3)
+
+
+def test_learning_stops_when_patience_is_up(data, config, tmp_path):
+    """The toy always drives alike: the first validation is the best, two more are waited for."""
+    patient = replace(config, evaluate_every=1, patience=2, checkpoint_rule="lexicographic")
+    lines = []
+    run = train(patient, data, tmp_path / "run", validation=data, seeds=2, say=lines.append)
+    assert lines[1:] == [f"seed {seed}: no better for 2 validations, stopped at 30 steps" for seed in (4, 5)]
+    for path in seed_folders(run.path):
+        rows = list(read_rows(path / "metrics.jsonl"))
+        assert [row["step"] for row in rows] == [10, 20, 30]
+        about = json.loads((path / "checkpoints" / "step-000000030" / "about.json").read_text())
+        row = rows[-1]
+        wanted = [row[f"validation/{name}"] for name in ("accuracy", "progress_ratio", "comfortable")]
+        assert about["score"] == wanted and all(value >= 0.0 for value in wanted)
+    # Nothing is left to do, and resuming does nothing.
+    train(patient, data, tmp_path / "run", validation=data, resume=True)
+    assert [row["step"] for row in read_rows(run.path / "seed-4" / "metrics.jsonl")] == [10, 20, 30]
+    with pytest.raises(UsageError, match="pass --validation"):
+        train(patient, data, tmp_path / "other")
+
+
+def test_patience():
+    ranks = [(0.1,), (0.5,), (0.5,), (0.4,), (0.6,)]
+    assert [patience_is_up(ranks[:n], 2) for n in range(6)] == [False, False, False, False, True, False]
+    assert not patience_is_up(ranks, 0) and not patience_is_up([], 3)
+    # Equal failures, better progress: that is better.
+    assert not patience_is_up([(0.9, 0.5, 1.0), (0.9, 0.6, 0.0)], 1)
+    assert patience_is_up([(0.9, 0.5, 0.2), (0.8, 1.0, 1.0)], 1)
+
+
+def test_ranks():
+    row = {
+        "validation/vmax_score": 0.7, "validation/accuracy": 0.75, "validation/progress_ratio": 0.9,
+        "validation/comfortable": None, "loss/value": 3.0,
+    }  # fmt: skip
+    assert rank("score", row) == (0.7,)
+    assert rank("lexicographic", row) == (0.75, 0.9, -1.0)
+    assert rank("score", {"validation/vmax_score_partial": 0.2}) == (0.2,)
+    assert rank("score", {"loss/value": 3.0}) is None
+    # A failure less is worth any progress, progress any comfort.
+    safe, quick, smooth = (0.76, 0.1, 0.0), (0.75, 0.9, 0.0), (0.75, 0.8, 1.0)
+    assert safe > quick > smooth
+
+
+def test_a_run_is_never_overwritten_or_resumed_on_other_data(data, config, tmp_path):
+    train(config, data, tmp_path / "run")
+    with pytest.raises(UsageError, match="--overwrite"):
+        train(config, data, tmp_path / "run")
+    generate(tmp_path / "other", 1, 12, Generation(workers=1))
+    other = ScenarioSet.open(tmp_path / "other")
+    with pytest.raises(UsageError, match="other scenarios"):
+        train(config, other, tmp_path / "run", resume=True)
+    with pytest.raises(UsageError, match="same --validation"):
+        train(config, data, tmp_path / "run", resume=True, validation=other)
+    with pytest.raises(UsageError, match="2 devices, but there are 1"):
+        train(replace(config, devices=2), data, tmp_path / "never")
+    assert not (tmp_path / "never").exists()
+
+
+def test_the_command_trains_several(data, tmp_path, capsys):
+    (tmp_path / "toy.yaml").write_text(settings.dump(settings.load(TrainConfig, VALUES)))
+    out = tmp_path / "out"
+    arguments = ["train", str(tmp_path / "toy.yaml"), "--data", str(data.path), "--out", str(out)]
+    assert main([*arguments, "--seeds", "2", "--total_steps", "20"]) == 0
+    told = capsys.readouterr()
+    assert "wrote" in told.out and "memory: " in told.err and (out / "seed-5" / "metrics.jsonl").is_file()
+    assert main([*arguments[:1], "demo", *arguments[2:], "--seeds", "0", "--overwrite"]) == 2
+    assert "0 seeds; use 1 or more" in capsys.readouterr().err

@@ -1,0 +1,66 @@
+"""The account of memory: bytes that are counted by hand, and what is refused."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from drivax.errors import UsageError
+from drivax.learning.environment import Environments
+from drivax.learning.memory import MemoryAccount, account, memory_of
+from drivax.scenario.record import record
+
+
+@record
+class State:
+    parameters: jax.Array
+    key: jax.Array
+    environments: Environments
+    learner: dict
+
+
+@record
+class Inner:
+    replay: jax.Array
+
+
+def test_every_byte_is_on_one_line():
+    data = {"scenarios": jnp.zeros((5, 7)), "codes": jnp.zeros(9, jnp.int8)}
+    state = State(
+        parameters=jnp.zeros((10, 3)),
+        key=jax.random.key(0),
+        environments=Environments(jnp.zeros(4), jnp.zeros(4, bool), {"ego": jnp.zeros((4, 2), jnp.bfloat16)}),
+        learner={"inner": Inner(jnp.zeros((100, 4), jnp.int32))},
+    )
+
+    def iterate(data, state):
+        square = jnp.outer(data["scenarios"].ravel(), data["scenarios"].ravel())
+        square = jnp.sort(square, axis=0)  # has to be kept: 35 x 35 numbers
+        return replace(state, parameters=state.parameters + square.sum()), jnp.zeros(50) + square[0, 0]
+
+    compiled = jax.jit(iterate, donate_argnums=1).lower(data, state).compile()
+    found = account(data, jnp.zeros(6), state, compiled, jax.devices()[:1])
+    assert {name: size for name, size in found.parts.items() if name != "program"} == {
+        "scenarios": 5 * 7 * 4 + 9, "validation": 24, "replay": 1600, "environments": 16 + 4 + 16,
+        "networks and optimiser": 120 + 8,
+    }  # fmt: skip
+    # Results that take the place of no argument, and the table.
+    assert 200 + 35 * 35 * 4 <= found.parts["program"] < 10 * 35 * 35 * 4
+    assert found.total == sum(found.parts.values())
+    assert found.limit == memory_of(jax.devices()[0]) and found.limit > 10**8
+    assert found.text().startswith("memory: ") and "replay 1.6 kB" in found.text()
+    assert memory_of(jax.devices()[0], 4) == found.limit // 4
+
+
+def test_what_does_not_fit_is_refused_with_the_cure():
+    parts = {"scenarios": 3_000_000_000, "replay": 5_000_000_000, "program": 2}
+    fits = MemoryAccount(parts, 9_000_000_000, "cuda:0")
+    fits.refuse_too_much()
+    replace(fits, limit=None).refuse_too_much()
+    with pytest.raises(UsageError) as refused:
+        replace(fits, limit=7_999_999_999).refuse_too_much()
+    assert str(refused.value) == (
+        "training does not fit; memory: 8.0 GB of 8.0 GB on cuda:0: scenarios 3.0 GB, replay 5.0 GB, program 2 B; "
+        "lower algorithm.replay.capacity, or set algorithm.replay.store to state"
+    )

@@ -1,0 +1,55 @@
+"""A run folder whose policy drives the vehicles around ego."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import drivax
+from drivax import settings
+from drivax.errors import DataError
+from drivax.learning.config import TrainConfig
+from drivax.learning.loop import train
+from drivax.learning.policy_traffic import policy_traffic
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.catalogue import prepared
+from drivax.simulator.reactive import IdmTraffic
+from drivax.synthetic.generate import Generation, generate
+
+TINY = {
+    "task": {
+        "observation": {"agents": 2, "steps": 1, "road": 0, "lights": 0, "route": 2},
+        "rewards": {"preset": "aggressive"},
+        "metrics": ["success"],
+    },
+    "algorithm": {
+        "kind": "ppo", "network": {"encoder": {"rows": [4], "hidden": [8]}, "head": [4]},
+        "environments": 2, "unroll": 4, "epochs": 1, "minibatches": 1,
+    },
+    "total_steps": 16,
+}  # fmt: skip
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    with pytest.raises(DataError):
+        policy_traffic(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_planner_is_judged_among_vehicles_that_a_policy_drives(tmp_path):
+    generate(tmp_path / "set", 2, 3, Generation(workers=1))
+    data = ScenarioSet.open(tmp_path / "set")
+    run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold")
+    with_logged, with_idm = (policy_traffic(run.path, count=2, base=base) for base in (None, IdmTraffic()))
+    assert (with_logged.name, with_idm.name) == ("driven_by_bold", "driven_by_bold+idm")
+    assert hash(with_logged) == hash(policy_traffic(run.path, count=2))
+    loaded = drivax.load(tmp_path / "set")
+    bank = prepared(with_idm, loaded.bank)
+    assert bank.paths is not None and bank.driver.name == "bold"
+    assert jax.tree.leaves(bank.driver.parameters)
+    results = drivax.evaluate("idm", loaded, traffic=with_logged)
+    logged = drivax.evaluate("idm", loaded)
+    assert results.summary()["traffic"] == "driven_by_bold"
+    distance = [found.summary()["metrics"]["average_ttc"]["mean"] for found in (results, logged)]
+    assert np.isfinite(distance).all() and distance[0] != distance[1]

@@ -1,0 +1,167 @@
+"""PPO on the pendulum: what it bootstraps, heads, seeds side by side, several devices; its optimiser."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from drivax.learning.agents import Agents
+from drivax.learning.collector import Rollout
+from drivax.learning.optimisers import clip_apart, clipped_adam
+from drivax.learning.ppo import PpoConfig
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
+from pendulum import Pendulum
+
+NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,), activation="tanh"), head=(4,))
+CONFIG = PpoConfig(network=NETWORK, environments=8, unroll=6, epochs=2, minibatches=2)
+
+
+def test_a_truncated_step_bootstraps_its_own_final_state():
+    """Rows of one environment: a step, the last one of its episode, the row that begins the next one, a step."""
+    learner = CONFIG.build(Pendulum(), (), 1)
+    value = jnp.array([[1.0], [2.0], [30.0], [4.0]])
+    reward = jnp.array([[0.1], [0.2], [0.0], [0.4]])
+    ended = jnp.array([[False], [True], [False], [False]])
+    for truncated in (True, False):
+        cut, failed = (ended, ~ended & ended) if truncated else (~ended & ended, ended)
+        rows = Rollout(
+            observation={"pendulum": jnp.zeros((4, 1, 3))}, state=None, choice=jnp.zeros((4, 1, 1)),
+            extra={"value": value, "log_prob": jnp.zeros((4, 1))}, reward=reward, terminated=failed,
+            truncated=cut, alive=jnp.array([[True], [True], [False], [True]]),
+        )  # fmt: skip
+        batch = learner._batch(rows, jnp.array([5.0]))
+        # gamma 0.99, lambda 0.95: by hand. The value 30 of the final state counts only where the log ended.
+        last = 0.2 + (0.99 * 30.0 if truncated else 0.0) - 2.0
+        first = 0.1 + 0.99 * 2.0 - 1.0 + 0.99 * 0.95 * last
+        open_end = 0.4 + 0.99 * 5.0 - 4.0
+        np.testing.assert_allclose(
+            batch["advantage"][jnp.array([0, 1, 3])], [first, last, open_end], rtol=1e-6
+        )
+        np.testing.assert_allclose(batch["target"][:2], [first + 1.0, last + 2.0], rtol=1e-6)
+        np.testing.assert_array_equal(batch["alive"], [1, 1, 0, 1])
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        NetworkConfig(encoder=NETWORK.encoder, head=(4,), distribution="beta", shared_encoder=True),
+        NetworkConfig(encoder=NETWORK.encoder, head=(4,), distribution="grid"),
+    ],
+    ids=["beta-shared", "grid"],
+)
+def test_heads(network):
+    environment = Pendulum(levels=((-1.0, 0.0, 1.0),))
+    config = PpoConfig(network=network, environments=4, unroll=4, epochs=1, minibatches=2)
+    learner = config.build(environment, (), 1)
+    state = jax.jit(learner.init)((), jax.random.key(0))
+    after, logs = jax.jit(learner.iterate)((), state)
+    assert all(np.isfinite(value) for value in logs.values())
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), after.parameters, state.parameters)
+    assert max(jax.tree.leaves(moved)) > 1e-5
+    policy = learner.distribution(after.parameters, {"pendulum": jnp.zeros(3)})
+    action = policy.action(policy.sample(jax.random.key(1)))
+    assert action.shape == (1,) and abs(float(action[0])) <= 1.0
+    assert network.distribution != "grid" or float(action[0]) in (-1.0, 0.0, 1.0)
+
+
+def test_seeds_side_by_side_learn_what_each_learns_alone():
+    learner = CONFIG.build(Pendulum(), (), 3)
+    together = Agents(learner, (3, 4))
+    states, logs = _iterate(together)
+    state, alone = _iterate(Agents(learner, (4,)))
+    # Sums in another order, three iterations on.
+    other, mine = (together.one(states.parameters, number) for number in (0, 1))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5), mine, state.parameters)
+    assert float(together.one(logs, 1)["loss/value"]) == pytest.approx(float(alone["loss/value"]), rel=1e-3)
+    assert max(jax.tree.leaves(jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), other, mine))) > 0.1
+
+
+def _iterate(agents):
+    state = jax.jit(agents.init)(())
+    step, logs = jax.jit(agents.iterate), {}
+    for _ in range(3):
+        state, logs = step((), state)
+    return state, logs
+
+
+MESH = """
+import jax, numpy as np
+from drivax.errors import UsageError
+from drivax.learning.agents import Agents
+from drivax.learning.program import Program
+from pendulum import Pendulum
+from test_ppo import CONFIG
+
+learner = CONFIG.build(Pendulum(), (), 3)
+
+def run(seeds, devices):
+    program = Program(Agents(learner, seeds), (), devices)
+    assert len(program.devices) == (devices or 4), program.devices
+    state = program.first_state()
+    for _ in range(3):
+        state, logs = program.step(state)
+    spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.environments)}
+    assert spread == {len(program.devices)}, spread
+    shard = state.environments.observation["pendulum"].sharding.shard_shape((8, 3) if len(seeds) == 1 else (2, 8, 3))
+    return jax.device_get((state.parameters, logs)), shard, program.account().parts["environments"]
+
+def same(one, other):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5), one, other)
+
+one, whole, size = run((3,), 1)
+for devices in (2, None):
+    several, shard, part = run((3,), devices)
+    same(one, several)
+    assert shard == (8 // (devices or 4), 3) and part == size // (devices or 4), (shard, part, size)
+# Two agents on two devices: one each.
+pair, shard, _ = run((3, 4), 2)
+same(one, jax.tree.map(lambda leaf: leaf[0], pair))
+assert shard == (1, 8, 3), shard
+try:
+    Program(Agents(learner, (3,)), (), 3)
+except UsageError as error:
+    assert "8 environments cannot be divided among 3 devices" in str(error), error
+else:
+    raise AssertionError("3 devices")
+print("same")
+"""
+
+
+def test_several_devices_learn_what_one_learns(repository, monkeypatch):
+    monkeypatch.setenv(
+        "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_force_host_platform_device_count=4"
+    )
+    monkeypatch.setenv(
+        "PYTHONPATH", f"{repository / 'src'}:{repository / 'tests'}:{repository / 'tests/learning'}"
+    )
+    result = subprocess.run([sys.executable, "-c", MESH], capture_output=True, text=True, check=False)
+    assert result.stdout == "same\n", result.stderr
+
+
+def test_parts_are_clipped_by_their_own_norms():
+    gradient = {
+        "policy": {"w": jnp.array([0.3, 0.4])},
+        "value": {"w": jnp.array([30.0]), "b": jnp.array([40.0])},
+    }
+    clipped, _ = clip_apart(1.0).update(gradient, optax.EmptyState())
+    np.testing.assert_allclose(clipped["policy"]["w"], [0.3, 0.4], rtol=1e-6)
+    np.testing.assert_allclose([clipped["value"]["w"][0], clipped["value"]["b"][0]], [0.6, 0.8], rtol=1e-6)
+    nothing, _ = clip_apart(1.0).update({"policy": jnp.zeros(2)}, optax.EmptyState())
+    np.testing.assert_array_equal(nothing["policy"], [0.0, 0.0])
+
+
+def test_the_rate_falls_to_a_tenth():
+    """The first step of Adam is the rate itself, whatever the gradient; and so are all, if it stays the same."""
+    optimiser = clipped_adam(0.5, 1.0, updates=10, eps=0.0)
+    weights, state = {"w": jnp.zeros(1)}, optimiser.init({"w": jnp.zeros(1)})
+    sizes = []
+    for _ in range(12):
+        change, state = optimiser.update({"w": jnp.ones(1)}, state, weights)
+        sizes.append(-float(change["w"][0]))
+    wanted = [0.5 - 0.045 * min(step, 10) for step in range(12)]
+    np.testing.assert_allclose(sizes, wanted, rtol=1e-4)

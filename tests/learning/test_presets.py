@@ -1,0 +1,51 @@
+"""Every preset is a training run that can be built, and the published ones have the published numbers."""
+
+import pytest
+
+from drivax import settings
+from drivax.learning.config import TrainConfig
+from drivax.learning.imitation import BcConfig
+from drivax.learning.ppo import PpoConfig
+from drivax.learning.sac import SacConfig
+from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
+from drivax.tasks.observations import PRESETS
+
+KINDS = {"bc": BcConfig, "sac": SacConfig, "ppo": PpoConfig, "bc_sac": BcSacConfig, "bc_ppo": BcPpoConfig}
+
+
+@pytest.mark.parametrize("name", settings.presets())
+def test_presets_load_and_round_trip(name):
+    config = settings.load(TrainConfig, name)
+    assert settings.load(TrainConfig, settings.parse_yaml(settings.dump(config))) == config
+    kind = name.removeprefix("published/")
+    if kind in KINDS:
+        assert type(config.algorithm) is KINDS[kind]
+    # More than warming up or cloning.
+    if hasattr(config.algorithm, "warm_start"):
+        assert 0 < config.algorithm.warm_start.iterations < config.iterations
+
+
+def test_every_algorithm_has_its_presets():
+    names = set(settings.presets())
+    assert set(KINDS) <= names
+    assert {f"published/{kind}" for kind in KINDS if kind != "bc_ppo"} <= names
+
+
+def test_published_numbers():
+    """As the semantics list them (Learning, published defaults)."""
+    sac = settings.load(TrainConfig, "published/sac")
+    learner = sac.algorithm
+    assert (sac.total_steps, learner.environments, learner.replay.capacity) == (25_000_000, 16, 1_000_000)
+    assert (learner.warm_up, learner.batch, learner.updates_per_step) == (10_000, 256, 4)
+    assert (learner.gamma, learner.tau, learner.temperature) == (0.99, 0.005, 0.1)
+    assert learner.policy_rate == learner.critic_rate == learner.temperature_rate == 3e-4
+    assert learner.target_entropy is None, "minus the size of an action, which is 2"
+    ppo = settings.load(TrainConfig, "published/ppo")
+    learner = ppo.algorithm
+    assert (ppo.total_steps, learner.environments) == (200_000_000, 256)
+    assert (learner.minibatches, learner.epochs, learner.clip, learner.lambda_) == (8, 4, 0.2, 0.95)
+    assert learner.steps_per_iteration // learner.minibatches == 512
+    assert (learner.value_coefficient, learner.entropy_coefficient, learner.gradient_norm) == (0.5, 0.01, 0.5)
+    both = settings.load(TrainConfig, "published/bc_sac")
+    for config in (sac, ppo, both):
+        assert config.task.observation == PRESETS["published"] and config.task.rewards.preset == "published"

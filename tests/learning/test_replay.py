@@ -1,0 +1,161 @@
+"""Replay: what is sampled is what happened, whatever was written over, and every step as often as any other."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from drivax.errors import UsageError
+from drivax.learning import replay
+from drivax.learning.collector import collect
+from drivax.learning.driving import Driving
+from drivax.learning.environment import Environments, Outcome
+from drivax.learning.replay import ReplayConfig
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from drivax.testing import worlds
+
+COUNT = 3
+
+
+@dataclass(frozen=True)
+class Counting:
+    """Every state is a different one: environment, episode, step. Episodes have 1 to 5 steps; even ones terminate."""
+
+    action_size: int = 1
+    levels: None = None
+
+    def shapes(self, data):
+        return {"place": (3,), "place_mask": ()}
+
+    def start(self, data, key, count):
+        state = jnp.stack([jnp.arange(count), jnp.zeros(count, int), jnp.zeros(count, int)], axis=-1)
+        return Environments(state, jnp.zeros(count, bool), self.observe_all(data, state))
+
+    def stored(self, state):
+        return state
+
+    def observe_all(self, data, stored):
+        return {"place": stored.astype(jnp.float32), "place_mask": stored[..., 2] > 0}
+
+    observe = observe_all
+
+    def look(self, data, state):
+        return ()
+
+    def step(self, data, now, looked, action, key):
+        who, episode, step = jnp.moveaxis(now.state, -1, 0)
+        moved = jnp.stack([who, episode, step + 1], axis=-1)
+        begun = jnp.stack([who, episode + 1, jnp.zeros_like(step)], axis=-1)
+        state = jnp.where(now.over[:, None], begun, moved)
+        over = ~now.over & (state[:, 2] >= 1 + (state[:, 0] + 2 * state[:, 1]) % 5)
+        ends = state[:, 1] % 2 == 0
+        outcome = Outcome(10.0 * moved[:, 1] + moved[:, 2], over & ends, over & ~ends, (), {})
+        return Environments(state, over, self.observe_all(data, state)), outcome
+
+
+def act(observation, key):
+    action = observation["place"][:, 2:] / 10.0
+    return action, action, {}
+
+
+def fill(config, steps, unroll):
+    """A replay after so many steps, and the steps that it should hold, told by plain loops."""
+    environment = Counting()
+    environments = environment.start((), jax.random.key(0), COUNT)
+    kept = replay.init(config, environment, environments)
+    run = jax.jit(lambda e, key: collect(environment, (), e, act, key, unroll, config.store)[:2])
+    for _ in range(steps // unroll):
+        environments, rollout = run(environments, jax.random.key(0))
+        kept = jax.jit(replay.add)(kept, rollout)
+    held = set()
+    for who in range(COUNT):
+        row, episode, step = 0, 0, 0
+        first = max(0, steps - config.capacity // COUNT)
+        while row < steps:
+            length = 1 + (who + 2 * episode) % 5
+            # A row per step, and one that only begins the next episode; the newest row has no successor.
+            if step < length and first <= row < steps - 1:
+                held.add((who, episode, step))
+            episode, step = (episode + 1, 0) if step == length else (episode, step + 1)
+            row += 1
+    return environment, kept, held
+
+
+def sampled(environment, kept, count, seed=1):
+    places = replay.draw(kept, jax.random.key(seed), (count,))
+    return replay.sample(environment, (), kept, places)
+
+
+@pytest.mark.parametrize("store", ["state", "observation"])
+@pytest.mark.parametrize(("capacity", "steps"), [(60, 12), (60, 20), (60, 24), (37, 48), (60, 84)])
+def test_samples_are_the_steps_that_happened(store, capacity, steps):
+    """Before the ring is full, exactly full, and after it was written over once and four times."""
+    environment, kept, held = fill(ReplayConfig(capacity, store), steps, 4)
+    batch = sampled(environment, kept, 4000)
+    before, after = (np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.following))
+    assert {tuple(row) for row in before.tolist()} == held
+    # What a step led to is the next state of the same episode, final states included.
+    np.testing.assert_array_equal(after, before + np.array([0, 0, 1]))
+    final = after[:, 2] == 1 + (after[:, 0] + 2 * after[:, 1]) % 5
+    assert final.any() and not final.all()
+    np.testing.assert_array_equal(batch.terminated, final & (after[:, 1] % 2 == 0))
+    np.testing.assert_allclose(batch.reward, 10.0 * before[:, 1] + after[:, 2])
+    np.testing.assert_allclose(batch.action[:, 0], before[:, 2] / 10.0, rtol=1e-6)
+    assert batch.observation["place_mask"].dtype == bool
+
+
+def test_every_step_is_as_likely_as_any_other():
+    environment, kept, held = fill(ReplayConfig(60), 84, 4)
+    batch = np.asarray(sampled(environment, kept, 20_000).observation["place"]).astype(int)
+    counts = np.unique(batch, axis=0, return_counts=True)[1]
+    assert len(counts) == len(held)
+    assert stats.chisquare(counts).pvalue > 0.01
+    # The oracle sees a bias: one of two environments twice as often fails it.
+    assert stats.chisquare(np.concatenate([counts, 2 * counts])).pvalue < 1e-9
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(UsageError, match="capacity of at least 6"):
+        ReplayConfig(capacity=5).rows(3)
+    environment, kept, _ = fill(ReplayConfig(12), 4, 4)
+    environments = environment.start((), jax.random.key(0), COUNT)
+    _, rollout, _ = collect(environment, (), environments, act, jax.random.key(0), 5, "state")
+    with pytest.raises(UsageError, match="5 steps for a replay of 4 rows"):
+        replay.add(kept, rollout)
+
+
+@pytest.mark.slow
+def test_states_and_observations_give_the_same_batch():
+    """In driving: observed when sampled is what the policy saw, within the precision of what is stored."""
+    observation = ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3)
+    environment = Driving(Simulator(Task(observation=observation, metrics="none")), latest_start=80)
+
+    def drive(observation, key):
+        action = jnp.tanh(jax.random.normal(key, (4, 2)))
+        return action, action, dict(observation)
+
+    def batches(bank):
+        environments = environment.start(bank, jax.random.key(0), 4)
+        _, rollout, _ = collect(environment, bank, environments, drive, jax.random.key(1), 16, "state")
+        for part in (rollout, replace(rollout, state=None, observation=rollout.extra)):
+            store = "state" if part.observation is None else "observation"
+            kept = replay.add(replay.init(ReplayConfig(64, store), environment, environments), part)
+            places = replay.draw(kept, jax.random.key(2), (64,))
+            yield replay.sample(environment, bank, kept, places)
+
+    exact, stored = jax.jit(lambda bank: tuple(batches(bank)))(worlds.worlds())
+    assert bool(exact.terminated.any()) or float(jnp.abs(exact.reward).max()) > 0
+    for name in ("action", "reward", "terminated"):
+        np.testing.assert_array_equal(getattr(exact, name), getattr(stored, name))
+    for one, other in ((exact.observation, stored.observation), (exact.following, stored.following)):
+        assert set(one) == set(other)
+        for name in one:
+            # bfloat16 keeps 8 bits.
+            np.testing.assert_allclose(one[name], other[name], rtol=2**-8, atol=1e-6, err_msg=name)
+    moved = np.abs(np.asarray(exact.observation["route"]) - np.asarray(exact.following["route"]))
+    assert moved.max() > 1e-3

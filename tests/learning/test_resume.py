@@ -1,0 +1,113 @@
+"""Every algorithm goes on from a checkpoint bit for bit, keeps to the rules, and goes through its phases."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.learning.imitation import BcConfig, Cloning
+from drivax.learning.loop import logged
+from drivax.learning.ppo import PpoConfig
+from drivax.learning.replay import ReplayConfig
+from drivax.learning.sac import SacConfig
+from drivax.learning.warm_start import BcPpoConfig, BcSacConfig, WarmStart
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
+from drivax.testing import check_algorithm
+from drivax.tracking.checkpoints import Checkpoints
+from pendulum import Demonstrations, Pendulum
+
+TINY = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
+#: Small enough that six iterations write over the whole ring.
+SAC = SacConfig(
+    network=TINY,
+    replay=ReplayConfig(32),
+    environments=4,
+    unroll=4,
+    updates_per_step=1,
+    batch=8,
+    warm_up=16,
+)
+PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
+START = WarmStart(iterations=2, cloning=Cloning(batch=8, updates=2), weight=0.5, half_life=2)
+ALGORITHMS = {
+    "bc": BcConfig(batch=8, updates=2, network=TINY),
+    "sac": SAC,
+    "sac_observations": replace(SAC, replay=ReplayConfig(32, "observation")),
+    "ppo": PPO,
+    "bc_sac": BcSacConfig(warm_start=START, sac=SAC),
+    "bc_ppo": BcPpoConfig(warm_start=START, ppo=PPO),
+}
+
+
+#: Warm starts go through both phases, and so through what the others do.
+PARAMETERS = [
+    name if name.startswith("bc_") else pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS
+]
+SHOWN = Demonstrations({"angle": jnp.linspace(-3, 3, 50), "rate": jnp.zeros(50)}, jnp.zeros((50, 1)))
+
+
+@pytest.fixture(scope="module", params=PARAMETERS)
+def run(request):
+    """A learner's compiled iteration, its states before each of six iterations and after, and what each logged."""
+    learner = ALGORITHMS[request.param].build(Pendulum(), SHOWN, 6)
+    state, iterate = jax.jit(learner.init)(SHOWN, jax.random.key(5)), jax.jit(learner.iterate)
+    states, rows = [state], []
+    for _ in range(6):
+        state, raw = iterate(SHOWN, state)
+        states.append(state)
+        rows.append(raw)
+    return request.param, learner, iterate, states, rows
+
+
+def test_resuming_is_bit_for_bit(run, tmp_path):
+    """Stopped in the middle and restored from disk, a run ends in the very state of one that was not stopped."""
+    _, learner, iterate, states, rows = run
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(3, states[3])
+    # Restored into shapes alone, as a fresh process does.
+    state = checkpoints.restore(jax.eval_shape(learner.init, SHOWN, jax.random.key(0)))
+    for number in range(3, 6):
+        state, raw = iterate(SHOWN, state)
+        jax.tree.map(np.testing.assert_array_equal, raw, rows[number])
+    jax.tree.map(np.testing.assert_array_equal, *(jax.tree.map(_plain, part) for part in (state, states[-1])))
+
+
+def test_a_warm_start_clones_and_then_learns(run):
+    name, _, _, states, raw = run
+    if not name.startswith("bc_"):
+        pytest.skip("has one phase")
+    rows = [logged(row) for row in raw]
+    begun, cloned, learned = (jax.device_get(states[number]) for number in (0, 2, 6))
+    # Cloning moves the policy alone, and logs nothing of what it did not do.
+    for part in ("environments", "optimiser", "iteration"):
+        before, after = (jax.tree.leaves(getattr(state.learner, part)) for state in (begun, cloned))
+        assert all(map(np.array_equal, before, after)), part
+    assert not all(map(np.array_equal, *(jax.tree.leaves(state.parameters) for state in (begun, cloned))))
+    for row in rows[:2]:
+        assert "loss/imitation" in row and "loss/policy" not in row
+        assert not any(name.startswith("reward/") for name in row)
+    # Learning by reward goes on from the clone, with imitation beside it.
+    for row in rows[2:]:
+        assert {"reward/swing", "loss/policy", "loss/imitation"} <= set(row)
+    assert (int(learned.iteration), int(learned.learner.iteration)) == (6, 4)
+    moved = jax.tree.leaves(begun.learner.environments), jax.tree.leaves(learned.learner.environments)
+    assert not all(map(np.array_equal, *moved))
+
+
+def _plain(leaf):
+    key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if key else leaf)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bc", "sac", "bc_sac", "bc_ppo"])
+def test_algorithms_keep_to_the_rules(name):
+    config = ALGORITHMS[name]
+    if name.startswith("bc_"):
+        config = replace(config, warm_start=replace(START, iterations=1))
+    if name == "sac":
+        config = replace(SAC, warm_up=0)
+    check_algorithm(config)

@@ -1,0 +1,195 @@
+"""Distributions against SciPy, numerical integration, finite differences and samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, special, stats
+
+from drivax.errors import UsageError
+from drivax.networks.distributions import (
+    Actions,
+    Beta,
+    Distribution,
+    Grid,
+    SquashedGaussian,
+    distribution,
+    first_parameters,
+    parameters_of,
+)
+
+LEVELS = ((-1.0, -0.25, 0.0, 0.25, 1.0), (-0.5, 0.0, 0.5))
+GAUSSIAN = SquashedGaussian(jnp.array([0.3, -1.0]), jnp.array([0.2, 1.4]))
+BETA = Beta(jnp.array([1.0, 7.5]), jnp.array([3.0, 2.0]))
+GRID = Grid(jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32), LEVELS)
+ALL = {"gaussian": GAUSSIAN, "beta": BETA, "grid": GRID}
+
+
+def draws(one, count=20_000):
+    return jax.vmap(one.sample)(jax.random.split(jax.random.key(0), count))
+
+
+def gaussian_density(action, loc, scale):
+    """Density of tanh of a Gaussian: SciPy's density of arctanh, its slope by finite difference in float64."""
+    step = 1e-6
+    slope = (np.arctanh(action + step) - np.arctanh(action - step)) / (2 * step)
+    return stats.norm.pdf(np.arctanh(action), loc, scale) * slope
+
+
+def test_gaussian_log_prob_and_its_jacobian():
+    action = np.array([0.7, -0.99])
+    wanted = np.log(gaussian_density(action, np.asarray(GAUSSIAN.loc), np.asarray(GAUSSIAN.scale))).sum()
+    choice = GAUSSIAN.choice_of(jnp.asarray(action))
+    assert float(GAUSSIAN.log_prob(choice)) == pytest.approx(wanted, rel=1e-4)
+    np.testing.assert_allclose(GAUSSIAN.action(choice), action, atol=1e-5)
+
+
+def test_gaussian_density_integrates_to_one():
+    one = SquashedGaussian(jnp.array([0.4]), jnp.array([0.7]))
+    action = np.linspace(-0.9999, 0.9999, 20001)
+    log_prob = jax.vmap(lambda a: one.log_prob(jnp.arctanh(a)[None]))(jnp.asarray(action))
+    assert np.trapezoid(np.exp(log_prob), action) == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("loc", [-3.0, 0.0, 0.8])
+@pytest.mark.parametrize("scale", [1e-3, 0.3, 2.0])
+def test_gaussian_mean_action_is_that_of_quadrature(loc, scale):
+    wanted, _ = integrate.quad(
+        lambda x: np.tanh(x) * stats.norm.pdf(x, loc, scale), loc - 9 * scale, loc + 9 * scale, points=[loc]
+    )
+    one = SquashedGaussian(jnp.array([loc]), jnp.array([scale]))
+    assert float(one.mean_action()[0]) == pytest.approx(wanted, abs=1e-3)
+
+
+def test_gaussian_samples_have_its_moments():
+    choice = draws(GAUSSIAN)
+    np.testing.assert_allclose(choice.mean(0), GAUSSIAN.loc, atol=0.03)
+    np.testing.assert_allclose(choice.std(0), GAUSSIAN.scale, atol=0.03)
+    np.testing.assert_allclose(GAUSSIAN.mode(), np.median(np.tanh(choice), axis=0), atol=0.03)
+
+
+def test_beta_against_scipy():
+    x = np.array([0.2, 0.93])
+    reference = stats.beta(np.asarray(BETA.alpha, float), np.asarray(BETA.beta, float), loc=-1, scale=2)
+    choice = BETA.choice_of(jnp.asarray(2 * x - 1))
+    np.testing.assert_allclose(choice, x, rtol=1e-6)
+    assert float(BETA.log_prob(choice)) == pytest.approx(reference.logpdf(2 * x - 1).sum(), rel=1e-5)
+    np.testing.assert_allclose(BETA.mean_action(), reference.mean(), rtol=1e-5)
+    assert float(BETA.entropy_estimate(jax.random.key(0))) == pytest.approx(
+        reference.entropy().sum(), rel=1e-4
+    )
+    actions = BETA.action(draws(BETA))
+    for axis in range(2):
+        one = stats.beta(float(BETA.alpha[axis]), float(BETA.beta[axis]), loc=-1, scale=2)
+        assert stats.kstest(np.asarray(actions[:, axis]), one.cdf).pvalue > 1e-3
+    fine = np.linspace(-0.999, 0.999, 1999)
+    np.testing.assert_allclose(BETA.mode(), [-1.0, fine[np.argmax(one.pdf(fine))]], atol=2e-3)
+
+
+def test_a_uniform_beta_has_its_mode_in_the_middle():
+    assert float(Beta(jnp.ones(1), jnp.ones(1)).mode()[0]) == 0.0
+
+
+def test_grid_against_scipy():
+    wanted = special.log_softmax(np.asarray(GRID.logits, float))
+    table = np.array([(a, b) for a in LEVELS[0] for b in LEVELS[1]])
+    choice = jnp.arange(15.0)[:, None]
+    batch = Grid(jnp.broadcast_to(GRID.logits, (15, 15)), LEVELS)
+    np.testing.assert_allclose(batch.log_prob(choice), wanted, rtol=1e-5)
+    np.testing.assert_array_equal(batch.action(choice), table.astype(np.float32))
+    np.testing.assert_array_equal(batch.choice_of(jnp.asarray(table, jnp.float32) + 0.1), choice)
+    np.testing.assert_array_equal(GRID.mode(), table[np.argmax(wanted)].astype(np.float32))
+    np.testing.assert_allclose(GRID.mean_action(), np.exp(wanted) @ table, atol=1e-6)
+    entropy = float(GRID.entropy_estimate(jax.random.key(0)))
+    assert entropy == pytest.approx(stats.entropy(np.exp(wanted)), rel=1e-5)
+    counts = np.bincount(np.asarray(draws(GRID)[:, 0], int), minlength=15)
+    assert stats.chisquare(counts, np.exp(wanted) * counts.sum()).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_samples_agree_with_what_a_distribution_says_of_itself(kind):
+    one = ALL[kind]
+    assert isinstance(one, Distribution)
+    choice = draws(one)
+    action = one.action(choice)
+    assert choice.dtype == jnp.float32 and float(jnp.abs(action).max()) <= 1.0
+    np.testing.assert_allclose(action.mean(0), one.mean_action(), atol=0.02)
+    by_density = -float(jax.vmap(one.log_prob)(choice).mean())
+    estimates = jax.vmap(one.entropy_estimate)(jax.random.split(jax.random.key(1), 20_000))
+    assert float(estimates.mean()) == pytest.approx(by_density, abs=0.04)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "beta"])
+def test_samples_are_differentiable_in_the_parameters(kind):
+    """d E[action^2] / d parameters, through samples and by finite differences of SciPy's moments."""
+    raw = jnp.array([0.7, 0.4])
+
+    def second(raw, key):
+        one = distribution(kind, raw, Actions(1))
+        return one.action(one.sample(key))[0] ** 2
+
+    keys = jax.random.split(jax.random.key(3), 40_000)
+    found = jax.vmap(jax.grad(second), (None, 0))(raw, keys).mean(0)
+
+    def moment(raw):
+        if kind == "beta":
+            one = stats.beta(*(1.0 + np.log1p(np.exp(raw))), loc=-1, scale=2)
+            return one.var() + one.mean() ** 2
+        scale = np.log1p(np.exp(raw[1]))
+        grid = raw[0] + scale * np.linspace(-9, 9, 4001)
+        return np.trapezoid(np.tanh(grid) ** 2 * stats.norm.pdf(grid, raw[0], scale), grid)
+
+    raw = np.asarray(raw, float)
+    wanted = [(moment(raw + step) - moment(raw - step)) / 2e-4 for step in 1e-4 * np.eye(2)]
+    np.testing.assert_allclose(found, wanted, atol=0.01)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "beta", "grid"])
+@pytest.mark.parametrize("size", [0.0, 30.0, -30.0])
+def test_policy_gradients_are_finite_at_saturation(kind, size):
+    actions = Actions(2, LEVELS)
+    count = parameters_of(kind, actions)
+    raw = size * jnp.sign(jnp.arange(count) % 2 - 0.5)
+    bounds = jnp.array([[1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]])
+
+    def of(raw, key):
+        one = distribution(kind, jnp.broadcast_to(raw, (3, count)), actions)
+        choice = one.choice_of(bounds)
+        mine = one.sample(key)
+        surrogate = one.log_prob(choice) + one.log_prob(mine) + one.entropy_estimate(key)
+        return jnp.sum(surrogate) + jnp.sum(one.mean_action() + one.mode() + one.action(mine))
+
+    value, gradient = jax.value_and_grad(of)(raw, jax.random.key(0))
+    assert bool(jnp.isfinite(value)) and bool(jnp.isfinite(gradient).all())
+
+
+def test_a_far_choice_has_finite_gradients():
+    def of(loc):
+        return SquashedGaussian(loc, jnp.array([0.5, 0.5])).log_prob(jnp.array([12.0, -9.0]))
+
+    assert bool(jnp.isfinite(jax.grad(of)(jnp.zeros(2))).all())
+
+
+def test_first_parameters_are_around_zero_with_the_asked_spread():
+    actions = Actions(2, LEVELS)
+    gaussian = distribution("gaussian", jnp.asarray(first_parameters("gaussian", actions, 0.3)), actions)
+    np.testing.assert_allclose(gaussian.scale, 0.3, rtol=1e-5)
+    beta = distribution("beta", jnp.asarray(first_parameters("beta", actions, 0.3)), actions)
+    np.testing.assert_allclose(beta.action(draws(beta)).std(0), 0.3, rtol=0.02)
+    grid = distribution("grid", jnp.asarray(first_parameters("grid", actions, 0.3)), actions)
+    weights = [stats.norm.pdf(np.array(axis), 0, 0.3) for axis in LEVELS]
+    np.testing.assert_allclose(
+        jax.nn.softmax(grid.logits), np.outer(*(w / w.sum() for w in weights)).ravel(), atol=1e-6
+    )
+    for one in (gaussian, beta, grid):
+        np.testing.assert_allclose(one.mean_action(), 0.0, atol=1e-6)
+        np.testing.assert_allclose(one.mode(), 0.0, atol=1e-6)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(UsageError, match="the grid needs actions with levels; choose the action space"):
+        parameters_of("grid", Actions(2))
+    with pytest.raises(UsageError, match=r"a Beta of first_scale 0\.6 has no peak; use less"):
+        first_parameters("beta", Actions(2), 0.6)
+    with pytest.raises(ValueError, match="levels of 1 numbers for actions of 2"):
+        Actions(2, ((0.0,),))

@@ -1,0 +1,235 @@
+"""Attention encoders against their equations in NumPy, and the rules of masks and orders."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+import encoder_oracle as oracle
+from drivax.networks.attention import Attention
+from drivax.networks.entity import EntityConfig
+from drivax.networks.tokens import forms
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+
+SPEC = {
+    "agents": (3, 2, 4), "agents_mask": (3, 2), "ego": (2, 3), "ego_static": (2,), "lights": (2, 3),
+    "lights_mask": (2,), "route": (4, 2), "route_mask": (4,),
+}  # fmt: skip
+GROUPS = ("agents", "ego", "ego_static", "lights", "route")
+TINY = {"width": 8, "heads": 2}
+LATENT = TINY | {"layers": 2, "latents": 3, "embedding": ()}
+CONFIGS = {
+    "lq": LqConfig(**LATENT | {"embedding": (5,)}),
+    "lqh": LqhConfig(**LATENT | {"layers": 1}),
+    "mtr": MtrConfig(**TINY, layers=2, embedding=()),
+    "late": WayformerConfig(**LATENT | {"layers": 1}),
+    "early": WayformerConfig(**LATENT, fusion="early"),
+    "hierarchical": WayformerConfig(**LATENT | {"layers": 1}, fusion="hierarchical"),
+    "factorised": WayformerConfig(**LATENT | {"layers": 1}, fusion="early", factorised=True),
+    "entity": EntityConfig(**TINY),
+}
+#: A set of series, a series and a set: where every group has parameters of its own, they tell as much as all five.
+THREE = ("agents", "ego", "route")
+SEEN = {"lq": GROUPS, "mtr": GROUPS, "entity": GROUPS}
+#: What is compiled here runs once.
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+
+def quick(function, *arguments):
+    return jax.device_get(jax.jit(function, compiler_options=QUICK)(*arguments))
+
+
+def spec_of(name):
+    return {key: SPEC[key] for key in SPEC if key.removesuffix("_mask") in SEEN.get(name, THREE)}
+
+
+def build(config, spec):
+    """Structure, and parameters drawn by NumPy: none is zero or one, as norms and biases begin."""
+    graph, empty = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
+    rng = np.random.default_rng(1)
+    return graph, jax.tree.map(
+        lambda leaf: jnp.asarray(0.5 * rng.normal(size=leaf.shape), jnp.float32), empty
+    )
+
+
+def observation(rng, spec):
+    groups = {name: rng.normal(size=shape).astype(np.float32) for name, shape in spec.items()}
+    masks = {name: groups[name] > -0.5 for name in spec if name.endswith("_mask")}
+    # At least one of all is there, and one of all is not.
+    for mask in masks.values():
+        mask.flat[0], mask.flat[-1] = True, False
+    return groups | masks
+
+
+def variants(one):
+    """An observation and others that mean the same, or that do not."""
+    masked = [name for name in GROUPS if f"{name}_mask" in one]
+    littered = {name: np.where(one[f"{name}_mask"][..., None], one[name], 777.0) for name in masked}
+    mixed = {name: np.roll(one[name], 1, axis=0) for name in one if name.removesuffix("_mask") in masked}
+    full = one | {"agents_mask": np.ones_like(one["agents_mask"])}
+    return {
+        "as it is": one,
+        "littered": one | littered,
+        "mixed": one | mixed,
+        "full": full,
+        "backwards": full | {"agents": full["agents"][:, ::-1]},
+        "ego backwards": full | {"ego": one["ego"][::-1]} if "ego" in one else full,
+        "nobody": one | {name: np.zeros_like(one[name]) for name in one if name.endswith("_mask")},
+    }
+
+
+def by_numpy(config, groups, parameters):
+    names = [name for name in GROUPS if name in groups]
+    p = jax.tree.map(lambda leaf: np.asarray(leaf, float), nnx.to_pure_dict(parameters))
+    if isinstance(config, MtrConfig):
+        return oracle.mtr(
+            groups, ("agents", "ego", "ego_static"), ("lights", "route"), ("ego", "ego_static"), p
+        )
+    if isinstance(config, EntityConfig):
+        parts = {"ego": ["ego", "ego_static"], "others": ["agents"], "goal": ["route"], "beside": ["lights"]}
+        return oracle.entity(groups, parts, p)
+    return oracle.latent_encoder(groups, names, p)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_encoders_follow_their_equations_and_rules(name):
+    config, spec = CONFIGS[name], spec_of(name)
+    graph, parameters = build(config, spec)
+    half, _ = build(replace(config, dtype="bfloat16"), spec)
+    told = variants(observation(np.random.default_rng(5), spec))
+    batch = {key: np.stack([one[key] for one in told.values()]) for key in spec}
+
+    def run(parameters, batch):
+        whole = nnx.merge(graph, parameters)(batch)
+        single = nnx.merge(graph, parameters)(jax.tree.map(lambda leaf: leaf[0], batch))
+        return whole, single, nnx.merge(half, parameters)(batch)
+
+    found, single, coarse = quick(run, parameters, batch)
+    assert found.dtype == np.float32 and found.shape == (len(told), nnx.merge(graph, parameters).width)
+    embedding = dict(zip(told, found, strict=True))
+    for key in ("as it is", "full", "nobody"):
+        np.testing.assert_allclose(
+            embedding[key], by_numpy(config, told[key], parameters), rtol=2e-4, atol=2e-4
+        )
+    for key in ("littered", "mixed"):
+        np.testing.assert_allclose(embedding[key], embedding["as it is"], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(single, embedding["as it is"], rtol=1e-4, atol=1e-5)
+    for key in ("backwards", "ego backwards"):
+        assert np.abs(embedding[key] - embedding["full"]).max() > 1e-2, key
+    # Eight bits of mantissa: differences of a few per cent of the spread.
+    assert coarse.dtype == np.float32
+    assert 0 < np.abs(coarse - found).max() < 0.1 * np.abs(found).max()
+
+
+@pytest.mark.parametrize("name", ["lq", "mtr", "factorised", "entity"])  # every kind of layer once
+def test_gradients_are_finite_where_everything_is_masked(name):
+    spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in ("agents", "route")}
+    config = CONFIGS[name] if name == "entity" else replace(CONFIGS[name], layers=1, embedding=())
+    graph, parameters = build(config, spec)
+    nobody = variants(observation(np.random.default_rng(6), spec))["nobody"]
+    masks = {name: value for name, value in nobody.items() if name.endswith("_mask")}
+    rows = {name: value for name, value in nobody.items() if name not in masks}
+
+    def loss(parameters, rows):
+        return jnp.sum(nnx.merge(graph, parameters)(rows | masks) ** 2)
+
+    by_parameters, by_rows = quick(jax.grad(loss, argnums=(0, 1)), parameters, rows)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(by_parameters))
+    assert any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(by_parameters)) or name == "mtr"
+    jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf, 0.0), by_rows)
+
+
+@pytest.mark.parametrize("queries", [2, 6])  # few: keys go to the queries; many: queries to the keys
+def test_attention_against_loops(queries):
+    rng = np.random.default_rng(queries)
+    width, heads = 8, 2
+    graph, parameters = nnx.split(nnx.eval_shape(lambda: Attention(width, heads, nnx.Rngs(0))))
+    parameters = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), parameters)
+    p = jax.tree.map(lambda leaf: np.asarray(leaf, float), nnx.to_pure_dict(parameters))
+    asks = rng.normal(size=(queries, width)).astype(np.float32)
+    tokens = rng.normal(size=(4, 5, width)).astype(np.float32)
+    mask = rng.random((4, 5)) < 0.6
+    mask[1], mask[2] = False, True
+
+    def run(parameters, asks, tokens, mask):
+        attention = nnx.merge(graph, parameters)
+        alike = jnp.broadcast_to(asks, (4, *asks.shape))
+        return attention(asks, tokens, mask), attention(alike, tokens, mask), attention(asks, tokens)
+
+    shared, own, unmasked = quick(run, parameters, asks, tokens, mask)
+    for row in range(4):
+        wanted = oracle.attention(asks.astype(float), tokens[row].astype(float), mask[row], p)
+        np.testing.assert_allclose(shared[row], wanted, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(own[row], wanted, rtol=1e-4, atol=1e-5)
+        everyone = oracle.attention(asks.astype(float), tokens[row].astype(float), np.ones(5, bool), p)
+        np.testing.assert_allclose(unmasked[row], everyone, rtol=1e-4, atol=1e-5)
+    assert (shared[1] == 0).all()
+
+
+def count(config, groups=GROUPS):
+    spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in groups}
+    shapes = nnx.state(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))), nnx.Param)
+    return sum(leaf.size for leaf in jax.tree.leaves(shapes))
+
+
+def test_parameter_counts():
+    # agents 4, ego 3, ego_static 2, lights 3, route 2 features to 8 numbers, each with bias and a norm.
+    embedding = (4 + 3 + 2 + 3 + 2) * 8 + 5 * (8 + 16)
+    attention, norm, feed_forward = 4 * 8 * 8, 16, 8 * 32 + 32 + 32 * 8 + 8
+    block = attention + feed_forward + 2 * norm
+    latents = 3 * 8 + attention + norm + block + norm
+    assert count(CONFIGS["late"]) == embedding + 5 * latents
+    assert count(CONFIGS["lqh"]) == embedding + 6 * latents == count(CONFIGS["hierarchical"])
+    assert count(CONFIGS["early"]) == embedding + latents + block
+    assert count(CONFIGS["factorised"]) == embedding + latents + 5 * (2 * block + norm)
+    assert (
+        count(CONFIGS["mtr"]) == embedding + block + 2 * (2 * (attention + norm) + feed_forward + norm) + norm
+    )
+    # One hidden layer of 5 per group; two layers that look at the tokens.
+    deep = (4 + 3 + 2 + 3 + 2) * 5 + 5 * 5 + 5 * (5 * 8 + 8 + 16)
+    assert count(CONFIGS["lq"]) == deep + latents + attention + norm + block
+    # Agents 2 x (4 + its mask), ego 2 x (3 + its mask) numbers a row.
+    entities = (10 + 8 + 2 + 3 + 2) * 8 + 5 * 8
+    assert count(CONFIGS["entity"]) == entities + attention + norm
+    # As published: 4 layers of two attentions and 8 d^2 of dense layers, d 256, 16 latents, a linear embedding.
+    d = 256
+    layer = 2 * 4 * d * d + 8 * d * d + 5 * d + 3 * 2 * d
+    assert count(LqConfig(size="published")) == 14 * d + 5 * 3 * d + 16 * d + 4 * layer + 2 * d
+
+
+def test_groups_are_told_apart_by_their_masks_and_axes():
+    found = {name: (f.masked, f.rows, f.times, f.features, f.series) for name, f in forms(SPEC).items()}
+    assert found == {
+        "agents": (True, 3, 2, 4, True), "ego": (False, 1, 2, 3, True), "ego_static": (False, 1, 1, 2, False),
+        "lights": (True, 2, 1, 3, False), "route": (True, 4, 1, 2, False),
+    }  # fmt: skip
+    one = forms({"agents": (3, 1, 4), "agents_mask": (3, 1), "ego": (1, 3)})
+    assert one["agents"].series and one["ego"].series
+
+
+@pytest.mark.parametrize("name", ["lq", "mtr", "entity"])
+@pytest.mark.parametrize("missing", ["masked", "unmasked"])
+def test_encoders_of_sets_alone_and_of_nothing_but_the_ego(name, missing):
+    wanted = [g for g in GROUPS if (f"{g}_mask" in SPEC) != (missing == "masked")]
+    spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in wanted}
+    graph, parameters = build(CONFIGS[name], spec)
+    one = observation(np.random.default_rng(7), spec)
+    found = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, one)
+    assert np.isfinite(found).all() and np.abs(found).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: LqConfig(width=10, heads=4), "width 10 is no multiple of 4 heads"),
+        (lambda: LqConfig(latents=0), "use at least 1"),
+        (lambda: MtrConfig(layers=0), "use at least 1"),
+        (lambda: EntityConfig(width=6), "width 6 is no multiple of 4 heads"),
+    ],
+)
+def test_impossible_sizes_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

@@ -1,0 +1,118 @@
+"""Others than ego, driven by a network: as several driven agents would be, and nobody else."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from drivax.errors import UsageError
+from drivax.planners.driven import PlannerTraffic, with_driver
+from drivax.planners.network import NetworkPlanner
+from drivax.planners.simple import Expert
+from drivax.scenario.schema import AgentKind
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import alone
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from scenes import bank_of, car, straight_road
+
+TASK = Task(
+    observation=ObservationConfig(agents=3, steps=3, road=8, lights=0, route=2), metrics="none", ends=()
+)
+TRAFFIC = PlannerTraffic(TASK, count=3)
+STEPS = 30
+
+
+class Choice:
+    def __init__(self, action):
+        self.action = action
+
+    def mode(self):
+        return self.action
+
+
+class Untrained(nnx.Module):
+    """One layer over everything that is seen."""
+
+    def __init__(self, width, rngs):
+        self.layer = nnx.Linear(width, 2, rngs=rngs)
+
+    def __call__(self, groups):
+        seen = jnp.concatenate([groups[name].ravel().astype(jnp.float32) for name in sorted(groups)])
+        return Choice(0.5 * jnp.tanh(self.layer(seen)))
+
+
+@pytest.fixture(scope="module")
+def bank():
+    """Ego; a car beside, a parked-like one, a cyclist, a car ahead, and two further away."""
+    cars = [
+        car(speed=8.0), car(-3, 3.7, 0, 9), car(15, 3.7, 0, 0.1), car(10, 0, 0, 5, kind=AgentKind.CYCLIST),
+        car(25, 0, 0, 7), car(60, 3.7, 0, 10), car(90, 0, 0, 10),
+    ]  # fmt: skip
+    bank = bank_of(straight_road(cars))
+    seen = jax.eval_shape(lambda b: Simulator(TASK).observe(b, Simulator(TASK).scene(b, 0, 10)), bank)
+    width = sum(int(np.prod(leaf.shape)) for leaf in seen.values())
+    graph, weights = nnx.split(Untrained(width, nnx.Rngs(4)), nnx.Param)
+    return with_driver(bank, NetworkPlanner(weights, graph))
+
+
+def nearest(bank):
+    """Slots of the three cars that are driven, by hand: those at x = -3, 25 and 60, nearest first."""
+    x = np.asarray(bank.agents[0, 10, :, 0])
+    return [int(np.argmin(np.abs(x - at))) for at in (-3, 25, 60)]
+
+
+def test_the_nearest_moving_vehicles_are_driven(bank):
+    state = jax.jit(lambda b: TRAFFIC.start(b, 0, 10))(bank)
+    assert state.scenes.slot.tolist() == nearest(bank)
+    more = PlannerTraffic(TASK, count=6)
+    slots = jax.jit(lambda b: more.start(b, 0, 10))(bank).scenes.slot.tolist()
+    assert slots[:3] == nearest(bank) and slots[4:] == [bank.agents.shape[2]] * 2
+
+
+def test_what_cannot_drive_is_refused(bank):
+    with pytest.raises(UsageError, match="cannot drive others"):
+        with_driver(bank, Expert())
+    with pytest.raises(UsageError, match="the bank has no driver; use planners"):
+        TRAFFIC.start(bank_of(straight_road([car()])), 0, 10)
+
+
+@pytest.mark.slow
+def test_they_drive_as_agents_that_are_stepped_together(bank):
+    """The same policy in two loops that share no step: as traffic of ego, and in a stack of driven agents with ego."""
+    simulator, ego = Simulator(TASK, TRAFFIC), jnp.array([0.3, 0.05])
+
+    @jax.jit
+    def as_traffic(bank):
+        def one(state, _):
+            after, _ = simulator.step(bank, state, ego)
+            return after, simulator.frame(bank, after.scene, alone(after.scene), 0)
+
+        return jax.lax.scan(one, simulator.reset(bank, 0), None, STEPS)[1]
+
+    stacked = Simulator(TASK)
+
+    @jax.jit
+    def together(bank, slots):
+        def one(states, _):
+            seen = stacked.observe_together(bank, states)
+            network = nnx.merge(bank.driver.graph, bank.driver.parameters)
+            act = jax.vmap(lambda groups: network(groups).mode())
+            actions = act(seen).at[0].set(ego)
+            after, _ = stacked.step_together(bank, states, actions)
+            first = jax.tree.map(lambda leaf: leaf[0], after.scene)
+            return after, stacked.frame(bank, first, after.scene, 0)
+
+        return jax.lax.scan(one, stacked.reset_together(bank, 0, slots), None, STEPS)[1]
+
+    found, expected = as_traffic(bank), together(bank, jnp.array([0, *nearest(bank)]))
+    for name in ("box", "velocity", "valid", "z"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=2e-3, err_msg=name)
+    logged = np.asarray(bank.agents[0, 11 : 11 + STEPS, :, :2])
+    apart = np.linalg.norm(np.asarray(found.box)[:, : logged.shape[1], :2] - logged, axis=-1)[-1]
+    assert (apart[nearest(bank)] > 0.5).all()
+    others = [s for s in range(1, 7) if s not in nearest(bank)]
+    np.testing.assert_allclose(apart[others], 0.0, atol=1e-4)

@@ -1,0 +1,236 @@
+"""Perception: lines of sight against shapely, and noise, range and drop-out as a tracker would have them."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.scenario.schema import AgentKind
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.features import Features
+from drivax.tasks.observations import ObservationConfig, observe
+from drivax.tasks.perception import Perception, in_view, lights_seen
+from drivax.tasks.task import Task
+from scenes import RED, bank_of, car, straight_road
+
+BOXES = 12
+SMALL = ObservationConfig(
+    agents=8, steps=2, road=20, lights=1, route=1, features=Features(agents=("position", "length"), route=())
+)
+
+
+def shown(x, y, heading, length, width):
+    return np.array([x, y, np.cos(heading), np.sin(heading), length, width], np.float32)
+
+
+def some_boxes(rng):
+    """A crowd about the origin: vehicles, and some as slim as people."""
+    size = rng.choice([(4.8, 2.0), (12.0, 2.6), (0.6, 0.6)], BOXES)
+    place, heading = rng.uniform(-25, 25, (BOXES, 2)), rng.uniform(-np.pi, np.pi, BOXES)
+    return np.stack([shown(*p, h, *s) for p, h, s in zip(place, heading, size, strict=True)])
+
+
+def in_view_by_shapely(eye, boxes, blocks, more):
+    """The rule told by another library; boxes that block are larger by ``more`` on each side."""
+    from shapely import affinity, geometry
+
+    def polygon(row, more):
+        x, y, cos, sin, length, width = map(float, row)
+        box = geometry.box(-length / 2 - more, -width / 2 - more, length / 2 + more, width / 2 + more)
+        return affinity.affine_transform(box, [cos, -sin, sin, cos, x, y])
+
+    result = []
+    for k, row in enumerate(boxes):
+        targets = [*polygon(row, 0.0).exterior.coords[:4], tuple(map(float, row[:2]))]
+        others = [polygon(other, more) for j, other in enumerate(boxes) if blocks[j] and j != k]
+        others = [box for box in others if not box.contains(geometry.Point(eye))]
+        rays = [geometry.LineString([eye, target]) for target in targets]
+        result.append(any(not any(ray.intersection(box).length > 0 for box in others) for ray in rays))
+    return np.array(result)
+
+
+def test_who_is_in_view_agrees_with_shapely():
+    pytest.importorskip("shapely")
+    rng = np.random.default_rng(3)
+    rule = jax.jit(in_view)
+    hidden = clear = 0
+    for _ in range(60):
+        boxes, blocks = some_boxes(rng), rng.random(BOXES) < 0.8
+        eye = rng.uniform(-5, 5, 2).astype(np.float32)
+        found = np.asarray(rule(eye, boxes, blocks))
+        large, small = (
+            in_view_by_shapely(tuple(map(float, eye)), boxes, blocks, more) for more in (1e-3, -1e-3)
+        )
+        certain = large == small
+        np.testing.assert_array_equal(found[certain], small[certain])
+        hidden, clear = hidden + (~small & certain).sum(), clear + (small & certain).sum()
+    assert hidden > 80 and clear > 80, (hidden, clear)
+
+
+def test_lines_of_sight_on_paper():
+    eye, everyone = jnp.zeros(2), jnp.ones(3, bool)
+    bus = shown(10, 0, 0, 10.0, 3.0)
+    behind = jnp.stack([bus, shown(25, 0, 0, 4.0, 2.0), shown(25, 3.0, 0, 4.0, 2.0)])
+    # The shadow of the bus's near side (x = 5, |y| < 1.5) ends at |y| = 0.3 x: beyond the corners of the second car
+    # (y up to 4 at x = 27, where it reaches 8.1), so both are hidden; one as far off as y = 7 shows a corner.
+    assert in_view(eye, behind, everyone).tolist() == [True, False, False]
+    behind = behind.at[2, 1].set(7.0)
+    assert in_view(eye, behind, everyone).tolist() == [True, False, True]
+    assert in_view(eye, behind, everyone.at[0].set(False)).tolist() == [True, True, True]
+    # A bus in which the eye itself is hides nobody.
+    assert in_view(jnp.array([8.0, 0.0]), behind, everyone).tolist() == [True, True, True]
+
+
+@pytest.fixture(scope="module")
+def bank():
+    cars = [
+        car(0, 0, 0, 4), car(15, 0, 0, 4, 12.0, 2.6), car(32, 0.2, 0, 4, 4.0), car(-20, 3.7, 0, 4, 4.2),
+        car(-40, 0, 0, 4, 4.4), car(60, 11, 0, 4, 4.6), car(15, 3.7, 0, 4, 0.6, 0.6, AgentKind.PEDESTRIAN),
+    ]  # fmt: skip
+    return bank_of(straight_road(cars, light=RED))
+
+
+FIRST = 15
+ALL = Perception(dropout_m=40.0, noise_m=0.1, range_m=50.0, occlusion=True)
+FAULTS = {
+    "none": Perception(),
+    "occlusion": Perception(occlusion=True),
+    "noise": Perception(noise_m=0.1),
+    "all": ALL,
+}
+
+
+@pytest.fixture(scope="module")
+def seen(bank):
+    """What is seen at every step from 15 on with each kind of fault, by one program; and the scenes."""
+    simulators = {
+        name: Simulator(Task(observation=replace(SMALL, perception=one))) for name, one in FAULTS.items()
+    }
+
+    def look(bank, step):
+        scene = simulators["none"].scene(bank, 0, step)
+        return {name: one.observe(bank, scene) for name, one in simulators.items()} | {"scene": scene}
+
+    return jax.device_get(jax.jit(jax.vmap(look, (None, 0)))(bank, jnp.arange(FIRST, 91)))
+
+
+def lengths(seen, step=0):
+    """Who is there at a step, by the lengths of their boxes, m."""
+    rows, mask = seen["agents"][step, :, -1], seen["agents_mask"][step, :, -1]
+    return sorted(np.round(rows[mask, 2].astype(np.float64) * 5, 1).tolist())
+
+
+def test_who_is_behind_a_bus_is_not_there(seen):
+    assert lengths(seen["none"]) == [0.6, 4.0, 4.2, 4.4, 4.6, 12.0]
+    # The car at 32 m is hidden by the bus ahead of ego; the one at 60 m, far to the left, is seen past it.
+    assert lengths(seen["occlusion"]) == [0.6, 4.2, 4.4, 4.6, 12.0]
+    for name in ("occlusion", "all"):
+        # Who is not seen now has no past, and leaves no gap among the nearest.
+        mask = seen[name]["agents_mask"]
+        assert not (mask.any(axis=2) & ~mask[..., -1]).any()
+        assert (np.sort(mask[..., -1], axis=1)[:, ::-1] == mask[..., -1]).all()
+    # Of the agents in view, all but that at 61 m are in range of 50 m, and chance lets each be seen at some steps.
+    everyone = {length for step in range(76) for length in lengths(seen["all"], step)}
+    assert everyone == {0.6, 4.2, 4.4, 12.0}
+
+
+def errors(seen, group="agents"):
+    """Errors of places, m."""
+    return (seen["noise"][group][..., :2] - seen["none"][group][..., :2]) * 50
+
+
+def test_noise_is_as_large_as_said_and_independent(seen):
+    truth, noisy = seen["none"], seen["noise"]
+    error = errors(seen)[:, :6, -1]
+    count = error.size
+    assert truth["agents_mask"][:, :6, -1].all() and not truth["agents_mask"][:, 6:].any() and count > 800
+    assert abs(error.mean()) < 4 * 0.1 / np.sqrt(count)
+    assert abs(error.std() - 0.1) < 4 * 0.1 / np.sqrt(2 * count)
+    for axis in range(3):  # steps, agents, directions
+        one = np.delete(error, -1, axis=axis).ravel()
+        other = np.delete(error, 0, axis=axis).ravel()
+        assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(len(one))
+    for group in ("road", "lights"):
+        mask, error = truth[f"{group}_mask"], errors(seen, group)
+        assert error[mask].all() and not error[~mask].any() and abs(error[mask].std() - 0.1) < 0.02
+        np.testing.assert_array_equal(noisy[group][..., 2:], truth[group][..., 2:])
+    np.testing.assert_array_equal(noisy["ego"], truth["ego"])
+
+
+def test_a_past_step_is_shown_as_it_was_seen_then(seen):
+    """Ego drives straight on at 4 m/s, so what it saw a step ago lies 0.4 m further behind now."""
+    for name in ("noise", "all"):
+        rows, mask = seen[name]["agents"], seen[name]["agents_mask"]
+        compared = 0
+        for step in range(1, len(rows)):
+            for row in np.flatnonzero(mask[step, :, -1]):
+                same = np.abs(rows[step - 1, :, -1, 2] - rows[step, row, -1, 2]) < 1e-6
+                before = np.flatnonzero(same & mask[step - 1, :, -1])
+                # It was seen then if and only if it is remembered now.
+                assert len(before) == mask[step, row, -2]
+                if len(before):
+                    wanted = rows[step - 1, before[0], -1, :2] - np.array([0.4 / 50, 0.0])
+                    np.testing.assert_allclose(rows[step, row, -2, :2], wanted, atol=1e-5)
+                    compared += 1
+        assert compared > 60
+
+
+def test_range_and_dropout_by_distance(seen):
+    """The share of steps at which something is seen is exp(-distance / 40 m); nothing is seen beyond the range."""
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["scene"])
+    distance = jnp.array([1.0, 15.0, 40.0, 90.0])
+
+    def look(faults):
+        return jax.vmap(lambda step: lights_seen(faults, replace(scene, step=step), distance))(
+            jnp.arange(4000)
+        )
+
+    one, other, near = (
+        np.asarray(look(Perception(**faults)))
+        for faults in ({"dropout_m": 40.0}, {"dropout_m": 40.0, "seed": 1}, {"range_m": 40.0})
+    )
+    wanted = np.exp(-np.asarray(distance) / 40.0)
+    np.testing.assert_array_less(np.abs(one.mean(axis=0) - wanted), 4 * np.sqrt(wanted * (1 - wanted) / 4000))
+    assert abs(np.corrcoef(one[:, 2], other[:, 2])[0, 1]) < 4 / np.sqrt(4000)
+    assert near.all(axis=0).tolist() == [True, True, True, False] and not near[:, 3].any()
+    # Agents go by the same rule, each for itself at every step.
+    free = np.linalg.norm(seen["occlusion"]["agents"][:, :5, -1, :2] * 50, axis=-1)
+    expected = np.where(free <= 50.0, np.exp(-free / 40.0), 0.0)
+    found = seen["all"]["agents_mask"][..., -1].sum(axis=1)
+    assert abs(found.sum() - expected.sum()) < 4 * np.sqrt((expected * (1 - expected)).sum())
+    assert len(np.unique(found)) > 2
+
+
+def test_a_replayed_scene_is_perceived_as_it_was_live(bank, seen):
+    """A stored scene, observed alone and in another program, as it was seen in the batch."""
+    simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["scene"])
+    for name, value in jax.jit(simulator.observe)(bank, scene).items():
+        np.testing.assert_allclose(value, seen["all"][name][25], atol=1e-6, err_msg=name)
+
+
+def test_what_is_off_leaves_no_trace(bank):
+    """The program of an observation without faults draws nothing, whatever the seed."""
+
+    def program(faults):
+        config = replace(SMALL, perception=faults)
+        simulator = Simulator(Task(observation=config))
+
+        def look(bank):
+            scene = simulator.scene(bank, 0, 20)
+            return observe(
+                config, bank, scene, lambda back: simulator.frame(bank, scene, _alone(scene), back)
+            )
+
+        return str(jax.make_jaxpr(look)(bank))
+
+    plain = program(Perception())
+    assert "random" not in plain and program(Perception(seed=9)) == plain
+    for faults in (Perception(noise_m=0.1), Perception(dropout_m=200.0)):
+        assert "random" in program(faults)
+
+
+def _alone(scene):
+    return jax.tree.map(lambda leaf: leaf[None], scene)

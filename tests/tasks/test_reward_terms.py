@@ -1,0 +1,321 @@
+"""Every reward term on hand-made facts, against a NumPy version on random ones, and in presets with options."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.learning.config import TrainConfig
+from drivax.scenario.queries import LaneHits, RouteHit
+from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Surroundings
+from drivax.tasks.rewards import (
+    AGGRESSIVE,
+    PRESETS,
+    PUBLISHED,
+    READS,
+    TERMS,
+    OwnTerm,
+    RewardConfig,
+    Touching,
+)
+from drivax.tasks.task import Task
+
+#: Which facts are booleans, which are whole numbers; the others are numbers.
+FLAGS = {
+    "collision", "at_fault", "offroad", "left_map", "red_light", "ttc_defined", "routed", "logged", "wrong_way",
+    "straddling", "off_route", "lane_changed", "merged",
+}  # fmt: skip
+WHOLE = {"collision_type": np.int8, "ignored": np.int16, "strand": np.int16}
+#: A quiet moment: 10 m/s under a limit of 13.4 m/s, on the route, nobody near.
+QUIET = {
+    "speed_mps": 10.0, "limit_mps": 13.4, "routed": True, "logged": True, "ttc_s": 5.0, "ttc_defined": True,
+    "gap_m": 50.0, "progress_m": 20.0, "goal_distance_m": 60.0, "strand": 3, "moved_m": 1.0,
+}  # fmt: skip
+
+
+def facts(**changes):
+    values = {field.name: 0.0 for field in fields(Facts)} | QUIET | changes
+    typed = {}
+    for name, value in values.items():
+        kind = bool if name in FLAGS else WHOLE.get(name, np.float32)
+        typed[name] = jnp.asarray(value, kind)
+    return Facts(**typed)
+
+
+def around(near=True):
+    no, zero = jnp.zeros((), bool), jnp.zeros(())
+    hits = LaneHits(
+        jnp.asarray(near), jnp.zeros(4, bool), no, no, no, no, zero, jnp.zeros((), jnp.int32), zero, zero
+    )
+    frame = Frame(
+        jnp.zeros((2, 6)), jnp.zeros((2, 2)), jnp.zeros(2), jnp.zeros(2, bool), jnp.zeros(2, jnp.int32)
+    )
+    return Surroundings(frame, hits, RouteHit(zero, zero, zero, jnp.zeros(2)))
+
+
+BEFORE = facts(progress_m=19.0, goal_distance_m=61.0)
+
+
+def value(term, near=True, before=BEFORE, **now):
+    """A term at a quiet moment with these changes."""
+    found = (TERMS[term] if isinstance(term, str) else term)(before, facts(**now), around(near))
+    assert found.dtype == jnp.float32 and found.shape == ()
+    return float(found)
+
+
+#: Term, what is different from the quiet moment, and the value by hand.
+CASES = [
+    ("collision", {}, 0.0),
+    ("collision", {"collision": True}, 1.0),
+    ("offroad", {}, 0.0),
+    ("offroad", {"offroad": True}, 1.0),
+    ("red_light", {}, 0.0),
+    ("red_light", {"red_light": True}, 1.0),
+    ("off_route", {}, 0.0),
+    ("off_route", {"off_route": True}, 1.0),
+    ("progress", {}, 1.0 / 1.2),
+    ("progress", {"progress_m": 20.5}, 1.0),
+    ("progress", {"routed": False}, 0.0),
+    ("discomfort", {"acceleration_mps2": 1.2}, 0.25),
+    ("discomfort", {"lateral_acceleration_mps2": -9.0}, 1.0),
+    ("speeding", {"speed_mps": 15.7}, 1.0),
+    ("speeding", {"speed_mps": 15.6}, 0.0),
+    ("speeding", {"speed_mps": 40.0, "limit_mps": -1.0}, 0.0),
+    ("any_progress", {}, 1.0),
+    ("any_progress", {"progress_m": 19.001}, 1.0),
+    ("any_progress", {"progress_m": 19.0}, 0.0),
+    ("any_progress", {"routed": False}, 0.0),
+    ("comfort", {}, 1.0),
+    ("comfort", {"jerk_mps3": -6.63}, 0.5),
+    ("comfort", {"jerk_mps3": 3.0, "lateral_acceleration_mps2": -3.63}, 0.5),
+    ("comfort", {"jerk_mps3": 20.0}, 0.0),
+    ("any_speeding", {"speed_mps": 13.4}, 0.0),
+    ("any_speeding", {"speed_mps": 13.5}, 1.0),
+    ("any_speeding", {"speed_mps": 13.5, "limit_mps": -1.0}, 0.0),
+    ("ttc", {"ttc_s": 1.6}, 0.0),
+    ("ttc", {"ttc_s": 1.4}, 1.0),
+    ("ttc", {"ttc_s": 0.0, "ttc_defined": False}, 0.0),
+    ("ttc_shortfall", {"ttc_s": 1.2}, 0.0),
+    ("ttc_shortfall", {"ttc_s": 0.25}, 0.75),
+    ("ttc_shortfall", {"ttc_s": 0.0, "ttc_defined": False}, 0.0),
+    ("close", {"gap_m": 1.1}, 0.0),
+    ("close", {"gap_m": 0.9}, 1.0),
+    ("wrong_way", {}, 0.0),
+    ("wrong_way", {"wrong_way": True}, 1.0),
+    ("straddling", {}, 0.0),
+    ("straddling", {"straddling": True}, 1.0),
+    ("log_divergence", {"log_divergence_m": 2.5}, 2.5),
+    ("log_divergence", {"log_divergence_m": 25.0}, 10.0),
+    ("log_divergence", {"log_divergence_m": 2.5, "logged": False}, 0.0),
+    ("speed_ratio", {"speed_mps": 6.7}, 0.5),
+    ("speed_ratio", {"speed_mps": 20.0}, 1.0),
+    ("speed_ratio", {"limit_mps": -1.0}, 0.0),
+    ("goal", {}, 0.0),
+    ("goal", {"goal_distance_m": 2.9}, 1.0),
+    ("goal", {"goal_distance_m": 2.9, "routed": False}, 0.0),
+    ("lane_change", {}, 0.0),
+    ("lane_change", {"lane_changed": True}, 1.0),
+    ("merge", {}, 0.0),
+    ("merge", {"merged": True}, 1.0),
+]
+
+
+@pytest.mark.parametrize(("term", "changes", "expected"), CASES)
+def test_terms_by_hand(term, changes, expected):
+    assert value(term, **changes) == pytest.approx(expected, abs=1e-5)
+
+
+def test_every_term_has_its_cases():
+    assert {term for term, _, _ in CASES} == set(TERMS)
+
+
+def test_away_from_all_lanes_nobody_straddles_them():
+    assert value("straddling", near=False, straddling=True) == 0.0
+
+
+def test_the_goal_counts_once():
+    there = facts(goal_distance_m=2.0)
+    assert value("goal", before=there, goal_distance_m=1.0) == 0.0
+
+
+def test_margins():
+    assert value(Touching(0.5), gap_m=0.6) == 0.0
+    assert value(Touching(0.5), gap_m=0.4) == 1.0
+    assert value(Touching(0.5), gap_m=0.6, collision=True) == 1.0
+    wary = RewardConfig(
+        preset="safety", collision_margin_m=0.5, ttc=-0.5, ttc_s=0.95, close=-0.1, close_m=3.0
+    )
+    found = {
+        gap: wary.weigh(BEFORE, facts(gap_m=gap, ttc_s=ttc), around())
+        for gap, ttc in ((0.4, 0.9), (2.9, 1.0), (3.1, 5.0))
+    }
+    assert [float(terms["collision"]) for terms in found.values()] == [-1, 0, 0]
+    assert [float(terms["ttc"]) for terms in found.values()] == [-0.5, 0, 0]
+    assert [float(terms["close"]) for terms in found.values()] == pytest.approx([-0.1, -0.1, 0])
+
+
+def in_numpy(before, now, near):
+    """All terms once more, row by row from their definitions: NumPy, float64, shares no code with the package."""
+    rows = {}
+    for i in range(len(near)):
+        b, n = ({name: float(column[i]) for name, column in side.items()} for side in (before, now))
+        known, defined, routed = n["limit_mps"] > 0, n["ttc_defined"] > 0, n["routed"] > 0
+        gained = n["progress_m"] - b["progress_m"]
+        hard = [
+            n["acceleration_mps2"] / (2.40 if n["acceleration_mps2"] >= 0 else 4.05),
+            n["lateral_acceleration_mps2"] / 4.89,
+            n["jerk_mps3"] / 8.37,
+        ]
+        felt = (abs(n["jerk_mps3"]) + abs(n["lateral_acceleration_mps2"])) / 13.26
+        row = {
+            "collision": n["collision"],
+            "offroad": n["offroad"],
+            "red_light": n["red_light"],
+            "off_route": n["off_route"],
+            "progress": min(max(gained / 1.2, 0), 1) if routed else 0,
+            "discomfort": min(1, max(abs(h) for h in hard) ** 2),
+            "speeding": known and n["speed_mps"] - n["limit_mps"] > 2.23,
+            "any_progress": routed and gained > 0,
+            "comfort": 1 - min(1, felt),
+            "any_speeding": known and n["speed_mps"] > n["limit_mps"],
+            "ttc": defined and n["ttc_s"] < 1.5,
+            "ttc_shortfall": max(0, 1 - n["ttc_s"]) if defined else 0,
+            "close": n["gap_m"] < 1,
+            "wrong_way": n["wrong_way"],
+            "straddling": n["straddling"] and near[i],
+            "log_divergence": min(n["log_divergence_m"], 10) if n["logged"] else 0,
+            "speed_ratio": min(n["speed_mps"] / n["limit_mps"], 1) if known else 0,
+            "goal": routed and n["goal_distance_m"] <= 3 < b["goal_distance_m"],
+            "lane_change": n["lane_changed"],
+            "merge": n["merged"],
+        }
+        for name, number in row.items():
+            rows.setdefault(name, []).append(float(number))
+    return {name: np.array(column) for name, column in rows.items()}
+
+
+#: Ranges in which thresholds fall both ways; others 0 to 2.
+RANGES = {
+    "speed_mps": (0, 30), "acceleration_mps2": (-6, 4), "lateral_acceleration_mps2": (-6, 6), "jerk_mps3": (-12, 12),
+    "log_divergence_m": (0, 15), "goal_distance_m": (0, 6), "progress_m": (0, 3), "ttc_s": (0, 3), "gap_m": (0, 3),
+}  # fmt: skip
+
+
+def random_facts(rng, count):
+    columns = {}
+    for name in (field.name for field in fields(Facts)):
+        if name in FLAGS:
+            columns[name] = rng.random(count) < 0.5
+        elif name == "limit_mps":
+            columns[name] = np.where(rng.random(count) < 0.3, -1.0, rng.uniform(5, 25, count)).astype(
+                np.float32
+            )
+        else:
+            columns[name] = rng.uniform(*RANGES.get(name, (0, 2)), count).astype(WHOLE.get(name, np.float32))
+    return columns
+
+
+def test_terms_agree_with_numpy_on_random_facts():
+    rng, count = np.random.default_rng(3), 400
+    before, now, near = random_facts(rng, count), random_facts(rng, count), rng.random(count) < 0.5
+    once = around()
+
+    @jax.jit
+    @jax.vmap
+    def every(before, now, near):
+        there = replace(once, lanes=replace(once.lanes, near=near))
+        return {name: term(before, now, there) for name, term in TERMS.items()}
+
+    as_facts = [
+        Facts(**{name: jnp.asarray(column) for name, column in side.items()}) for side in (before, now)
+    ]
+    found, expected = every(*as_facts, jnp.asarray(near)), in_numpy(before, now, near)
+    assert set(found) == set(expected)
+    for name, column in expected.items():
+        np.testing.assert_allclose(found[name], column, atol=1e-5, err_msg=name)
+        assert 0 < np.mean(column != column[0]) < 1, name  # both ways occurred
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_terms_look_at_nothing_but_what_they_say(term):
+    def lean(whole):
+        kept = {field.name: getattr(whole, field.name) for field in fields(Facts)}
+        made = object.__new__(Facts)
+        for name, fact in kept.items():
+            object.__setattr__(made, name, fact if name in READS[term] else None)
+        return made
+
+    assert READS[term] <= FACTS | ON_REQUEST
+    now = facts(lane_changed=True, straddling=True)
+    assert float(TERMS[term](lean(BEFORE), lean(now), around())) == value(
+        term, lane_changed=True, straddling=True
+    )
+
+
+def test_published_weights():
+    assert {"collision": -1, "offroad": -1, "red_light": -1}.items() <= PUBLISHED.items()
+    rest = {"off_route": -0.2, "any_progress": 0.2, "comfort": 0.2, "any_speeding": -0.1}
+    assert dict(PUBLISHED.items() - PRESETS["safety"].items()) == rest
+    more = {"ttc_shortfall": -0.5, "speed_ratio": 0.3, "lane_change": 0.2, "merge": 0.2}
+    assert dict(AGGRESSIVE.items() - PUBLISHED.items()) == more
+
+
+def total(preset, **now):
+    return float(sum(RewardConfig(preset=preset).weigh(BEFORE, facts(**now), around()).values()))
+
+
+def test_published_by_hand():
+    """The published ranges: -3.3 at worst, 0.4 at best."""
+    assert total("published") == pytest.approx(0.4)
+    worst = {
+        "collision": True, "offroad": True, "red_light": True, "off_route": True, "progress_m": 19.0, "jerk_mps3": 99.0,
+        "speed_mps": 14.0,
+    }  # fmt: skip
+    assert total("published", **worst) == pytest.approx(-3.3)
+
+
+def test_the_aggressive_driver_by_hand():
+    # Published 0.4, 10 / 13.4 of the limit; then 0.3 s from a car in front; then into the next lane, which is a merge.
+    fast = 0.3 * 10 / 13.4
+    assert total("aggressive") == pytest.approx(0.4 + fast)
+    assert total("aggressive", ttc_s=0.3) == pytest.approx(0.4 + fast - 0.5 * 0.7)
+    assert total("aggressive", lane_changed=True, merged=True) == pytest.approx(0.4 + fast + 0.4)
+
+
+def test_what_is_off_is_not_measured():
+    for preset in ("safety", "navigation", "behaviour", "published"):
+        assert not RewardConfig(preset=preset).reads & ON_REQUEST
+        assert not Task(rewards=RewardConfig(preset=preset)).reads & ON_REQUEST
+    assert RewardConfig(preset="aggressive").reads & ON_REQUEST == {"lane_changed", "merged"}
+    assert RewardConfig(collision_margin_m=0.5).reads - RewardConfig().reads == {"gap_m"}
+    calm = RewardConfig(preset="aggressive", lane_change=0.0, merge=0.0)
+    assert set(AGGRESSIVE) - set(calm.weights()) == {"lane_change", "merge"}
+    assert not calm.reads & ON_REQUEST
+
+
+def test_own_terms_get_facts_on_request():
+    def alongside(before, now, around):
+        return (now.gap_m < 2.0).astype(jnp.float32)
+
+    plain, asking = OwnTerm(alongside, -0.1), OwnTerm(alongside, -0.1, reads=("gap_m",))
+    assert RewardConfig(own=(plain,)).reads == FACTS
+    config = RewardConfig(preset="safety", own=(asking,))
+    assert config.reads == FACTS | {"gap_m"}
+    assert float(config.weigh(BEFORE, facts(gap_m=1.0), around())["alongside"]) == pytest.approx(-0.1)
+    with pytest.raises(ValueError, match="reads 'gap', which is no fact"):
+        OwnTerm(alongside, -0.1, reads=("gap",))
+
+
+def test_configurations():
+    rewards = {"preset": "published", "collision_margin_m": 0.5, "ttc": -0.3, "ttc_s": 0.95}
+    made = settings.load(TrainConfig, {"task": {"rewards": rewards}}).task.rewards
+    assert made.weights() == PUBLISHED | {"ttc": -0.3} and made.ttc_s == 0.95
+    for wrong in ({"preset": "publishd"}, {"collision_margin_m": -1.0}, {"ttc_s": 9.0}, {"close_m": 99.0}):
+        with pytest.raises(UsageError, match=r"task\.rewards"):
+            settings.load(TrainConfig, {"task": {"rewards": wrong}})
