@@ -107,6 +107,9 @@ def test_imitation_fades():
     assert float(WarmStart(weight=0.8).weight_at(jnp.asarray(1000))) == pytest.approx(0.8)
     with pytest.raises(UsageError, match="use 0 or more"):
         WarmStart(weight=-1.0)
+    with pytest.raises(UsageError, match="raise total_steps"):
+        WarmStart(iterations=5).rest(5)
+    assert WarmStart(iterations=5).rest(8) == 3
 
 
 @pytest.mark.slow

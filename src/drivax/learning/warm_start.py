@@ -66,6 +66,25 @@ class WarmStart:
         if min(self.iterations, self.half_life) < 0 or self.weight < 0.0:
             raise UsageError("a warm start has negative settings", cure="use 0 or more")
 
+    def rest(self, iterations: int) -> int:
+        """How many iterations of a run are left to learn by reward.
+
+        Raises:
+            UsageError: There is none.
+        """
+        if iterations <= self.iterations:
+            raise UsageError(
+                f"all {iterations} iterations clone", cure="raise total_steps, or lower warm_start.iterations"
+            )
+        return iterations - self.iterations
+
+    def before(
+        self, config: SacConfig | PpoConfig, environment: Environment, data: Any, iterations: int
+    ) -> WarmStarted:
+        """The learner of a run of so many iterations."""
+        refuse_flat(self.cloning, config.network)
+        return WarmStarted(self, config.build(environment, data, self.rest(iterations)), environment)
+
     def weight_at(self, iteration: Int[Array, ""]) -> Float[Array, ""]:
         """The weight so many iterations after cloning."""
         if not self.half_life:
@@ -93,9 +112,7 @@ class BcSacConfig:
 
     def build(self, environment: Environment, data: Any, iterations: int) -> WarmStarted:
         """Cloning, then SAC."""
-        refuse_flat(self.warm_start.cloning, self.sac.network)
-        online = self.sac.build(environment, data, iterations - self.warm_start.iterations)
-        return WarmStarted(self.warm_start, online, environment)
+        return self.warm_start.before(self.sac, environment, data, iterations)
 
 
 @dataclass(frozen=True)
@@ -118,9 +135,7 @@ class BcPpoConfig:
 
     def build(self, environment: Environment, data: Any, iterations: int) -> WarmStarted:
         """Cloning, then PPO."""
-        refuse_flat(self.warm_start.cloning, self.ppo.network)
-        online = self.ppo.build(environment, data, iterations - self.warm_start.iterations)
-        return WarmStarted(self.warm_start, online, environment)
+        return self.warm_start.before(self.ppo, environment, data, iterations)
 
 
 @record

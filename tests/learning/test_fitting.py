@@ -1,0 +1,126 @@
+"""Two scenarios are driven without a fault after a short run, by every algorithm with every encoder.
+
+Policies act by their mode, in closed loop to the end of the log. Algorithms that learn by reward are helped by a small
+price for leaving the log. Small sizes everywhere; most pairs are marked slow.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.evaluation.rollout import drive
+from drivax.learning.driving import Driving
+from drivax.learning.imitation import BcConfig, Cloning
+from drivax.learning.ppo import PpoConfig
+from drivax.learning.replay import ReplayConfig
+from drivax.learning.sac import SacConfig
+from drivax.learning.warm_start import BcPpoConfig, BcSacConfig, WarmStart
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
+from drivax.networks.entity import EntityConfig
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import CAPACITIES
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.features import Features
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.rewards import RewardConfig
+from drivax.tasks.task import Task
+
+TINY = {"width": 32, "heads": 2, "layers": 1, "embedding": (32,)}
+ENCODERS = {
+    "mlp": MlpConfig(rows=(16,), hidden=(64, 64)),
+    "lq": LqConfig(**TINY, latents=4),
+    "lqh": LqhConfig(**TINY, latents=4),
+    "mtr": MtrConfig(**TINY),
+    "wayformer": WayformerConfig(**TINY, latents=4),
+    "entity": EntityConfig(),
+}
+SEEN = ObservationConfig(
+    agents=4, steps=1, road=0, lights=1, route=8, features=Features(ego_static=("length", "width"))
+)
+TASK = Task(
+    observation=SEEN,
+    rewards=RewardConfig(preset="navigation", log_divergence=-0.05),
+    metrics=("success", "accuracy"),
+)
+CLONING = Cloning(batch=128, updates=250, learning_rate=3e-3)
+PPO = PpoConfig(
+    environments=64,
+    unroll=32,
+    epochs=4,
+    minibatches=4,
+    learning_rate=1e-3,
+    gamma=0.95,
+    entropy_coefficient=0.0,
+)
+SAC = SacConfig(
+    replay=ReplayConfig(50_000),
+    environments=16,
+    unroll=16,
+    updates_per_step=4,
+    batch=128,
+    warm_up=2_000,
+    policy_rate=1e-3,
+    critic_rate=1e-3,
+    temperature_rate=1e-3,
+    gamma=0.95,
+    tau=0.01,
+    temperature=0.02,
+)
+START = WarmStart(iterations=2, cloning=CLONING, weight=1.0, half_life=20)
+
+
+def algorithm(name, encoder):
+    """A configuration, and how many iterations it gets."""
+    network = NetworkConfig(encoder=ENCODERS[encoder], head=(64,), first_scale=0.1)
+    if name == "bc":
+        return BcConfig(**vars(CLONING), network=network), 2
+    if name == "ppo":
+        return replace(PPO, network=replace(network, first_scale=0.3)), 100
+    if name == "sac":
+        return replace(SAC, network=replace(network, first_scale=0.3, activation="relu")), 120
+    if name == "bc_ppo":
+        ppo = replace(PPO, network=network, learning_rate=2e-4)
+        return BcPpoConfig(warm_start=START, ppo=ppo), 12
+    sac = replace(SAC, network=replace(network, activation="relu"), explore="policy", warm_up=512)
+    return BcSacConfig(warm_start=START, sac=replace(sac, policy_rate=3e-4, temperature=0.005)), 42
+
+
+@pytest.fixture(scope="module")
+def two():
+    """A roundabout, and a junction with lights."""
+    capacity = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
+    recordings = [generate_recording(seed=0, index=index) for index in (0, 8)]
+    return ScenarioBank.from_scenarios([assemble(one, capacity) for one in recordings], trim=False)
+
+
+FAST = {("bc", "mlp"), ("bc", "lq")}
+PAIRS = [
+    pytest.param(*pair, marks=() if pair in FAST else pytest.mark.slow)
+    for pair in ((name, encoder) for name in ("bc", "ppo", "sac", "bc_ppo", "bc_sac") for encoder in ENCODERS)
+]
+
+
+@pytest.mark.parametrize(("name", "encoder"), PAIRS)
+def test_two_scenarios_are_driven_without_a_fault(two, name, encoder):
+    config, iterations = algorithm(name, encoder)
+    learner = config.build(Driving(Simulator(TASK), latest_start=60), two, iterations)
+    state = jax.jit(learner.init)(two, jax.random.key(0))
+    iterate = jax.jit(learner.iterate, donate_argnums=1)
+    judge = Simulator(replace(TASK, to_the_end=True))
+    keys = jax.random.split(jax.random.key(1), 2)
+
+    def success():
+        planner = learner.planner(state.parameters, name, samples=False)
+        return np.asarray(drive(judge, planner, two, jnp.arange(2), keys).metrics["success"].value)
+
+    before = success()
+    for _ in range(iterations):
+        state, _ = iterate(two, state)
+    assert (success() == 1.0).all() and not (before == 1.0).all()
