@@ -17,6 +17,7 @@ from drivax.networks.distributions import (
     first_parameters,
     parameters_of,
 )
+from quick import quick
 
 LEVELS = ((-1.0, -0.25, 0.0, 0.25, 1.0), (-0.5, 0.0, 0.5))
 GAUSSIAN = SquashedGaussian(jnp.array([0.3, -1.0]), jnp.array([0.2, 1.4]))
@@ -26,7 +27,8 @@ ALL = {"gaussian": GAUSSIAN, "beta": BETA, "grid": GRID}
 
 
 def draws(one, count=20_000):
-    return jax.vmap(one.sample)(jax.random.split(jax.random.key(0), count))
+    keys = jax.random.split(jax.random.key(0), count)
+    return jnp.asarray(quick(lambda one, keys: jax.vmap(one.sample)(keys), one, keys))
 
 
 def gaussian_density(action, loc, scale):
@@ -47,18 +49,18 @@ def test_gaussian_log_prob_and_its_jacobian():
 def test_gaussian_density_integrates_to_one():
     one = SquashedGaussian(jnp.array([0.4]), jnp.array([0.7]))
     action = np.linspace(-0.9999, 0.9999, 20001)
-    log_prob = jax.vmap(lambda a: one.log_prob(jnp.arctanh(a)[None]))(jnp.asarray(action))
+    log_prob = quick(jax.vmap(one.log_prob), np.arctanh(action)[:, None].astype(np.float32))
     assert np.trapezoid(np.exp(log_prob), action) == pytest.approx(1.0, abs=2e-3)
 
 
-@pytest.mark.parametrize("loc", [-3.0, 0.0, 0.8])
-@pytest.mark.parametrize("scale", [1e-3, 0.3, 2.0])
-def test_gaussian_mean_action_is_that_of_quadrature(loc, scale):
-    wanted, _ = integrate.quad(
-        lambda x: np.tanh(x) * stats.norm.pdf(x, loc, scale), loc - 9 * scale, loc + 9 * scale, points=[loc]
-    )
-    one = SquashedGaussian(jnp.array([loc]), jnp.array([scale]))
-    assert float(one.mean_action()[0]) == pytest.approx(wanted, abs=1e-3)
+def test_gaussian_mean_action_is_that_of_quadrature():
+    cases = [(loc, scale) for loc in (-3.0, 0.0, 0.8) for scale in (1e-3, 0.3, 2.0)]
+    wanted = [
+        integrate.quad(lambda z, loc=loc, s=s: np.tanh(loc + s * z) * stats.norm.pdf(z), -9, 9)[0]
+        for loc, s in cases
+    ]
+    found = quick(lambda one: one.mean_action(), SquashedGaussian(*jnp.asarray(cases).T))
+    np.testing.assert_allclose(found, wanted, atol=1e-3)
 
 
 def test_gaussian_samples_have_its_moments():
@@ -111,12 +113,16 @@ def test_samples_agree_with_what_a_distribution_says_of_itself(kind):
     one = ALL[kind]
     assert isinstance(one, Distribution)
     choice = draws(one)
-    action = one.action(choice)
-    assert choice.dtype == jnp.float32 and float(jnp.abs(action).max()) <= 1.0
-    np.testing.assert_allclose(action.mean(0), one.mean_action(), atol=0.02)
-    by_density = -float(jax.vmap(one.log_prob)(choice).mean())
-    estimates = jax.vmap(one.entropy_estimate)(jax.random.split(jax.random.key(1), 20_000))
-    assert float(estimates.mean()) == pytest.approx(by_density, abs=0.04)
+    keys = jax.random.split(jax.random.key(1), len(choice))
+
+    def run(one, choice, keys):
+        estimates = jax.vmap(one.entropy_estimate)(keys)
+        return one.action(choice), one.mean_action(), jax.vmap(one.log_prob)(choice), estimates
+
+    action, mean, log_probs, estimates = quick(run, one, choice, keys)
+    assert choice.dtype == np.float32 and np.abs(action).max() <= 1.0
+    np.testing.assert_allclose(action.mean(0), mean, atol=0.02)
+    assert estimates.mean() == pytest.approx(-log_probs.mean(), abs=0.04)
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "beta"])
@@ -129,7 +135,7 @@ def test_samples_are_differentiable_in_the_parameters(kind):
         return one.action(one.sample(key))[0] ** 2
 
     keys = jax.random.split(jax.random.key(3), 40_000)
-    found = jax.vmap(jax.grad(second), (None, 0))(raw, keys).mean(0)
+    found = quick(jax.vmap(jax.grad(second), (None, 0)), raw, keys).mean(0)
 
     def moment(raw):
         if kind == "beta":
@@ -145,29 +151,22 @@ def test_samples_are_differentiable_in_the_parameters(kind):
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "beta", "grid"])
-@pytest.mark.parametrize("size", [0.0, 30.0, -30.0])
-def test_policy_gradients_are_finite_at_saturation(kind, size):
+def test_policy_gradients_are_finite_at_saturation(kind):
     actions = Actions(2, LEVELS)
     count = parameters_of(kind, actions)
-    raw = size * jnp.sign(jnp.arange(count) % 2 - 0.5)
+    raw = jnp.array([0.0, 30.0, -30.0])[:, None] * jnp.sign(jnp.arange(count) % 2 - 0.5)
     bounds = jnp.array([[1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]])
 
     def of(raw, key):
-        one = distribution(kind, jnp.broadcast_to(raw, (3, count)), actions)
-        choice = one.choice_of(bounds)
+        one = distribution(kind, raw[:, None].repeat(3, 1), actions)
+        choice = one.choice_of(jnp.broadcast_to(bounds, (3, 3, 2)))
+        far = choice + (9.0 if kind == "gaussian" else 0.0)
         mine = one.sample(key)
-        surrogate = one.log_prob(choice) + one.log_prob(mine) + one.entropy_estimate(key)
+        surrogate = one.log_prob(choice) + one.log_prob(far) + one.log_prob(mine) + one.entropy_estimate(key)
         return jnp.sum(surrogate) + jnp.sum(one.mean_action() + one.mode() + one.action(mine))
 
-    value, gradient = jax.value_and_grad(of)(raw, jax.random.key(0))
-    assert bool(jnp.isfinite(value)) and bool(jnp.isfinite(gradient).all())
-
-
-def test_a_far_choice_has_finite_gradients():
-    def of(loc):
-        return SquashedGaussian(loc, jnp.array([0.5, 0.5])).log_prob(jnp.array([12.0, -9.0]))
-
-    assert bool(jnp.isfinite(jax.grad(of)(jnp.zeros(2))).all())
+    value, gradient = quick(jax.value_and_grad(of), raw, jax.random.key(0))
+    assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
 def test_first_parameters_are_around_zero_with_the_asked_spread():

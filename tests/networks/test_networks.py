@@ -13,6 +13,7 @@ from drivax.networks.distributions import Actions
 from drivax.networks.encoders import MlpConfig, group_spec
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+from quick import drawn, quick
 
 SMALL = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,))
 LEVELS = ((-1.0, 0.0, 1.0), (-1.0, -0.5, 0.0, 0.5, 1.0))
@@ -27,98 +28,107 @@ def observation(rng):
     }
 
 
-def size(module):
-    return sum(leaf.size for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
+def size(parameters):
+    return sum(leaf.size for leaf in jax.tree.leaves(parameters))
+
+
+def stacked(*observations):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *observations)
 
 
 @pytest.mark.parametrize("rows", [(), (8, 8)])
 def test_masked_rows_never_matter_and_batches_agree(rows):
     rng = np.random.default_rng(0)
-    one = observation(rng)
+    one, other = observation(rng), observation(rng)
     config = NetworkConfig(encoder=MlpConfig(rows=rows, hidden=(16, 16)), head=(8,))
-    network = ActorCritic(config, group_spec(one), nnx.Rngs(0))
+    graph, parameters = drawn(lambda: ActorCritic(config, group_spec(one), nnx.Rngs(0)))
     noisy = dict(one, agents=jnp.where(one["agents_mask"][..., None], one["agents"], 99.0))
-    np.testing.assert_array_equal(network.policy(one).loc, network.policy(noisy).loc)
-    other = observation(rng)
-    batch = jax.tree.map(lambda a, b: jnp.stack([a, b]), one, other)
-    for row, single in enumerate((one, other)):
-        np.testing.assert_allclose(network.value(batch)[row], network.value(single), rtol=1e-5)
-        np.testing.assert_allclose(network.policy(batch).scale[row], network.policy(single).scale, rtol=1e-5)
+    nobody = dict(one, agents_mask=jnp.zeros_like(one["agents_mask"]))
+
+    def run(parameters, single, batch):
+        network = nnx.merge(graph, parameters)
+        return network.both(single), network.both(batch)
+
+    single, batch = quick(run, parameters, one, stacked(one, noisy, other, nobody))
+    for alone, together in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
+        np.testing.assert_array_equal(together[0], together[1])
+        np.testing.assert_allclose(together[0], alone, rtol=1e-5)
+        assert np.abs(together[2] - together[0]).max() > 1e-3 and np.isfinite(together[3]).all()
 
 
 def test_pooled_rows_have_no_order():
     one = observation(np.random.default_rng(2))
     order = jnp.array([2, 0, 3, 1])
     mixed = dict(one, agents=one["agents"][order], agents_mask=one["agents_mask"][order])
-    config = NetworkConfig(encoder=MlpConfig(rows=(8,), hidden=(16,)), head=(8,))
-    network = ActorCritic(config, group_spec(one), nnx.Rngs(0))
-    np.testing.assert_allclose(network.value(one), network.value(mixed), rtol=1e-6)
-    nobody = dict(one, agents_mask=jnp.zeros_like(one["agents_mask"]))
-    assert bool(jnp.isfinite(network.value(nobody)))
-
-
-def test_an_untrained_policy_is_near_zero_with_the_first_scale():
-    one = observation(np.random.default_rng(1))
-    network = ActorCritic(NetworkConfig(), group_spec(one), nnx.Rngs(0))
-    policy = network.policy(one)
-    assert float(jnp.abs(policy.loc).max()) < 0.2
-    np.testing.assert_allclose(policy.scale, 0.3, atol=0.1)
+    spec = group_spec(one)
+    graph, parameters = drawn(lambda: MlpConfig(rows=(8,), hidden=(16,)).build(spec, nnx.Rngs(0)))
+    found = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, stacked(one, mixed))
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "beta", "grid"])
-def test_every_distribution_has_a_head(kind):
+def test_every_distribution_has_a_head_that_begins_around_zero(kind):
     one = observation(np.random.default_rng(1))
     config = NetworkConfig(encoder=MlpConfig(hidden=(8,)), distribution=kind)
-    policy = Policy(config, group_spec(one), nnx.Rngs(0), Actions(2, LEVELS))
-    batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), one)
-    found = jax.jit(lambda groups, key: (d := policy(groups), d.sample(key)))(batch, jax.random.key(0))
-    action = found[0].action(found[1])
-    assert action.shape == (3, 2) and float(jnp.abs(found[0].mean_action()).max()) < 0.05
-    assert found[0].log_prob(found[1]).shape == (3,)
+
+    def run(groups, key):
+        found = Policy(config, group_spec(one), nnx.Rngs(key), Actions(2, LEVELS))(groups)
+        many = jax.vmap(found.sample)(jax.random.split(key, 2000))
+        return found.mean_action(), found.action(many), found.log_prob(many[0])
+
+    mean, actions, log_prob = quick(run, stacked(one, one, one), jax.random.key(0))
+    assert mean.shape == (3, 2) and np.abs(mean).max() < 0.05
+    assert log_prob.shape == (3,) and actions.shape == (2000, 3, 2)
+    # Of 0.3 as asked; tanh takes a little of it. The grid's levels are too far apart to tell.
+    wanted = {"gaussian": 0.28, "beta": 0.3, "grid": actions.std(0)}[kind]
+    np.testing.assert_allclose(actions.std(0), np.broadcast_to(wanted, (3, 2)), atol=0.025)
 
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_both_is_policy_and_value_and_a_shared_encoder_is_one(shared):
     one = observation(np.random.default_rng(3))
-    network = ActorCritic(
-        NetworkConfig(SMALL.encoder, (4,), shared_encoder=shared), group_spec(one), nnx.Rngs(0)
-    )
-    policy, value = network.both(one)
-    np.testing.assert_allclose(policy.loc, network.policy(one).loc, rtol=1e-6)
-    np.testing.assert_allclose(value, network.value(one), rtol=1e-6)
+    config = NetworkConfig(SMALL.encoder, (4,), shared_encoder=shared)
+    graph, parameters = drawn(lambda: ActorCritic(config, group_spec(one), nnx.Rngs(0)))
     # 16 + 8 + 12 numbers in: 24 of agents, their 8 masks, 12 of ego; heads 8 -> 4 -> 4 and 8 -> 4 -> 1.
     encoder, heads = (24 + 8 + 12) * 8 + 8, (8 * 4 + 4 + 4 * 4 + 4) + (8 * 4 + 4 + 4 + 1)
-    assert size(network) == encoder * (1 if shared else 2) + heads
-    graph, parameters = nnx.split(network)
+    assert size(parameters) == encoder * (1 if shared else 2) + heads
 
-    def loss(parameters):
-        return nnx.merge(graph, parameters).value(one)
+    def run(parameters, groups):
+        network = nnx.merge(graph, parameters)
+        alone, weights = nnx.split(network.policy)
+        policy, value = network.both(groups)
+        apart = network.policy(groups).loc, network.value(groups), nnx.merge(alone, weights)(groups).loc
+        return (policy.loc, value, policy.loc), apart
 
-    gradient = jax.grad(loss)(parameters)
-    reaches_policy = any(float(jnp.abs(leaf).max()) > 0 for leaf in jax.tree.leaves(gradient["policy"]))
+    together, apart = quick(run, parameters, one)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), together, apart)
+
+    gradient = quick(jax.grad(lambda p: nnx.merge(graph, p).value(one)), parameters)
+    reaches_policy = any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient["policy"]))
     assert reaches_policy == shared
-    alone, weights = nnx.split(network.policy)
-    np.testing.assert_array_equal(nnx.merge(alone, weights)(one).loc, policy.loc)
 
 
 def test_twin_critics_share_nothing_and_can_be_negative():
     rng = np.random.default_rng(4)
     one = observation(rng)
-    twins = TwinCritic(SMALL, group_spec(one), nnx.Rngs(0), Actions(2))
-    graph, parameters = nnx.split(twins)
-    assert size(twins) == 2 * ((24 + 8 + 12) * 8 + 8 + (8 + 2) * 4 + 4 + 4 + 1)
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(observation(rng) for _ in range(64)))
-    values = twins(batch, jnp.asarray(rng.uniform(-1, 1, (64, 2)), jnp.float32))
-    assert values.shape == (2, 64) and float(values.min()) < 0 < float(values.max())
-    assert float(jnp.abs(values[0] - values[1]).max()) > 1e-2
-    action = jnp.array([0.3, -0.2])
-    first = jax.grad(lambda p: nnx.merge(graph, p)(one, action)[0])(parameters)
+    graph, parameters = drawn(lambda: TwinCritic(SMALL, group_spec(one), nnx.Rngs(0), Actions(2)))
+    assert size(parameters) == 2 * ((24 + 8 + 12) * 8 + 8 + (8 + 2) * 4 + 4 + 4 + 1)
+    batch = stacked(*(observation(rng) for _ in range(64)))
+    actions = jnp.asarray(rng.uniform(-1, 1, (64, 2)), jnp.float32)
+
+    def run(parameters, batch, actions):
+        values, pull = jax.vjp(lambda p, a: nnx.merge(graph, p)(batch, a), parameters, actions)
+        return values, *pull(jnp.stack([jnp.ones(64), jnp.zeros(64)]))
+
+    values, by_parameters, by_action = quick(run, parameters, batch, actions)
+    assert values.shape == (2, 64) and values.min() < 0 < values.max()
+    assert np.abs(values[0] - values[1]).max() > 1e-2
     reached = [
-        float(jnp.abs(first["critics"][i]["head"]["out"]["kernel"].get_value()).max()) for i in range(2)
+        max(np.abs(leaf).max() for leaf in jax.tree.leaves(by_parameters["critics"][number]))
+        for number in (0, 1)
     ]
     assert reached[0] > 0 and reached[1] == 0
-    by_action = jax.grad(lambda a: twins(one, a)[0])(action)
-    assert float(jnp.abs(by_action).min()) > 0
+    assert (np.abs(by_action).max(-1) > 0).all()
 
 
 def load(text):

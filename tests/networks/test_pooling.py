@@ -49,7 +49,7 @@ def test_values_and_gradients_are_those_of_the_plain_maximum(activation, rows, s
 
 
 def test_gradients_of_many_rows_take_a_fraction_of_the_work():
-    layers, x, there = case(64, (11, 16, 16))
+    layers, x, there = jax.tree.map(jnp.asarray, case(64, (11, 16, 16)))
 
     def operations(function):
         def loss(layers):

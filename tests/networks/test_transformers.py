@@ -13,6 +13,7 @@ from drivax.networks.attention import Attention
 from drivax.networks.entity import EntityConfig
 from drivax.networks.tokens import forms
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
+from quick import drawn, quick
 
 SPEC = {
     "agents": (3, 2, 4), "agents_mask": (3, 2), "ego": (2, 3), "ego_static": (2,), "lights": (2, 3),
@@ -33,13 +34,7 @@ CONFIGS = {
 }
 #: A set of series, a series and a set: where every group has parameters of its own, they tell as much as all five.
 THREE = ("agents", "ego", "route")
-SEEN = {"lq": GROUPS, "mtr": GROUPS, "entity": GROUPS}
-#: What is compiled here runs once.
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-
-
-def quick(function, *arguments):
-    return jax.device_get(jax.jit(function, compiler_options=QUICK)(*arguments))
+SEEN = {"lq": GROUPS, "mtr": GROUPS, "entity": GROUPS, "factorised": ("agents", "ego")}
 
 
 def spec_of(name):
@@ -47,12 +42,7 @@ def spec_of(name):
 
 
 def build(config, spec):
-    """Structure, and parameters drawn by NumPy: none is zero or one, as norms and biases begin."""
-    graph, empty = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
-    rng = np.random.default_rng(1)
-    return graph, jax.tree.map(
-        lambda leaf: jnp.asarray(0.5 * rng.normal(size=leaf.shape), jnp.float32), empty
-    )
+    return drawn(lambda: config.build(spec, nnx.Rngs(0)))
 
 
 def observation(rng, spec):
@@ -98,30 +88,34 @@ def by_numpy(config, groups, parameters):
 def test_encoders_follow_their_equations_and_rules(name):
     config, spec = CONFIGS[name], spec_of(name)
     graph, parameters = build(config, spec)
-    half, _ = build(replace(config, dtype="bfloat16"), spec)
     told = variants(observation(np.random.default_rng(5), spec))
     batch = {key: np.stack([one[key] for one in told.values()]) for key in spec}
-
-    def run(parameters, batch):
-        whole = nnx.merge(graph, parameters)(batch)
-        single = nnx.merge(graph, parameters)(jax.tree.map(lambda leaf: leaf[0], batch))
-        return whole, single, nnx.merge(half, parameters)(batch)
-
-    found, single, coarse = quick(run, parameters, batch)
+    found = quick(lambda p, groups: nnx.merge(graph, p)(groups), parameters, batch)
     assert found.dtype == np.float32 and found.shape == (len(told), nnx.merge(graph, parameters).width)
     embedding = dict(zip(told, found, strict=True))
     for key in ("as it is", "full", "nobody"):
         np.testing.assert_allclose(
-            embedding[key], by_numpy(config, told[key], parameters), rtol=2e-4, atol=2e-4
+            embedding[key], by_numpy(config, told[key], parameters), rtol=1e-4, atol=2e-5
         )
     for key in ("littered", "mixed"):
         np.testing.assert_allclose(embedding[key], embedding["as it is"], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(single, embedding["as it is"], rtol=1e-4, atol=1e-5)
     for key in ("backwards", "ego backwards"):
-        assert np.abs(embedding[key] - embedding["full"]).max() > 1e-2, key
-    # Eight bits of mantissa: differences of a few per cent of the spread.
-    assert coarse.dtype == np.float32
-    assert 0 < np.abs(coarse - found).max() < 0.1 * np.abs(found).max()
+        assert np.abs(embedding[key] - embedding["full"]).max() > 1e-3, key
+
+
+@pytest.mark.parametrize("name", ["lq", "mtr", "entity"])
+def test_bfloat16_is_close_and_gives_float32(name):
+    config, spec = CONFIGS[name], spec_of(name)
+    graph, parameters = build(config, spec)
+    half, _ = build(replace(config, dtype="bfloat16"), spec)
+    batch = jax.tree.map(lambda leaf: leaf[None], observation(np.random.default_rng(5), spec))
+
+    def run(parameters, batch):
+        return tuple(nnx.merge(one, parameters)(batch) for one in (graph, half))
+
+    whole, coarse = quick(run, parameters, batch)
+    # Eight significant bits: differences of a few per cent of the largest numbers.
+    assert coarse.dtype == np.float32 and 0 < np.abs(coarse - whole).max() < 0.1 * np.abs(whole).max()
 
 
 @pytest.mark.parametrize("name", ["lq", "mtr", "factorised", "entity"])  # every kind of layer once
@@ -130,7 +124,7 @@ def test_gradients_are_finite_where_everything_is_masked(name):
     config = CONFIGS[name] if name == "entity" else replace(CONFIGS[name], layers=1, embedding=())
     graph, parameters = build(config, spec)
     nobody = variants(observation(np.random.default_rng(6), spec))["nobody"]
-    masks = {name: value for name, value in nobody.items() if name.endswith("_mask")}
+    masks = {name: jnp.asarray(value) for name, value in nobody.items() if name.endswith("_mask")}
     rows = {name: value for name, value in nobody.items() if name not in masks}
 
     def loss(parameters, rows):

@@ -1,45 +1,49 @@
 """Counting and timing encoders, from the command line."""
 
 import json
+import math
 
 import pytest
 
 from drivax.cli import bench, main
 from drivax.errors import UsageError
 from drivax.networks.encoders import MlpConfig
-from drivax.studies.bench_encoders import EncoderBench, encoder_sizes
+from drivax.studies.bench_encoders import EncoderBench, bench_encoders, encoder_sizes
+from drivax.tasks.observations import ObservationConfig
 
 TINY = [
-    "--only", "[entity small]", "--batches", "[1, 2]", "--repeats", "1", "--observation.agents", "2",
-    "--observation.steps", "1", "--observation.road", "0", "--observation.lights", "1", "--observation.route", "2",
+    "--only", "[mlp]", "--batches", "[1, 2]", "--repeats", "1", "--observation.agents", "2", "--observation.steps", "1",
+    "--observation.road", "0", "--observation.lights", "1", "--observation.route", "2",
 ]  # fmt: skip
 
 
 def test_the_command_counts_and_times(capsys, monkeypatch):
     assert main(["bench", "--encoders", "--json", *TINY]) == 0
     found = json.loads(capsys.readouterr().out)
-    rows, shapes = found["rows"], found["observation"]
-    assert [(row["encoder"], row["dtype"]) for row in rows] == [
-        ("entity small", "float32"), ("entity small", "bfloat16")
-    ]  # fmt: skip
-    # Numbers in a row of each group: with its times side by side, and of a series which of them are there.
-    numbers = {
-        "ego": shapes["ego"][0] * (shapes["ego"][1] + 1), "ego_static": shapes["ego_static"][0],
-        "agents": shapes["agents"][1] * (shapes["agents"][2] + 1), "lights": shapes["lights"][1],
-        "route": shapes["route"][1],
-    }  # fmt: skip
-    wanted = sum((one + 1) * 32 for one in numbers.values()) + 4 * 32 * 32 + 2 * 32
-    for row in rows:
-        assert row["parameters"] == wanted and row["width"] == 4 * 32
-        assert set(row["forward_us"]) == {"1", "2"}
-        assert all(value > 0 for value in (*row["forward_us"].values(), row["gradient_us"]))
+    (row,), shapes = found["rows"], found["observation"]
+    assert (row["encoder"], row["dtype"], row["width"]) == ("mlp", "float32", 256)
+    assert shapes["agents_mask"] == [2, 1] and shapes["route_mask"] == [2] and "road" not in shapes
+    assert row["parameters"] == (sum(math.prod(shape) for shape in shapes.values()) + 1 + 257) * 256
+    assert set(row["forward_us"]) == {"1", "2"}
+    assert all(value > 0 for value in (*row["forward_us"].values(), row["gradient_us"]))
     monkeypatch.setattr(bench, "bench_encoders", lambda config: found)
     assert main(["bench", "--encoders", *TINY]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == [
         "encoder", "computes", "in", "parameters", "width", "batch", "1", "batch", "2", "backward"
     ]  # fmt: skip
-    assert lines[2].split()[:5] == ["entity", "small", "float32", f"{wanted:,}", "128"]
+    assert lines[2].split()[:4] == ["mlp", "float32", f"{row['parameters']:,}", "256"]
+
+
+@pytest.mark.slow
+def test_all_but_variants_are_timed_in_bfloat16_too():
+    tiny = ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)
+    config = EncoderBench(("entity small", "wayformer small, early"), (1,), 1, tiny)
+    rows = bench_encoders(config)["rows"]
+    assert [(row["encoder"], row["dtype"]) for row in rows] == [
+        ("entity small", "float32"), ("entity small", "bfloat16"), ("wayformer small, early", "float32")
+    ]  # fmt: skip
+    assert all(row["gradient_us"] > 0 for row in rows)
 
 
 def test_sizes_take_no_computation():

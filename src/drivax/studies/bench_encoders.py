@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array
 
@@ -18,7 +18,7 @@ from drivax.learning.driving import Driving
 from drivax.named import nearest
 from drivax.networks.encoders import EncoderConfig, GroupSpec, MlpConfig
 from drivax.networks.entity import EntityConfig
-from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, TransformerConfig, WayformerConfig
+from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
@@ -27,8 +27,9 @@ from drivax.tasks.observations import PRESETS, ObservationConfig
 from drivax.tasks.task import Task
 from drivax.tracking.runs import versions
 
+_Ours = MlpConfig | EntityConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig
 #: What is compared, by name: an encoder and its size. All but the MLP also in bfloat16, unless it is a mere variant.
-ENCODERS: Mapping[str, MlpConfig | TransformerConfig | EntityConfig] = {
+ENCODERS: dict[str, _Ours] = {
     "mlp": MlpConfig(),
     "mlp rows": MlpConfig(rows=(64, 64)),
     "entity small": EntityConfig(),
@@ -42,7 +43,7 @@ ENCODERS: Mapping[str, MlpConfig | TransformerConfig | EntityConfig] = {
     "wayformer small": WayformerConfig(),
     "wayformer published": WayformerConfig(size="published"),
 }
-VARIANTS: Mapping[str, WayformerConfig] = {
+VARIANTS: dict[str, _Ours] = {
     "wayformer small, early": WayformerConfig(fusion="early"),
     "wayformer small, hierarchical": WayformerConfig(fusion="hierarchical"),
     "wayformer small, factorised": WayformerConfig(factorised=True),
@@ -96,9 +97,10 @@ def bench_encoders(config: EncoderBench | None = None, *, times: bool = True) ->
     for name, encoder in (ENCODERS | VARIANTS).items():
         if config.only and name not in config.only:
             continue
-        both = name in ENCODERS and not isinstance(encoder, MlpConfig)
-        for dtype in ("float32", "bfloat16") if both else ("float32",):
-            one = replace(encoder, dtype=dtype) if both else encoder
+        kinds = {"float32": encoder}
+        if name in ENCODERS and not isinstance(encoder, MlpConfig):
+            kinds["bfloat16"] = replace(encoder, dtype="bfloat16")
+        for dtype, one in kinds.items():
             row = {"encoder": name, "dtype": dtype} | encoder_sizes(one, spec)
             rows.append(row | (_times(one, spec, config) if times else {}))
     return {
@@ -124,15 +126,18 @@ def encoder_sizes(config: EncoderConfig, spec: GroupSpec) -> dict[str, int]:
 
 def random_observations(spec: GroupSpec, batch: int) -> dict[str, Array]:
     """Observations of noise in which about half of the rows are there."""
-    found = {}
-    for number, (name, shape) in enumerate(sorted(spec.items())):
-        noise = jax.random.normal(jax.random.key(number), (batch, *shape))
-        found[name] = noise > 0 if name.endswith("_mask") else noise
-    return found
+    rng = np.random.default_rng(0)
+    noise = {
+        name: rng.normal(size=(batch, *shape)).astype(np.float32) for name, shape in sorted(spec.items())
+    }
+    return {name: jnp.asarray(one > 0 if name.endswith("_mask") else one) for name, one in noise.items()}
 
 
 def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[str, Any]:
-    graph, parameters = nnx.split(config.build(spec, nnx.Rngs(0)))
+    graph, empty = nnx.split(nnx.eval_shape(lambda: config.build(spec, nnx.Rngs(0))))
+    # Times do not depend on what the parameters are.
+    rng = np.random.default_rng(0)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(0.05 * rng.normal(size=leaf.shape), leaf.dtype), empty)
 
     def encode(parameters: Any, groups: Any) -> Array:
         encoder: Any = nnx.merge(graph, parameters)
