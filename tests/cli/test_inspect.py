@@ -162,9 +162,7 @@ def test_observations(sets, inspect, tmp_path):
     assert out.startswith(
         "32 states of 4 episodes driven by constant_velocity, 0 with a collision; every number is f"
     )
-    (row,) = [line.split() for line in out.splitlines() if line.startswith("  length ") and "64" in line][:1]
-    # Two steps of every look; all cars are as long, and a policy of no action depends on nothing.
-    assert row == ["length", "72", "0.96", "0.00", "0.96", "0.96"]
+    assert "\nagents" in out and "\n  velocity ahead " in out
     assert (tmp_path / "seen.png").read_bytes().startswith(b"\x89PNG")
     again = inspect(*words, "--draw", tmp_path / "seen.png", status=2)
     assert "--overwrite" in again and len(again.splitlines()) == 1
@@ -179,6 +177,9 @@ def test_observations(sets, inspect, tmp_path):
         "route",
     }
     assert all(row["broken"] == 0 and row["importance"] is None for row in found["features"])
+    (length,) = [row for row in found["features"] if (row["group"], row["name"]) == ("agents", "length")]
+    # 0, 1, 2 and 3 others, of which two are seen, at both steps of eight looks; all are as long.
+    assert length["count"] == (0 + 1 + 2 + 2) * 2 * 8 and length["mean"] == pytest.approx(4.8 / 5)
 
 
 @pytest.mark.parametrize(

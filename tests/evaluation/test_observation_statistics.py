@@ -13,6 +13,7 @@ from scipy import stats
 from drivax.errors import UsageError
 from drivax.evaluation.observation_statistics import (
     collision_correlation,
+    described,
     importances,
     look_at,
     observation_statistics,
@@ -23,6 +24,7 @@ from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Physical, Published
+from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig, OwnGroup
 from drivax.tasks.task import Task
 from scenes import bank_of, car, straight_road
@@ -71,6 +73,7 @@ def column(found, group, name):
     return one
 
 
+@pytest.mark.slow
 def test_episodes_are_looked_at_until_and_after_the_collision(bank):
     looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
     assert looks.state.scene.step.tolist() == [[*range(10, 81, 10)]] * 3
@@ -79,6 +82,7 @@ def test_episodes_are_looked_at_until_and_after_the_collision(bank):
     assert looks.collides.tolist() == [True, False, False]
 
 
+@pytest.mark.slow
 def test_a_column_is_described_by_its_valid_rows(shy):
     assert (shy.planner, shy.episodes, shy.collisions, shy.states, shy.permuted) == (
         "shy",
@@ -96,6 +100,7 @@ def test_a_column_is_described_by_its_valid_rows(shy):
     assert column(shy, "lights", "on_route").count == 0 and np.isnan(column(shy, "lights", "on_route").mean)
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_found(shy):
     one = column(shy, "faulty", "0")
     assert (one.broken, shy.broken, one.count) == (2, 2, 22)
@@ -109,6 +114,7 @@ def test_what_is_not_finite_is_found(shy):
     assert light["mean"] is None and light["count"] == 0
 
 
+@pytest.mark.slow
 def test_only_what_the_planner_looks_at_matters(shy):
     found = {(one.group, one.name): one.importance for one in shy.features}
     assert found.pop(("agents", "position x")) > 0.5 and shy.groups["agents"] > 0.5
@@ -119,6 +125,29 @@ def test_only_what_the_planner_looks_at_matters(shy):
 def test_a_planner_of_another_action_space_is_refused(bank):
     with pytest.raises(UsageError, match="another action space"):
         observation_statistics(Expert(), bank, replace(TASK, actions=Published()), permute=False)
+
+
+def test_columns_of_observations_made_by_hand():
+    """Two episodes of three looks at one row that is there or not; the second one hits somebody at its last look."""
+    rows = np.arange(12.0).reshape(2, 3, 1, 2)
+    mask = np.array([[[True], [True], [False]], [[True], [True], [True]]])
+    rows[0, 1, 0, 1], rows[0, 2, 0, 1], rows[1, 0, 0, 1] = np.nan, np.inf, -np.inf
+    hit, collides = np.array([[False] * 3, [False, False, True]]), np.array([False, True])
+    static = np.linspace(0, 1, 6).reshape(2, 3, 1)
+    seen = {"mine": rows, "mine_mask": mask, "ego_static": static}
+    one, two, static = described(Features(ego_static=("width",)), seen, hit, collides, {("mine", 0): 0.5})
+    assert (one.group, one.name, static.name) == ("mine", "0", "width")
+    kept = [0.0, 2.0, 6.0, 8.0, 10.0]
+    assert (one.count, one.broken, one.mean, one.low, one.high) == (5, 0, np.mean(kept), 0.0, 10.0)
+    assert one.std == pytest.approx(np.std(kept)) and one.importance == 0.5 and np.isnan(two.importance)
+    # Infinite in a masked row counts as broken, too.
+    assert (two.count, two.broken, two.low, two.high) == (3, 3, 1.0, 11.0)
+    assert (static.count, static.low, static.high) == (6, 0.0, 1.0)
+    # Of two episodes nothing can be said; of four, r is that of their means before the collision: 1, 7, 1, 7.
+    assert np.isnan(one.collision)
+    twice = {name: np.concatenate([values, values]) for name, values in seen.items()}
+    again = described(Features(ego_static=("width",)), twice, np.tile(hit, (2, 1)), np.tile(collides, 2), {})
+    assert again[0].collision == pytest.approx(1.0)
 
 
 def test_correlation_is_scipys_point_biserial():

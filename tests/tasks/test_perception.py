@@ -203,6 +203,7 @@ def test_range_and_dropout_by_distance(seen):
     assert len(np.unique(found)) > 2
 
 
+@pytest.mark.slow
 def test_a_replayed_scene_is_perceived_as_it_was_live(bank, seen):
     """A stored scene, observed alone and in another program, as it was seen in the batch."""
     simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))

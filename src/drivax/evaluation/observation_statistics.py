@@ -25,7 +25,7 @@ from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import SimState
-from drivax.tasks.features import feature_names
+from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task
 
 #: Steps between two looks, scenarios that run side by side, and states on which features are permuted.
@@ -141,7 +141,6 @@ def observation_statistics(
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
-    names = feature_names(task.observation.features, {name: leaf.shape[2:] for name, leaf in seen.items()})
     columns, groups, permuted = {}, {}, 0
     if permute:
         rows = np.unique(np.linspace(0, hit.size - 1, min(PERMUTED, hit.size)).round().astype(int))
@@ -149,18 +148,40 @@ def observation_statistics(
         *rest, shown = jax.tree.map(lambda leaf: leaf.reshape(hit.size, *leaf.shape[2:])[rows], known)
         act = partial(_actions, simulator, planner, bank, *rest)
         columns, groups = importances(act, jax.device_get(shown), seed)
-    features = []
-    for group, parts in names.items():
-        mask = seen.get(f"{group}_mask")
-        for column, name in enumerate(parts):
-            values = seen[group][..., column]
-            valid = np.ones(values.shape, bool) if mask is None else mask
-            correlation = collision_correlation(values, valid & ~_wide(hit, valid), collides)
-            importance = columns.get((group, column), float("nan"))
-            features.append(FeatureStatistics(group, name, *_moments(values, valid), correlation, importance))
+    features = described(task.observation.features, seen, hit, collides, columns)
     return ObservationStatistics(
-        planner.name, len(collides), int(collides.sum()), hit.size, permuted, tuple(features), groups
+        planner.name, len(collides), int(collides.sum()), hit.size, permuted, features, groups
     )
+
+
+def described(
+    features: Features,
+    observation: Mapping[str, Values],
+    hit: Values,
+    collides: Values,
+    importance: Mapping[tuple[str, int], float],
+) -> tuple[FeatureStatistics, ...]:
+    """Statistics of every column of what was observed.
+
+    Args:
+        features: Features of our own groups.
+        observation: What was observed, ``[episode, look, ...]`` by group.
+        hit: Whether ego has collided by then, ``[episode, look]``.
+        collides: Whether it collides at all, ``[episode]``.
+        importance: Of columns that were permuted, by group and number.
+    """
+    names = feature_names(features, {name: values.shape[2:] for name, values in observation.items()})
+    found = []
+    for group, parts in names.items():
+        for column, name in enumerate(parts):
+            values = observation[group][..., column]
+            valid = observation.get(f"{group}_mask", np.ones(values.shape, bool))
+            before = valid & ~hit.reshape(*hit.shape, *(1,) * (valid.ndim - hit.ndim))
+            moments = _moments(values, valid)
+            correlation = collision_correlation(values, before, collides)
+            importance_here = importance.get((group, column), float("nan"))
+            found.append(FeatureStatistics(group, name, *moments, correlation, importance_here))
+    return tuple(found)
 
 
 def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0) -> Looks:
@@ -227,11 +248,6 @@ def _actions(
         return planner.act(carry, bank, state, simulator.situation(bank, state), observation, key)[0]
 
     return jax.vmap(act)(state, carry, key, observation)
-
-
-def _wide(flags: Values, like: Values) -> Values:
-    """Flags ``[episode, look]`` with the row axes of a mask."""
-    return flags.reshape(*flags.shape, *(1,) * (like.ndim - flags.ndim))
 
 
 def _moments(values: Values, valid: Values) -> tuple[int, int, float, float, float, float]:

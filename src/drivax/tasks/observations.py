@@ -277,6 +277,22 @@ def _agents(
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
+def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+    """The road group as configured: pieces cut, moved by noise, of the chosen columns."""
+    wanted, noisy = config.features.road, config.perception.noise_m > 0
+    pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
+    found = _road(pieces, bank, scene, view)
+    if config.road_cut == 1 and wanted == Features().road and not noisy:
+        return found
+    rows, mask = found["road"], found["road_mask"]
+    if config.road_cut > 1:
+        rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
+    if noisy:
+        rows = rows.at[:, :2].add(moved_road(config.perception, scene, config.road) / POSITION_M)
+    columns = columns_of("road", wanted) + ([rows.shape[-1] - 1] if "curvature" in wanted else [])
+    return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
+
+
 def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     x, y, layer = bank.road_at[scene.index]
     dx, dy = x - view.xy[0], y - view.xy[1]
@@ -320,22 +336,6 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     # Exact in any precision of a product: no factor is above eight.
     before = within[-1] @ jnp.triu(jnp.ones((blocks, blocks)), 1)
     return jnp.stack([row + before for row in within], axis=-1).reshape(-1)[:count].astype(jnp.int32)
-
-
-def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    """The road group as configured: pieces cut, moved by noise, of the chosen columns."""
-    wanted, noisy = config.features.road, config.perception.noise_m > 0
-    pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
-    found = _road(pieces, bank, scene, view)
-    if config.road_cut == 1 and wanted == Features().road and not noisy:
-        return found
-    rows, mask = found["road"], found["road_mask"]
-    if config.road_cut > 1:
-        rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
-    if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, scene, config.road) / POSITION_M)
-    columns = columns_of("road", wanted) + ([rows.shape[-1] - 1] if "curvature" in wanted else [])
-    return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
 def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
