@@ -242,6 +242,7 @@ def test_they_are_rewarded_once(driven):
     np.testing.assert_allclose(terms["merge"], 0.2 * facts.merged)
 
 
+@pytest.mark.slow
 def test_logged_steps_score_as_simulated_ones(driven):
     made, bank, (_, terms) = driven
     for name in ("there and back", "a lane drop", "a ramp", "a fork"):
