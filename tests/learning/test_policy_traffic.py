@@ -19,7 +19,7 @@ from drivax.synthetic.generate import Generation, generate
 
 TINY = {
     "task": {
-        "observation": {"agents": 2, "steps": 1, "road": 0, "lights": 0, "route": 2},
+        "observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 2},
         "rewards": {"preset": "aggressive"},
         "metrics": ["success"],
     },

@@ -162,7 +162,7 @@ SCENES = {
     "into oncoming traffic": (two_way_road([along(10 * T, aside(1.0, LANE_M))]), [], []),
     "a lane drop": (drop(along(10 * T, aside(1.0, LANE_M)), 60.0), [42], [42]),
     "long before a lane drop": (drop(along(10 * T, aside(1.0, LANE_M)), 200.0), [42], []),
-    "past the end of a lane": (drop(along(10 * T, aside(6.0, LANE_M)), 60.0), [], [75]),
+    "past the end of a lane": (drop(along(10 * T, aside(6.0, LANE_M)), 60.0), [], [74]),
     "along a taper": (taper(along(15 * T, LANE_M * np.clip((15 * T - 30) / 60, 0, 1))), [], [71]),
     "to the lane that is joined": (taper(along(10 * T, aside(0.5, LANE_M, 2.0))), [26], [26]),
     "a ramp": (ramp(ramping()), [], [51]),
@@ -242,6 +242,7 @@ def test_they_are_rewarded_once(driven):
     np.testing.assert_allclose(terms["merge"], 0.2 * facts.merged)
 
 
+@pytest.mark.slow
 def test_logged_steps_score_as_simulated_ones(driven):
     made, bank, (_, terms) = driven
     for name in ("there and back", "a lane drop", "a ramp", "a fork"):
