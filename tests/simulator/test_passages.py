@@ -219,7 +219,8 @@ def driven():
     made = scenes()
     assembled = [assemble(recording, SIZE) for recording, _, _ in made.values()]
     for name, scenario in zip(made, assembled, strict=True):
-        assert not {"segments", "lane_run", "lanes", "lane_links"} & set(scenario.overflow), name
+        # Far ends of long roads lie outside the grid.
+        assert not {"lane_run", "lanes", "lane_links"} & set(scenario.overflow), name
     bank = ScenarioBank.from_scenarios(assembled, trim=False)
     return made, bank, jax.device_get(replayed(bank))
 
