@@ -41,7 +41,10 @@ def travelling(recording):
 
 
 def crossings(recording, row):
-    """Steps at which the nearest lane that runs a car's way becomes one that the source calls its neighbour."""
+    """Steps at which the nearest lane that runs a car's way becomes one that the source calls its neighbour.
+
+    Only where the two are 2 m apart: the car is between them.
+    """
     lanes = [f for f in recording.features if f.kind in CAR_LANE_KINDS and len(f.points) > 1]
     lines = [LineString(f.points[:, :2]) for f in lanes]
     beside = {f.feature_id: {*f.left_neighbours, *f.right_neighbours} for f in lanes}
@@ -61,7 +64,16 @@ def crossings(recording, row):
     for k in range(1, len(ids)):
         a, b = ids[k - 1], ids[k]
         if a != b and (b in beside.get(a, ()) or a in beside.get(b, ())):
-            found.append(k + 11)
+            here = Point(tracks.xy[row, k + 11])
+            if (
+                sum(
+                    drawn.distance(here)
+                    for f, drawn in zip(lanes, lines, strict=True)
+                    if f.feature_id in (a, b)
+                )
+                > 2
+            ):
+                found.append(k + 11)
     return found
 
 
