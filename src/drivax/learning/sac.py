@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -127,7 +128,7 @@ class Sac:
         self.target_entropy = (
             -float(environment.action_size) if config.target_entropy is None else config.target_entropy
         )
-        optimisers = {
+        optimisers: dict[Hashable, optax.GradientTransformation] = {
             "policy": clipped_adam(config.policy_rate, config.gradient_norm),
             "critic": clipped_adam(config.critic_rate, config.gradient_norm),
             "temperature": optax.adam(config.temperature_rate),
@@ -149,13 +150,14 @@ class Sac:
         network_key, environment_key, key = jax.random.split(key, 3)
         policy, critic = (nnx.state(network, nnx.Param) for network in self._networks(network_key))
         log_temperature = jnp.asarray(math.log(self.config.temperature), jnp.float32)
+        trained: Any = Trained(policy, critic, log_temperature)
         environments = self.environment.start(data, environment_key, self.config.environments)
         return SacState(
             parameters=policy,
             critic=critic,
             log_temperature=log_temperature,
             target=jax.tree.map(jnp.copy, critic),
-            optimiser=self.optimiser.init(Trained(policy, critic, log_temperature)),
+            optimiser=self.optimiser.init(trained),
             replay=replay.init(self.config.replay, self.environment, environments),
             environments=environments,
             key=key,
@@ -233,9 +235,9 @@ class Sac:
         return actor
 
     def _update(
-        self, now: tuple[Trained, Any, Any], part: Transitions, key: Array, also: Also | None
-    ) -> tuple[tuple[Trained, Any, Any], dict[str, Array]]:
-        """All three losses at the same parameters, then the target critics."""
+        self, now: tuple[Any, Any, Any], part: Transitions, key: Array, also: Also | None
+    ) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
+        """All three losses at the same parameters (``Trained``), then the target critics."""
         trained, target, optimiser = now
         (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(trained, target, part, key, also)
         logs["policy_gradient_norm"] = optax.tree.norm(gradient.policy)
