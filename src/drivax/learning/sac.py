@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -127,7 +128,7 @@ class Sac:
         self.target_entropy = (
             -float(environment.action_size) if config.target_entropy is None else config.target_entropy
         )
-        optimisers = {
+        optimisers: dict[Hashable, optax.GradientTransformation] = {
             "policy": clipped_adam(config.policy_rate, config.gradient_norm),
             "critic": clipped_adam(config.critic_rate, config.gradient_norm),
             "temperature": optax.adam(config.temperature_rate),
@@ -150,12 +151,13 @@ class Sac:
         policy, critic = (nnx.state(network, nnx.Param) for network in self._networks(network_key))
         log_temperature = jnp.asarray(math.log(self.config.temperature), jnp.float32)
         environments = self.environment.start(data, environment_key, self.config.environments)
+        trained: Any = Trained(policy, critic, log_temperature)
         return SacState(
             parameters=policy,
             critic=critic,
             log_temperature=log_temperature,
             target=jax.tree.map(jnp.copy, critic),
-            optimiser=self.optimiser.init(Trained(policy, critic, log_temperature)),
+            optimiser=self.optimiser.init(trained),
             replay=replay.init(self.config.replay, self.environment, environments),
             environments=environments,
             key=key,
@@ -233,15 +235,22 @@ class Sac:
         return actor
 
     def _update(
-        self, now: tuple[Trained, Any, Any], part: Transitions, key: Array, also: Also | None
-    ) -> tuple[tuple[Trained, Any, Any], dict[str, Array]]:
-        """All three losses at the same parameters, then the target critics."""
+        self, now: tuple[Any, Any, Any], part: Transitions, key: Array, also: Also | None
+    ) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
+        """All three losses at the same parameters, then the target critics.
+
+        Args:
+            now: What is :class:`Trained`, the target critics, and the optimiser's state.
+            part: The batch.
+            key: Of samples.
+            also: A further loss of the policy.
+        """
         trained, target, optimiser = now
         (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(trained, target, part, key, also)
         logs["policy_gradient_norm"] = optax.tree.norm(gradient.policy)
         logs["critic_gradient_norm"] = optax.tree.norm(gradient.critic)
         change, optimiser = self.optimiser.update(gradient, optimiser, trained)
-        trained = optax.apply_updates(trained, change)
+        trained: Any = optax.apply_updates(trained, change)
         return (trained, polyak(target, trained.critic, self.config.tau), optimiser), logs
 
     def _loss(
