@@ -19,7 +19,7 @@ _CURES = {
     "replay": "lower algorithm.replay.capacity, or set algorithm.replay.store to state",
     "environments": "lower algorithm.environments",
     "networks and optimiser": "choose a smaller network, or fewer --seeds",
-    "program": "lower algorithm.environments and unroll, or raise algorithm.minibatches",
+    "program": "lower algorithm.environments, unroll or batch, or raise algorithm.minibatches",
 }
 #: Fields of a learner's state that have a line of their own.
 _FIELDS = ("replay", "environments")

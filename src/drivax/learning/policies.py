@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.starts import LogStart
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder, seed_folders
@@ -37,7 +39,9 @@ def load_policy(
             f"holds {len(inside)} agents", file=folder.path, cure=f"name one of them, as {inside[0]}"
         )
     config = folder.config(TrainConfig)
-    learner = config.algorithm.build(config.environment(), bank, config.iterations)
+    # Parameters do not depend on what the others did, and the bank may not be prepared for it.
+    environment = replace(config, traffic="log", start=LogStart()).environment()
+    learner = config.algorithm.build(environment, bank, config.iterations)
     checkpoints = Checkpoints(folder.checkpoints)
     template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
     chosen = checkpoints.best() if step is None else step
