@@ -23,6 +23,8 @@ _SPECS = (
     {"ego": (1, 6), "lights": (2, 7), "lights_mask": (2,)},
 )  # fmt: skip
 _BATCH = 6
+#: How far results may lie apart where settings say ``dtype: bfloat16``, which has eight significant bits.
+_COARSE = 5e-2
 
 
 def check_encoder(config: EncoderConfig | str) -> None:
@@ -30,7 +32,8 @@ def check_encoder(config: EncoderConfig | str) -> None:
 
     It builds for any groups; embeds one observation or a batch as ``[..., width]`` float32, the same compiled or not;
     its parameters follow from the key and are all that it keeps; values and gradients are finite, also where every row
-    is masked; what masked rows hold does not matter, and what the others hold does.
+    is masked; what masked rows hold does not matter, and what the others hold does. What is alike is compared more
+    coarsely where the settings have ``dtype`` bfloat16.
 
     Args:
         config: The encoder's settings, or the dotted name of such a class or instance.
@@ -42,6 +45,7 @@ def check_encoder(config: EncoderConfig | str) -> None:
     found = found() if isinstance(found, type) else found
     what = f"encoder {type(found).__name__}"
     expect(isinstance(found, EncoderConfig), f"{what} has no build(spec, rngs)", "see EncoderConfig")
+    close = _COARSE if getattr(found, "dtype", "") == "bfloat16" else CLOSE
     for number, spec in enumerate(_SPECS):
         encoder: Any = found.build(spec, nnx.Rngs(0))
         batch = _observations(spec, number)
@@ -55,8 +59,8 @@ def check_encoder(config: EncoderConfig | str) -> None:
         )
         check_numbers(what, embedding)
         _check_state(what, found, spec, encoder)
-        _check_rows(what, encoder if number == 0 else run, run, batch, embedding)
-        _check_masks(what, run, spec, batch, embedding)
+        _check_rows(what, (encoder if number == 0 else run, run), batch, embedding, close)
+        _check_masks(what, run, batch, embedding, close)
         _check_gradients(what, encoder, batch)
 
 
@@ -86,11 +90,12 @@ def _check_state(what: str, config: EncoderConfig, spec: Any, encoder: Any) -> N
     )
 
 
-def _check_rows(what: str, encoder: Any, run: Any, batch: Any, embedding: Any) -> None:
-    one = jax.tree.map(lambda leaf: leaf[0], batch)
+def _check_rows(what: str, forms: tuple[Any, Any], batch: Any, embedding: Any, close: float) -> None:
+    """One observation in either form of the encoder, as it is and compiled: alone, and in a batch of batches of one."""
+    one, (encoder, run) = jax.tree.map(lambda leaf: leaf[0], batch), forms
     for result in (encoder(one), run(jax.tree.map(lambda leaf: leaf[None, None], one))[0, 0]):
         expect(
-            same(embedding[0], jax.device_get(result), CLOSE),
+            same(embedding[0], jax.device_get(result), close),
             f"{what} embeds an observation differently alone and in a batch",
             "work on the last axes, whatever axes lead",
         )
@@ -98,8 +103,8 @@ def _check_rows(what: str, encoder: Any, run: Any, batch: Any, embedding: Any) -
     expect(spread > 0, f"{what} embeds all observations alike", "let it read the groups")
 
 
-def _check_masks(what: str, run: Any, spec: Any, batch: Any, embedding: Any) -> None:
-    masked = [name for name in spec if f"{name}_mask" in spec]
+def _check_masks(what: str, run: Any, batch: Any, embedding: Any, close: float) -> None:
+    masked = [name for name in batch if f"{name}_mask" in batch]
     littered, nobody = dict(batch), dict(batch)
     for name in masked:
         there = batch[f"{name}_mask"][..., None]
@@ -107,7 +112,7 @@ def _check_masks(what: str, run: Any, spec: Any, batch: Any, embedding: Any) -> 
         nobody[f"{name}_mask"] = jnp.zeros_like(batch[f"{name}_mask"])
     other = run(littered)
     expect(
-        same(embedding, other, CLOSE),
+        same(embedding, other, close),
         f"{what} changes with what masked rows hold",
         "use jnp.where(mask[..., None], rows, 0) first, and mask after every bias",
     )
