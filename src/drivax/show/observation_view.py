@@ -319,9 +319,7 @@ def _legend(figure: Figure, left: float, config: ObservationConfig, seen: Seen) 
             for kind, name in zip(kinds, named, strict=True)
         ]
         if config.steps > 1:
-            handles.append(
-                Patch(facecolor=LIGHT["vehicle"], alpha=0.3, label=f"{config.steps - 1} past steps, faded")
-            )
+            handles.append(Patch(facecolor=LIGHT["vehicle"], alpha=0.3, label="past steps, faded"))
     if seen.has("agents", "velocity") or seen.has("ego", "velocity"):
         handles.append(line("ink", "way in 1 s", marker=">", markersize=5, linewidth=0.9))
     if seen.has("road", "position"):
