@@ -208,7 +208,7 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
 def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     past = scene.history[HISTORY - config.steps :]
     turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
-    size = bank.agent_box[scene.index, scene.slot]
+    size = bank.agent_box[scene.index, scene.slot, :2] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: turned[:, ::-1],
@@ -216,9 +216,9 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View
         "time": lambda: -DT_S * jnp.arange(config.steps - 1, -1, -1, dtype=jnp.float32)[:, None],
     }
     static = {
-        "length": lambda: size[0:1] / SIZE_M,
-        "width": lambda: size[1:2] / SIZE_M,
-        "height": lambda: size[2:3] / SIZE_M,
+        "length": lambda: size[:1],
+        "width": lambda: size[1:],
+        "height": lambda: bank.agent_box[scene.index, scene.slot, 2:3] / SIZE_M,
         "last_action": lambda: scene.action,
     }
     result = {}
@@ -266,9 +266,10 @@ def _agents(
     rows = [row(back) for back in range(config.steps - 1, -1, -1)]
     moving = jnp.stack([one for one, _ in rows], axis=1)
     mask = jnp.stack([valid for _, valid in rows], axis=1) & there[:, None]
+    size = now.box[chosen, 4:6] / SIZE_M
     parts = {
-        "length": lambda: now.box[chosen, 4:5] / SIZE_M,
-        "width": lambda: now.box[chosen, 5:6] / SIZE_M,
+        "length": lambda: size[:, :1],
+        "width": lambda: size[:, 1:],
         "height": lambda: bank.agent_box[scene.index, chosen, 2:3] / SIZE_M,
         "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
