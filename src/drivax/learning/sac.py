@@ -134,7 +134,8 @@ class Sac:
             "temperature": optax.adam(config.temperature_rate),
         }
         self.optimiser = optax.partition(optimisers, Trained("policy", "critic", "temperature"))
-        policy, critic = self._networks(jax.random.key(0))
+        # Only the structures are wanted: no number is drawn.
+        policy, critic = nnx.eval_shape(lambda: self._networks(jax.random.key(0)))
         self.policy_graph, self.critic_graph = nnx.graphdef(policy), nnx.graphdef(critic)
 
     def _networks(self, key: Array) -> tuple[Policy, TwinCritic]:
@@ -243,8 +244,8 @@ class Sac:
         logs["policy_gradient_norm"] = optax.tree.norm(gradient.policy)
         logs["critic_gradient_norm"] = optax.tree.norm(gradient.critic)
         change, optimiser = self.optimiser.update(gradient, optimiser, trained)
-        trained = optax.apply_updates(trained, change)
-        return (trained, polyak(target, trained.critic, self.config.tau), optimiser), logs
+        better: Any = optax.apply_updates(trained, change)
+        return (better, polyak(target, better.critic, self.config.tau), optimiser), logs
 
     def _loss(
         self, trained: Trained, target: Any, part: Transitions, key: Array, also: Also | None
