@@ -151,8 +151,8 @@ class Sac:
         network_key, environment_key, key = jax.random.split(key, 3)
         policy, critic = (nnx.state(network, nnx.Param) for network in self._networks(network_key))
         log_temperature = jnp.asarray(math.log(self.config.temperature), jnp.float32)
-        trained: Any = Trained(policy, critic, log_temperature)
         environments = self.environment.start(data, environment_key, self.config.environments)
+        trained: Any = Trained(policy, critic, log_temperature)
         return SacState(
             parameters=policy,
             critic=critic,
@@ -238,14 +238,21 @@ class Sac:
     def _update(
         self, now: tuple[Any, Any, Any], part: Transitions, key: Array, also: Also | None
     ) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
-        """All three losses at the same parameters (``Trained``), then the target critics."""
+        """All three losses at the same parameters, then the target critics.
+
+        Args:
+            now: What is :class:`Trained`, the target critics, and the optimiser's state.
+            part: The batch.
+            key: Of samples.
+            also: A further loss of the policy.
+        """
         trained, target, optimiser = now
         (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(trained, target, part, key, also)
         logs["policy_gradient_norm"] = optax.tree.norm(gradient.policy)
         logs["critic_gradient_norm"] = optax.tree.norm(gradient.critic)
         change, optimiser = self.optimiser.update(gradient, optimiser, trained)
-        better: Any = optax.apply_updates(trained, change)
-        return (better, polyak(target, better.critic, self.config.tau), optimiser), logs
+        trained: Any = optax.apply_updates(trained, change)
+        return (trained, polyak(target, trained.critic, self.config.tau), optimiser), logs
 
     def _loss(
         self, trained: Trained, target: Any, part: Transitions, key: Array, also: Also | None

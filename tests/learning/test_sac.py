@@ -1,0 +1,103 @@
+"""SAC's losses: against NumPy on the networks' own outputs, and which parameters each of them reaches."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.learning.replay import ReplayConfig, Transitions
+from drivax.learning.sac import SacConfig, Trained
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
+from pendulum import Pendulum
+
+NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,))
+CONFIG = SacConfig(network=NETWORK, replay=ReplayConfig(64), environments=4, unroll=4, batch=16, warm_up=0)
+
+
+@pytest.fixture(scope="module")
+def sac():
+    """A learner with its first state, target critics that differ from the critics, and a batch of steps."""
+    learner = CONFIG.build(Pendulum(), (), 1)
+    state = jax.jit(learner.init)((), jax.random.key(0))
+    target = jax.tree.map(lambda leaf: leaf + 0.1, state.target)
+    keys = jax.random.split(jax.random.key(1), 5)
+    batch = Transitions(
+        observation={"pendulum": jax.random.normal(keys[0], (16, 3))},
+        action=jax.random.uniform(keys[1], (16, 1), minval=-1.0),
+        reward=jax.random.normal(keys[2], (16,)),
+        terminated=jax.random.bernoulli(keys[3], 0.3, (16,)),
+        following={"pendulum": jax.random.normal(keys[4], (16, 3))},
+    )
+    trained = Trained(state.parameters, state.critic, jnp.log(0.2))
+    return learner, trained, target, batch
+
+
+def test_losses_against_numpy(sac):
+    learner, trained, target, batch = sac
+    key = jax.random.key(7)
+    _, logs = jax.jit(lambda t: learner._loss(t, target, batch, key, None))(trained)
+
+    @jax.jit
+    def outputs(trained):
+        """What the losses are made of: values, log-densities, drawn by the same keys."""
+        next_key, now_key, _ = jax.random.split(key, 3)
+        following = learner.distribution(trained.policy, batch.following)
+        policy = learner.distribution(trained.policy, batch.observation)
+        then, now = following.sample(next_key), policy.sample(now_key)
+        return {
+            "target": learner._q(target, batch.following, jnp.tanh(then)),
+            "then": following.log_prob(then),
+            "q": learner._q(trained.critic, batch.observation, batch.action),
+            "judged": learner._q(trained.critic, batch.observation, jnp.tanh(now)),
+            "now": policy.log_prob(now),
+        }
+
+    found = {name: np.asarray(value, np.float64) for name, value in outputs(trained).items()}
+    assert not np.allclose(found["q"][0], found["q"][1]), "the critics are two networks"
+    value = np.minimum(*found["target"]) - 0.2 * found["then"]
+    goal = np.asarray(batch.reward) + 0.99 * np.where(batch.terminated, 0.0, value)
+    expected = {
+        "critic": 0.5 * ((found["q"] - goal) ** 2).mean(),
+        "policy": (0.2 * found["now"] - np.minimum(*found["judged"])).mean(),
+        "mean_q": found["q"].mean(),
+        "entropy": -found["now"].mean(),
+        "temperature": 0.2,
+    }
+    assert set(logs) == set(expected)
+    for name, number in expected.items():
+        assert float(logs[name]) == pytest.approx(number, rel=1e-4, abs=1e-5), name
+
+
+def test_every_loss_reaches_its_own_parameters_only(sac):
+    learner, trained, target, batch = sac
+
+    @jax.jit
+    def slopes_of(trained):
+        def part(name):
+            def of(trained):
+                total, logs = learner._loss(trained, target, batch, jax.random.key(7), None)
+                return total if name == "total" else logs[name], logs
+
+            return jax.grad(of, has_aux=True)(trained)
+
+        return {name: part(name) for name in ("total", "critic", "policy")}
+
+    found = slopes_of(trained)
+    slopes = {name: slope for name, (slope, _) in found.items()}
+    for name in ("critic", "policy"):
+        own, whole = (jax.tree.leaves(getattr(slopes[which], name)) for which in (name, "total"))
+        for one, other in zip(own, whole, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+        assert max(float(jnp.abs(leaf).max()) for leaf in own) > 1e-3
+    # The temperature's slope is alpha (entropy - target): by hand, from what is logged.
+    slope = 0.2 * (float(found["total"][1]["entropy"]) + 1.0)
+    assert float(slopes["total"].log_temperature) == pytest.approx(slope, rel=1e-3, abs=1e-5)
+
+
+def test_what_cannot_be_learned_from_is_refused():
+    with pytest.raises(UsageError, match="no step with a successor"):
+        SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
+    with pytest.raises(UsageError, match="more capacity"):
+        SacConfig(network=NETWORK, environments=4, unroll=100, replay=ReplayConfig(100))
