@@ -73,6 +73,7 @@ def test_heads(network):
 MESH = """
 import jax, numpy as np
 from drivax.errors import UsageError
+from drivax.learning.agents import Agents
 from drivax.learning.program import Program
 from pendulum import Pendulum
 from test_ppo import CONFIG
