@@ -4,7 +4,6 @@ import json
 import os
 import signal
 
-import jax
 import numpy as np
 import pytest
 
@@ -12,9 +11,7 @@ from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import logged, train
-from drivax.learning.policies import load_policy
 from drivax.learning.stopping import Preempted
-from drivax.scenario.bank import ScenarioBank
 from drivax.tracking.sinks import MetricLog, read_rows
 
 SMALL = {
@@ -59,9 +56,10 @@ def test_a_run_that_was_told_to_stop_goes_on_bit_for_bit(data, config, tmp_path,
         for name in one:
             if not name.startswith(("time", "steps_per_second")):
                 assert one[name] == other[name], name
-    bank = ScenarioBank.from_scenarios(data)
-    policies = [load_policy(run.path, bank)[0].parameters for run in (whole, resumed)]
-    jax.tree.map(np.testing.assert_array_equal, *policies)
+    # The whole state, by the checksum of every array.
+    last = [run.checkpoints / "step-000000512" / "about.json" for run in (whole, resumed)]
+    leaves = [json.loads(file.read_text())["leaves"] for file in last]
+    assert leaves[0] == leaves[1] and len(leaves[0]) > 50
 
 
 def test_means_of_an_iteration():

@@ -142,7 +142,8 @@ class Bc:
         refuse_flat(config, config.network)
         self.spec = environment.shapes(data)
         self.optimiser = config.optimiser(iterations * config.updates)
-        self.graph = nnx.graphdef(self._network(jax.random.key(0)))
+        # Only the structure is wanted: no number is drawn.
+        self.graph = nnx.graphdef(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> Policy:
         actions = Actions(self.environment.action_size, self.environment.levels)

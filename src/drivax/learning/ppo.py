@@ -97,7 +97,8 @@ class Ppo:
             eps=1e-5,
             apart=not config.network.shared_encoder,
         )
-        self.graph = nnx.graphdef(self._network(jax.random.key(0)))
+        # Only the structure is wanted: no number is drawn.
+        self.graph = nnx.graphdef(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> ActorCritic:
         actions = Actions(self.environment.action_size, self.environment.levels)

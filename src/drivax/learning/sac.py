@@ -134,7 +134,8 @@ class Sac:
             "temperature": optax.adam(config.temperature_rate),
         }
         self.optimiser = optax.partition(optimisers, Trained("policy", "critic", "temperature"))
-        policy, critic = self._networks(jax.random.key(0))
+        # Only the structures are wanted: no number is drawn.
+        policy, critic = nnx.eval_shape(lambda: self._networks(jax.random.key(0)))
         self.policy_graph, self.critic_graph = nnx.graphdef(policy), nnx.graphdef(critic)
 
     def _networks(self, key: Array) -> tuple[Policy, TwinCritic]:
