@@ -46,7 +46,7 @@ SEEN = ObservationConfig(
 )
 TASK = Task(
     observation=SEEN,
-    rewards=RewardConfig(preset="navigation", log_divergence=-0.05),
+    rewards=RewardConfig(collision=-5.0, offroad=-5.0, red_light=-5.0, progress=0.05, log_divergence=-0.1),
     metrics=("success", "accuracy"),
 )
 CLONING = Cloning(batch=128, updates=250, learning_rate=3e-3)
@@ -82,14 +82,14 @@ def algorithm(name, encoder):
     if name == "bc":
         return BcConfig(**vars(CLONING), network=network), 2
     if name == "ppo":
-        return replace(PPO, network=replace(network, first_scale=0.3)), 100
+        return replace(PPO, network=replace(network, first_scale=0.3)), 300
     if name == "sac":
-        return replace(SAC, network=replace(network, first_scale=0.3, activation="relu")), 120
+        return replace(SAC, network=replace(network, first_scale=0.3, activation="relu")), 240
     if name == "bc_ppo":
         ppo = replace(PPO, network=network, learning_rate=2e-4)
-        return BcPpoConfig(warm_start=START, ppo=ppo), 12
+        return BcPpoConfig(warm_start=START, ppo=ppo), 300
     sac = replace(SAC, network=replace(network, activation="relu"), explore="policy", warm_up=512)
-    return BcSacConfig(warm_start=START, sac=replace(sac, policy_rate=3e-4, temperature=0.005)), 42
+    return BcSacConfig(warm_start=START, sac=replace(sac, policy_rate=3e-4, temperature=0.005)), 240
 
 
 @pytest.fixture(scope="module")
