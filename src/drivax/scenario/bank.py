@@ -279,10 +279,8 @@ def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
 def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
     line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
     z, heading, exits = (_column(scenarios, f"light_{name}") for name in ("z", "heading", "exit_heading"))
-    middle, half = (
-        (line[..., :2] + line[..., 2:]) / 2,
-        np.hypot(*np.moveaxis(line[..., 2:] - line[..., :2], -1, 0)) / 2,
-    )
+    middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
+    half = np.hypot(*np.moveaxis(along, -1, 0)) / 2
     x, y = np.moveaxis(middle, -1, 0)
     right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
     arc = np.stack([_stop_arcs(scenario, at) for scenario, at in zip(scenarios, middle, strict=True)])
@@ -315,12 +313,11 @@ def _stack_maps(
 ) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
     blocks = _column(scenarios, "segment_blocks").astype(np.int64)
     edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
-    grid = scenarios[0].capacity.grid
+    capacity = scenarios[0].capacity
     grid_edge = _column(scenarios, "grid_edge").astype(np.int16)
     grid_lane = (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16)
-    capacity = scenarios[0].capacity
-    edge_run = _longest_run(grid_edge, grid) if trim else capacity.edge_run
-    lane_run = _longest_run(grid_lane, grid) if trim else capacity.lane_run
+    edge_run = _longest_run(grid_edge, capacity.grid) if trim else capacity.edge_run
+    lane_run = _longest_run(grid_lane, capacity.grid) if trim else capacity.lane_run
     edge_rows = int(edge_count.max()) if trim else capacity.segments
     lane_rows = int(lane_count.max()) if trim else capacity.segments
     # A run is read whole, so every start must leave room for one behind it.
