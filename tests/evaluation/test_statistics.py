@@ -8,7 +8,14 @@ import pytest
 import scipy.stats
 
 from drivax.errors import UsageError
-from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap, rate, wilson
+from drivax.evaluation.statistics import (
+    Interval,
+    bootstrap_mean,
+    crossed_bootstrap,
+    paired_bootstrap,
+    rate,
+    wilson,
+)
 
 
 @pytest.mark.parametrize(("successes", "n"), [(0, 1), (1, 1), (0, 12), (5, 12), (12, 12), (173, 256)])
@@ -176,3 +183,30 @@ def test_the_impossible_is_refused_in_one_line(call):
     with pytest.raises(UsageError) as caught:
         call()
     assert "\n" not in str(caught.value) and caught.value.cure
+
+
+def test_crossed_bootstrap_draws_agents_and_clusters():
+    values = np.array([[0.0, 1.0, 4.0, 2.0], [3.0, 1.0, np.nan, 7.0]])
+    clusters = ["a", "a", "b", "c"]
+    columns = [[0, 1], [2], [3]]
+    means = []
+    for agents in itertools.product(range(2), repeat=2):
+        for drawn in itertools.product(range(3), repeat=3):
+            seen = [values[agent, at] for agent in agents for cluster in drawn for at in columns[cluster]]
+            means.append(np.nanmean(seen) if not np.isnan(seen).all() else 0.0)
+    found = crossed_bootstrap(values, clusters, resamples=20_000, seed=1)
+    assert found.mean == pytest.approx(18 / 7) and found.n == 7
+    low, high = np.quantile(means, [0.025, 0.975])
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.15)
+
+
+def test_crossed_bootstrap_of_agents_that_agree_is_that_of_their_episodes():
+    row = np.random.default_rng(0).normal(size=60)
+    one, alone = crossed_bootstrap([row, row, row], seed=0), bootstrap_mean(row, seed=0)
+    assert one.mean == pytest.approx(alone.mean)
+    assert (one.low, one.high) == pytest.approx((alone.low, alone.high), abs=0.02)
+    # Agents that differ widen it, and nothing defined is nothing.
+    assert crossed_bootstrap([row - 1, row, row + 1], seed=0).low < one.low - 0.3
+    assert crossed_bootstrap([[None, None]], seed=0) == Interval(None, None, None, 0)
+    with pytest.raises(UsageError, match="different episodes"):
+        crossed_bootstrap([[1.0, 2.0], [1.0]], seed=0)

@@ -174,6 +174,59 @@ def paired_bootstrap(
     return bootstrap_mean(first - second, clusters, confidence, resamples, seed=seed)
 
 
+def crossed_bootstrap(
+    values: Any,
+    clusters: Any = None,
+    confidence: float = 0.95,
+    resamples: int = RESAMPLES,
+    *,
+    seed: int,
+) -> Interval:
+    """Percentile bootstrap interval of a mean over agents (training seeds) and episodes, both resampled.
+
+    Agents and clusters are crossed: every agent drove every scenario. Each resample draws as many of both as there are,
+    independently and with replacement, which for crossed factors is at worst too wide (Owen, Ann. Appl. Stat. 1, 2007,
+    "The pigeonhole bootstrap").
+
+    Args:
+        values: ``[agents, episodes]``; numbers or undefined.
+        clusters: Labels of the clusters, one per episode; None: every episode is its own.
+        confidence: Coverage, between 0 and 1.
+        resamples: Number of resamples.
+        seed: Seed of the random numbers.
+
+    Raises:
+        UsageError: If lengths disagree, a value is infinite, or an option is impossible.
+    """
+    _normal_quantile(confidence)
+    if resamples < 1:
+        raise UsageError(f"{resamples} resamples cannot be", cure="use 1000 or more")
+    rows = [_numbers(row) for row in values]
+    labels = np.arange(rows[0].size) if clusters is None else np.unique(clusters, return_inverse=True)[1]
+    if any(row.size != labels.size for row in rows):
+        raise UsageError("agents drove different episodes", cure="give one value per agent and episode")
+    x = np.stack(rows)
+    there = ~np.isnan(x)
+    count = int(labels.max()) + 1
+    sums = np.stack(
+        [np.bincount(labels, np.where(one, row, 0.0), count) for row, one in zip(x, there, strict=True)]
+    )
+    counts = np.stack([np.bincount(labels, one, count) for one in there])
+    if not there.any():
+        return NOTHING
+    mean, n = float(sums.sum() / counts.sum()), int(there.sum())
+    if count < 2:
+        return Interval(mean, None, None, n)
+    rng = np.random.default_rng(seed)
+    means = np.empty(resamples)
+    for number in range(resamples):
+        agents = np.bincount(rng.integers(0, len(x), len(x)), minlength=len(x))
+        drawn = np.bincount(rng.integers(0, count, count), minlength=count)
+        means[number] = (agents @ sums @ drawn) / max(float(agents @ counts @ drawn), 1.0)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(mean, float(low), float(high), n)
+
+
 def _normal_quantile(confidence: float) -> float:
     """Two-sided quantile z of the standard normal distribution."""
     if not 0 < confidence < 1:
