@@ -66,7 +66,7 @@ def help_of(command: str) -> str:
 
 
 #: Pages that take more than a few seconds.
-SLOW_PAGES = ("docs/guide/custom.md", "docs/guide/rewards.md")
+SLOW_PAGES = ("docs/guide/custom.md", "docs/guide/rewards.md", "docs/guide/traffic.md")
 PYTHON_PAGES = [
     pytest.param(page, marks=pytest.mark.slow) if str(page.relative_to(REPOSITORY)) in SLOW_PAGES else page
     for page in PAGES

@@ -43,10 +43,9 @@ ALGORITHMS = {
 }
 
 
-#: Warm starts go through both phases, and so through what the others do.
-PARAMETERS = [
-    name if name.startswith("bc_") else pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS
-]
+#: This one goes through cloning, and through SAC with its replay; PPO is resumed in ``test_learning.py``.
+FAST = "bc_sac"
+PARAMETERS = [name if name == FAST else pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS]
 SHOWN = Demonstrations({"angle": jnp.linspace(-3, 3, 50), "rate": jnp.zeros(50)}, jnp.zeros((50, 1)))
 
 
