@@ -27,6 +27,7 @@ from drivax.evaluation.statistics import crossed_bootstrap
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
+from drivax.learning.threads import widen_pool
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
@@ -39,6 +40,8 @@ REFERENCES = ("expert", "idm", "constant_velocity")
 
 def trained(args: argparse.Namespace, overrides: list[str]) -> None:
     """Trains one preset with all seeds in one program; what it took is kept beside the run."""
+    if args.seeds > 1:
+        widen_pool()
     config = settings.load(TrainConfig, args.preset, overrides)
     out = args.runs / args.preset.replace("/", "-")
     began = time.perf_counter()

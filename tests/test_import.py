@@ -25,21 +25,3 @@ def test_the_scheduler_that_hangs_is_off_unless_it_is_asked_for(given, after):
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
     )
     assert result.stdout == f"{after}\nFalse\n"
-
-
-@pytest.mark.parametrize("given", [None, "3"])
-def test_few_cores_have_a_pool_of_eight_threads_unless_another_is_asked_for(given):
-    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
-    environment |= {"NPROC": given} if given else {}
-    result = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "import os; os.cpu_count = lambda: 2; import drivax; print(os.environ['NPROC'])",
-        ],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert result.stdout == f"{given or 8}\n"

@@ -28,18 +28,15 @@ _HOMES = {
     "Task": "drivax.tasks.task",
 }
 
-#: jaxlib 0.10's CPU client runs the parts of a program on a pool of threads, one per core. Parts wait for others in it,
-#: and on two cores programs that train several agents side by side hang for ever once both threads wait. Without its
-#: scheduler for concurrency the parts run one after the other, and a pool of eight always has a thread that does not
-#: wait. XLA ends a process that gives a flag it does not know; so the version counts.
+#: jaxlib 0.10's CPU client runs the parts of a program on a pool of threads, and in programs that train several agents
+#: side by side one now and then is never woken up again (see also ``learning.threads``). Without its scheduler for
+#: concurrency the parts run one after the other. XLA ends a process that gives a flag it does not know; so the version
+#: counts.
 _XLA_FLAG, _XLA_SERIES = "--xla_cpu_enable_concurrency_optimized_scheduler", "0.10."
-_THREADS = 8
 
 
 def _avoid_the_hang() -> None:
-    """Sets the flag and the size of the pool (``NPROC``), unless the user has; before JAX's backend starts."""
-    if (os.cpu_count() or 1) < _THREADS:
-        os.environ.setdefault("NPROC", str(_THREADS))
+    """Sets the flag, unless the user has; before JAX reads it, which is when its backend starts."""
     given = os.environ.get("XLA_FLAGS", "")
     try:
         known = metadata.version("jaxlib").startswith(_XLA_SERIES)

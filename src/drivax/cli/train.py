@@ -13,6 +13,7 @@ from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
+from drivax.learning.threads import widen_pool
 from drivax.scenario.store import ScenarioSet
 
 
@@ -47,6 +48,8 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     """Train, then say where the run is."""
     if args.resume and overrides:
         raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(overrides))
+    if args.seeds > 1 or args.resume:
+        widen_pool()
     config = settings.load(TrainConfig, args.config, list(overrides))
     validation = None if args.validation is None else ScenarioSet.open(args.validation)
     folder = train(

@@ -222,9 +222,14 @@ def crossed_bootstrap(
     for number in range(resamples):
         agents = np.bincount(rng.integers(0, len(x), len(x)), minlength=len(x))
         drawn = np.bincount(rng.integers(0, count, count), minlength=count)
-        means[number] = (agents @ sums @ drawn) / max(float(agents @ counts @ drawn), 1.0)
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+        means[number] = _ratio(agents @ sums @ drawn, agents @ counts @ drawn)
+    low, high = np.nanquantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(mean, float(low), float(high), n)
+
+
+def _ratio(total: float, count: float) -> float:
+    """A mean; NaN of nothing, which a resample of sparse values may be."""
+    return total / count if count else float("nan")
 
 
 def _normal_quantile(confidence: float) -> float:

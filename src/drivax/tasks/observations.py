@@ -325,7 +325,7 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
 def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     """How many are true up to each place: within blocks of eight, all blocks at once, then over the blocks.
 
-    ``jnp.cumsum`` costs five times as much on a CPU: it adds place by place.
+    ``jnp.cumsum`` costs several times as much on a CPU: it adds place by place.
     """
     count = inside.shape[0]
     blocks = -(-count // _BLOCK)

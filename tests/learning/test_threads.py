@@ -1,0 +1,32 @@
+"""The pool of threads of a training of several agents."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+import os
+from drivax.cli import train
+from drivax.learning.threads import widen_pool
+os.cpu_count = lambda: 2
+widen_pool()
+import jax
+jax.numpy.ones(3).block_until_ready()
+names = [open(f"/proc/self/task/{task}/comm").read() for task in os.listdir("/proc/self/task")]
+print(os.environ["NPROC"], sum("XLA" in name for name in names))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads as Linux lists them")
+@pytest.mark.parametrize("given", [None, "3"])
+def test_a_pool_of_eight_threads_unless_another_is_asked_for(given):
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    environment |= {"NPROC": given} if given else {}
+    result = subprocess.run(
+        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
+    )
+    wanted, threads = map(int, result.stdout.split())
+    assert wanted == int(given or 8) and threads >= wanted
