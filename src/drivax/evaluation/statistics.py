@@ -222,7 +222,7 @@ def crossed_bootstrap(
     for number in range(resamples):
         agents = np.bincount(rng.integers(0, len(x), len(x)), minlength=len(x))
         drawn = np.bincount(rng.integers(0, count, count), minlength=count)
-        means[number] = _ratio(agents @ sums @ drawn, agents @ counts @ drawn)
+        means[number] = _ratio(float(agents @ sums @ drawn), float(agents @ counts @ drawn))
     low, high = np.nanquantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(mean, float(low), float(high), n)
 
