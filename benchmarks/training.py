@@ -35,8 +35,15 @@ from drivax.tracking.runs import versions
 
 RESULT = Path(__file__).resolve().parent / "results" / "training.json"
 SCENARIOS = 1024
-#: What is trained: the preset, and with one pass over the experience instead of its four.
-KINDS = {"ppo": (), "ppo, 1 epoch": ("--algorithm.epochs", "1")}
+_TWO = ("--algorithm.network.shared_encoder", "false")
+#: What is trained: the preset; with an encoder each for policy and value; and with twice the passes over experience.
+KINDS = {
+    "ppo": (),
+    "ppo, two encoders": _TWO,
+    "ppo, two encoders, 4 epochs of 8 minibatches": (
+        *_TWO, "--algorithm.epochs", "4", "--algorithm.minibatches", "8",
+    ),
+}  # fmt: skip
 
 
 def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], Any]]:

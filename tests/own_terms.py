@@ -68,6 +68,18 @@ nearest_other = Metric(
     of=StepValue("nearest_other", "m", _gap, frozenset()),
     operator="min",
 )
+lane_changes = Metric(
+    unit="-",
+    better="-",
+    text="lane changes",
+    of=StepValue(
+        "lane_changed",
+        "-",
+        lambda m: (m.facts.lane_changed.astype(jnp.float32), True),
+        frozenset({"lane_changed"}),
+    ),
+    operator="sum",
+)
 
 
 class _Mean(nnx.Module):

@@ -8,9 +8,14 @@ from flax import nnx
 _OPTIONS = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
+def quickly(function):
+    """The function under ``jit``, compiled that way."""
+    return jax.jit(function, compiler_options=_OPTIONS)
+
+
 def quick(function, *arguments):
     """The function's result, compiled, as NumPy arrays."""
-    return jax.device_get(jax.jit(function, compiler_options=_OPTIONS)(*arguments))
+    return jax.device_get(quickly(function)(*arguments))
 
 
 def drawn(make):

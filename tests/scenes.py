@@ -10,6 +10,7 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CAPACITIES, STEPS, AgentKind, Flag, LightState, RoadKind
+from drivax.tasks.observations import ObservationConfig
 
 LANE_M = 3.7
 
@@ -89,6 +90,8 @@ def straight_road(cars, light=None, light_x=40.0, limit=13.4, begin=-150.0, end=
     )
 
 
+#: The least that can be seen, for tests that look at no observation: tracing the default one takes over a second.
+GLIMPSE = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2)
 #: One small size for all hand-made scenes: banks of as many scenarios share one compiled program.
 SMALL = replace(
     CAPACITIES["default"],

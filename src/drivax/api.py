@@ -12,13 +12,14 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate_in
 from drivax.learning.policies import load_policy
+from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.zoo import is_policy, zoo
 from drivax.named import is_dotted
 from drivax.planners.catalogue import PLANNERS, make_planner
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.catalogue import make_traffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.types import Traffic
@@ -60,14 +61,15 @@ def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> 
 
     Args:
         task: Action space, observation, reward and ends.
-        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, or a traffic. All but ``log`` may need
-            their bank prepared: ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
+        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
+            ``zoo:NAME``), or a traffic. All but ``log`` may need their bank prepared:
+            ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
     """
     return Simulator(task or Task(), _traffic(traffic))
 
 
 def _traffic(given: str | Traffic) -> Traffic:
-    return make_traffic(given) if isinstance(given, str) else given
+    return find_traffic(given) if isinstance(given, str) else given
 
 
 def evaluate(
@@ -77,10 +79,10 @@ def evaluate(
     """Drives every scenario to the end of its log and measures it; writes nothing.
 
     Args:
-        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), or a planner.
+        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner.
         data: Folder of a scenario set, or what :func:`load` returned.
         task: Action space and observation of a planner of your own.
-        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, or a traffic.
+        traffic: As of :func:`make_simulator`; it is prepared here.
         start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
         options: ``start_step``, ``seed``, ``progress`` of ``evaluation.runner.evaluate``.
     """
@@ -94,19 +96,17 @@ def evaluate(
 
 
 def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
-    """The planner of a name or run folder, and the task that it was made for.
+    """The planner of a name, run folder or policy of the zoo, and the task that it was made for.
 
     Raises:
-        UsageError: If there is neither such a planner nor such a folder.
+        UsageError: If there is no such planner, folder or policy.
     """
-    if name in PLANNERS or (is_dotted(name) and not Path(name).is_dir()):
+    if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
         return make_planner(name), Task()
     folder, _, step = name.partition("@")
-    if not Path(folder).is_dir():
-        raise UsageError(
-            f"there is no planner {name!r}",
-            cure=f"use {', '.join(PLANNERS)}, package.module:name, or the folder of a training run",
-        )
+    if not is_policy(folder):
+        kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
+        raise UsageError(f"there is no planner {name!r}", cure=f"use {', '.join(kinds)}")
     if step and not step.isdecimal():
         raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")
     return load_policy(folder, bank, step=int(step) if step else None, samples=sample)

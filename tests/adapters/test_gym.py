@@ -20,11 +20,12 @@ from drivax.evaluation.rollout import judging
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.assemble import assemble
 from drivax.scenario.store import ScenarioWriter
-from drivax.tasks.observations import PRESETS, SPEED_MPS, ObservationConfig
+from drivax.tasks.observations import SPEED_MPS, ObservationConfig
 from drivax.tasks.task import Task
 from scenes import car, straight_road
 
-SMALL = Task(observation=PRESETS["minimal"])
+#: Every group, a few rows of each, and what training measures: all environments here share its programs.
+SMALL = Task(observation=ObservationConfig(agents=4, steps=2, road=8, lights=1, route=3), metrics="training")
 STILL = np.zeros(2, np.float32)
 
 
@@ -68,11 +69,13 @@ def test_ids(name):
 
 def test_environments_by_id(data):
     """On scenarios of the built-in world where none are given; Gymnasium's own wrappers check every call."""
-    env = gymnasium.make("drivax/minimal-v0", data=data)
-    assert env.unwrapped.observation_space == DrivingEnv(data, SMALL).observation_space
+    made = gymnasium.make("drivax/minimal-v0", data=data).unwrapped
+    assert made.observation_space == DrivingEnv(data, TASKS["minimal"]).observation_space
+    env = gymnasium.make("drivax/minimal-v0", data=data, task=SMALL)
     env.reset(seed=1)
     env.step(env.action_space.sample())
-    assert gymnasium.make("drivax/minimal-v0", data=2).reset(seed=0)[1]["scenario_id"].startswith("w")
+    built_in = gymnasium.make("drivax/minimal-v0", data=2, task=SMALL)
+    assert built_in.reset(seed=0)[1]["scenario_id"].startswith("w")
     vector = gymnasium.make_vec("drivax/minimal-v0", num_envs=2, data=data)
     assert isinstance(vector, VectorDrivingEnv) and vector.num_envs == 2
 
@@ -286,10 +289,10 @@ def test_pictures(data):
     assert DrivingEnv(data, SMALL).render() is None
     with pytest.raises(UsageError, match="the only one is 'rgb_array'"):
         DrivingEnv(data, SMALL, render_mode="human")
-    vector = VectorDrivingEnv(2, data, SMALL, render_mode="rgb_array")
-    vector.reset(options={"scenarios": [0, 0]})
-    brake = np.array([[0.0, 0.0], [-1.0, 0.0]], np.float32)
+    vector = VectorDrivingEnv(3, data, SMALL, render_mode="rgb_array")
+    vector.reset(options={"scenarios": [0, 0, 0]})
+    brake = np.array([[0.0, 0.0], [-1.0, 0.0], [0.0, 0.0]], np.float32)
     for _ in range(2):
         vector.step(brake)
-    for picture, wanted in zip(vector.render(), pictures, strict=True):
+    for picture, wanted in zip(vector.render(), [first, second, first], strict=True):
         np.testing.assert_array_equal(picture, wanted)

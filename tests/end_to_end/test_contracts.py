@@ -10,6 +10,7 @@ import pytest
 from drivax.cli import main
 from drivax.evaluation.results import KEYS
 from drivax.metrics.catalogue import METRICS
+from drivax.scenario.store import ScenarioSet
 from drivax.studies import bench
 from drivax.synthetic.generate import Generation, generate
 
@@ -66,14 +67,16 @@ BENCH = {
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("contracts") / "set"
-    generate(path, 5, 21, Generation(workers=1))
+    generate(path, 6, 21, Generation(workers=1))
     return path
 
 
 @pytest.fixture(scope="module")
 def evaluation(data):
+    """Five of the six scenarios are driven."""
     out = data.parent / "constant"
-    assert main(["evaluate", "--planner", "constant_velocity", "--data", str(data), "--out", str(out)]) == 0
+    call = ["evaluate", "--planner", "constant_velocity", "--data", str(data), "--out", str(out)]
+    assert main([*call, "--limit", "5"]) == 0
     return out
 
 
@@ -81,7 +84,8 @@ def test_episodes(evaluation, data):
     with (evaluation / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [*KEYS, *METRICS]
-    assert len(rows) == 5 and len({row["scenario_id"] for row in rows}) == 5
+    assert len(ScenarioSet.open(data)) == 6 and len(rows) == 5
+    assert [row["scenario_id"] for row in rows] == [one.id for one in ScenarioSet.open(data)][:5]
     assert {(row["planner"], row["traffic"], row["dataset"]) for row in rows} == {
         ("constant_velocity", "log", "drivax")
     }
@@ -123,11 +127,27 @@ def test_inspect(data, capsys):
     assert main(["inspect", str(data), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     jsonschema.validate(found, INSPECT)
-    assert len(found["scenarios"]) == 5
+    assert len(found["scenarios"]) == 6
 
 
-def test_bench(data, capsys):
-    assert main(["bench", "--data", str(data), "--batch", "4", "--repeats", "1", "--json"]) == 0
+#: A task and parts that compile three times as fast as what is timed by default.
+LEAN = ["--task.metrics", "none", "--task.observation.road", "0", "--task.observation.steps", "1"]
+QUICK = ("dynamics", "agents", "contacts", "ttc", "edges", "lanes", "route", "metrics")
+
+
+def test_bench(data, capsys, monkeypatch):
+    parts = bench._parts
+    monkeypatch.setattr(bench, "_parts", lambda of: {name: parts(of)[name] for name in QUICK})
+    check_bench(data, capsys, LEAN)
+
+
+@pytest.mark.slow
+def test_bench_of_the_default_task_and_all_parts(data, capsys):
+    check_bench(data, capsys, [])
+
+
+def check_bench(data, capsys, task):
+    assert main(["bench", "--data", str(data), "--batch", "4", "--repeats", "1", "--json", *task]) == 0
     jsonschema.validate(json.loads(capsys.readouterr().out), BENCH)
 
 
@@ -149,23 +169,6 @@ def test_report(evaluation, data):
     assert main(["report", str(evaluation), "--out", str(out)]) == 0
     page = out.read_text()
     assert "constant_velocity" in page and "<script>" in page
-
-
-def test_limit_drives_only_the_first_scenarios(data):
-    out = data.parent / "two"
-    call = [
-        "evaluate",
-        "--planner",
-        "constant_velocity",
-        "--data",
-        str(data),
-        "--out",
-        str(out),
-        "--limit",
-        "2",
-    ]
-    assert main(call) == 0
-    assert len((out / "episodes.csv").read_text().splitlines()) == 3
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,10 @@ from drivax.evaluation.statistics import (
     Interval,
     bootstrap_mean,
     crossed_bootstrap,
+    interquartile_mean,
     paired_bootstrap,
     rate,
+    split_bootstrap,
     wilson,
 )
 
@@ -210,3 +212,101 @@ def test_crossed_bootstrap_of_agents_that_agree_is_that_of_their_episodes():
     assert crossed_bootstrap([[None, None]], seed=0) == Interval(None, None, None, 0)
     with pytest.raises(UsageError, match="different episodes"):
         crossed_bootstrap([[1.0, 2.0], [1.0]], seed=0)
+
+
+def test_stratified_bootstrap_is_the_exact_distribution():
+    """Two strata of three and two clusters: two draws weighed by 3/2, and one draw weighed by 2."""
+    values, strata = [0.0, 1.0, 5.0, 10.0, 14.0], ["x", "x", "x", "y", "y"]
+    means = [
+        (1.5 * (a + b) + 2 * c) / 5
+        for a in (0.0, 1.0, 5.0) for b in (0.0, 1.0, 5.0) for c in (10.0, 14.0)
+    ]  # fmt: skip
+    found = bootstrap_mean(values, strata=strata, confidence=0.8, resamples=40_000, seed=2)
+    assert found.mean == pytest.approx(6.0) and found.n == 5
+    assert found.low == pytest.approx(np.quantile(means, 0.1, method="inverted_cdf"))
+    assert found.high == pytest.approx(np.quantile(means, 0.9, method="inverted_cdf"))
+
+
+def test_stratified_bootstrap_has_the_variance_of_stratified_sampling():
+    """``sum_h (C_h / C)^2 s_h^2 / C_h`` with unbiased ``s_h``, however small the strata (ten of three)."""
+    rng = np.random.default_rng(0)
+    strata = np.repeat(np.arange(10), 3)
+    values = rng.normal(10.0 * strata, 1.0)
+    spread = np.array([values[strata == h].var(ddof=1) for h in range(10)])
+    expected = math.sqrt((0.1**2 * spread / 3).sum())
+    one_sigma = math.erf(1 / math.sqrt(2))
+    found = bootstrap_mean(values, strata=strata, confidence=one_sigma, resamples=20_000, seed=0)
+    assert (found.high - found.low) / 2 == pytest.approx(expected, rel=0.03)
+    without = bootstrap_mean(values, confidence=one_sigma, seed=0)
+    assert without.high - without.low > 10 * (found.high - found.low), (
+        "between strata nothing is left to chance"
+    )
+
+
+def test_strata_take_clusters_along_and_undefined_values_out():
+    values, clusters, strata = [1.0, 2.0, 3.0, None, 5.0], list("aabbc"), list("xxyyy")
+    found = bootstrap_mean(values, clusters, strata=strata, seed=0)
+    assert found.n == 4 and found.mean == pytest.approx(2.75)
+    with pytest.raises(UsageError, match="lies in two strata"):
+        bootstrap_mean([1.0, 2.0], ["a", "a"], strata=["x", "y"], seed=0)
+
+
+def test_split_bootstrap_draws_each_arm_by_itself():
+    values, first = np.array([0.0, 3.0, 1.0, 5.0, 6.0]), np.array([True, False, True, False, False])
+    means = [
+        (a + b) / 2 - sum(c) / 3
+        for a in (0, 1) for b in (0, 1) for c in itertools.product((3, 5, 6), repeat=3)
+    ]  # fmt: skip
+    found = split_bootstrap(values, first, confidence=0.9, resamples=40_000, seed=0)
+    assert found.mean == pytest.approx(0.5 - 14 / 3) and found.n == 5
+    assert found.low == pytest.approx(np.quantile(means, 0.05, method="inverted_cdf"))
+    assert found.high == pytest.approx(np.quantile(means, 0.95, method="inverted_cdf"))
+    assert split_bootstrap(values, np.zeros(5, bool), seed=0) == Interval(None, None, None, 0)
+    assert split_bootstrap(values, first, ["a", "b", "a", "c", "d"], seed=0).low is None, (
+        "one cluster in an arm"
+    )
+    strata = np.array([0, 1, 0, 1, 1])
+    assert split_bootstrap(values, first, strata=strata, seed=0).mean == found.mean
+
+
+@pytest.mark.parametrize("n", [4, 8, 12, 40])
+def test_interquartile_mean_is_scipys_where_quarters_are_whole(n):
+    values = np.random.default_rng(n).normal(size=n)
+    assert interquartile_mean(values) == pytest.approx(scipy.stats.trim_mean(values, 0.25))
+
+
+def test_interquartile_mean_by_hand():
+    # Of three the outer ones count (1/3 - 1/4) / (1/2) = 1/6 each, the middle one 2/3.
+    assert interquartile_mean([9.0, 0.0, 3.0]) == pytest.approx(9 / 6 + 3 * 2 / 3)
+    assert interquartile_mean([1.0, None, 2.0]) == pytest.approx(1.5)
+    assert interquartile_mean([7.0]) == pytest.approx(7.0) and interquartile_mean([None]) is None
+
+
+def test_crossed_bootstrap_of_interquartile_means_is_the_exact_distribution():
+    values = np.array([[0.0, 2.0], [1.0, 5.0], [8.0, 9.0]])
+    found = crossed_bootstrap(values, confidence=0.8, resamples=20_000, across="interquartile_mean", seed=0)
+    assert found.mean == pytest.approx(interquartile_mean(values.mean(axis=1))) and found.n == 6
+    means = [
+        interquartile_mean([values[a, list(drawn)].mean() for a in agents])
+        for agents in itertools.product(range(3), repeat=3) for drawn in itertools.product(range(2), repeat=2)
+    ]  # fmt: skip
+    assert found.low == pytest.approx(np.quantile(means, 0.1), abs=0.06)
+    assert found.high == pytest.approx(np.quantile(means, 0.9), abs=0.06)
+
+
+def test_crossed_bootstrap_against_others_draws_their_agents_too():
+    values, others = np.array([[0.0, 2.0], [3.0, 5.0]]), np.array([[1.0, 1.0], [0.0, 4.0], [2.0, 6.0]])
+    differences = [
+        values[list(a)][:, list(drawn)].mean() - others[list(b)][:, list(drawn)].mean()
+        for a in itertools.product(range(2), repeat=2) for b in itertools.product(range(3), repeat=3)
+        for drawn in itertools.product(range(2), repeat=2)
+    ]  # fmt: skip
+    found = crossed_bootstrap(values, against=others, confidence=0.8, resamples=20_000, seed=0)
+    assert found.mean == pytest.approx(2.5 - 14 / 6) and found.n == 4
+    assert found.low == pytest.approx(np.quantile(differences, 0.1), abs=0.1)
+    assert found.high == pytest.approx(np.quantile(differences, 0.9), abs=0.1)
+    # One agent on each side: a paired bootstrap.
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(1, 1, 80), rng.normal(0, 1, 80)
+    one, pairs = crossed_bootstrap([a], against=[b], seed=0), paired_bootstrap(a, b, seed=0)
+    assert (one.mean, one.low, one.high) == pytest.approx((pairs.mean, pairs.low, pairs.high), abs=0.02)

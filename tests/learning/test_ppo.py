@@ -71,6 +71,7 @@ def test_heads(network):
 
 
 MESH = """
+import sys
 import jax, numpy as np
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
@@ -95,10 +96,13 @@ def same(one, other):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5), one, other)
 
 one, whole, size = run((3,), 1)
-for devices in (2, None):
+for devices in (2,) if sys.argv[1] == "two" else (2, None):
     several, shard, part = run((3,), devices)
     same(one, several)
     assert shard == (8 // (devices or 4), 3) and part == size // (devices or 4), (shard, part, size)
+if sys.argv[1] == "two":
+    print("same")
+    sys.exit()
 # Two agents on two devices, one each: the first learns what it learns alone, the second something else.
 pair, shard, _ = run((3, 4), 2)
 first, second = (jax.tree.map(lambda leaf: leaf[number], pair) for number in (0, 1))
@@ -116,14 +120,15 @@ print("same")
 """
 
 
-def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(repository, monkeypatch):
+@pytest.mark.parametrize("extent", ["two", pytest.param("four_and_seeds", marks=pytest.mark.slow)])
+def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(extent, repository, monkeypatch):
     monkeypatch.setenv(
         "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_force_host_platform_device_count=4"
     )
     monkeypatch.setenv(
         "PYTHONPATH", f"{repository / 'src'}:{repository / 'tests'}:{repository / 'tests/learning'}"
     )
-    result = subprocess.run([sys.executable, "-c", MESH], capture_output=True, text=True, check=False)
+    result = subprocess.run([sys.executable, "-c", MESH, extent], capture_output=True, text=True, check=False)
     assert result.stdout == "same\n", result.stderr
 
 

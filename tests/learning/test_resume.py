@@ -32,7 +32,7 @@ SAC = SacConfig(
     warm_up=16,
 )
 PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
-START = WarmStart(iterations=2, cloning=Cloning(batch=8, updates=2), weight=0.5, half_life=2)
+START = WarmStart(iterations=2, cloning=Cloning(batch=8, updates=2), settle=2, weight=0.5, half_life=2)
 ALGORITHMS = {
     "bc": BcConfig(batch=8, updates=2, network=TINY),
     "sac": SAC,
@@ -43,7 +43,7 @@ ALGORITHMS = {
 }
 
 
-#: This one goes through cloning, and through SAC with its replay; PPO is resumed in ``test_learning.py``.
+#: This one goes through cloning, and through SAC with its replay.
 FAST = "bc_sac"
 PARAMETERS = [name if name == FAST else pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS]
 SHOWN = Demonstrations({"angle": jnp.linspace(-3, 3, 50), "rate": jnp.zeros(50)}, jnp.zeros((50, 1)))
@@ -94,6 +94,17 @@ def test_a_warm_start_clones_and_then_learns(run):
     for row in rows[2:]:
         assert {"reward/swing", "loss/policy", "loss/imitation"} <= set(row)
     assert (int(learned.iteration), int(learned.learner.iteration)) == (6, 4)
+    # The policy stays the clone while values settle, and then no more; the values move at once.
+    policies = [
+        jax.tree.leaves(state.parameters["policy"] if name == "bc_ppo" else state.parameters)
+        for state in map(jax.device_get, (states[2], states[4], states[6]))
+    ]
+    assert all(map(same, policies[0], policies[1])) and not all(map(same, policies[1], policies[2]))
+    values = [
+        jax.tree.leaves(state.parameters["value"] if name == "bc_ppo" else state.learner.critic)
+        for state in map(jax.device_get, (states[2], states[4]))
+    ]
+    assert not all(map(same, *values))
     moved = jax.tree.leaves(begun.learner.environments), jax.tree.leaves(learned.learner.environments)
     assert not all(map(same, *moved))
 

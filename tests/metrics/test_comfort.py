@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.metrics.comfort import TAIL, WINDOW, judge_comfort, judge_trip, tail_operator
+from drivax.metrics.comfort import TAIL, WINDOW, filter_operator, judge_comfort, judge_trip, tail_operator
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2)])
@@ -18,6 +18,9 @@ def test_tail_operator_is_scipys_filter(window, order, derivative):
         cut = savgol_filter(signal[:end], window, order, deriv=derivative)
         np.testing.assert_allclose(tail, cut[-TAIL:], atol=1e-9)
         np.testing.assert_allclose(tail[0], whole[end - TAIL], atol=1e-9)
+    operator = filter_operator(41, window, order, derivative)
+    whole = savgol_filter(signal[:41], window, order, deriv=derivative)
+    np.testing.assert_allclose(operator @ signal[:41], whole, atol=1e-9)
 
 
 def histories(speed, heading):

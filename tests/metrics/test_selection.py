@@ -92,6 +92,7 @@ def test_a_list_names_sets_and_metrics_and_brings_what_they_need():
     assert selected(("min_ttc",)).reads == {"ttc_s", "ttc_defined"}
     assert selected("none").reads == frozenset() and selected("full").reads == FACTS
     assert list(catalogue(("min_ttc", "ade"))) == ["min_ttc", "ade"]
+    assert selected(("full", "own_terms:lane_changes")).reads == FACTS | {"lane_changed"}
 
 
 def test_misspelt_names_get_one_line():

@@ -25,6 +25,9 @@ def observation(rng):
         "agents": jnp.asarray(rng.normal(size=(4, 2, 3)), jnp.float32),
         "agents_mask": jnp.asarray(mask),
         "ego": jnp.asarray(rng.normal(size=(2, 6)), jnp.float32),
+        # Without a row: as if it were not there.
+        "lights": jnp.zeros((0, 7)),
+        "lights_mask": jnp.zeros(0, bool),
     }
 
 

@@ -1,5 +1,7 @@
 """Planners: what each promises, on scenes whose answer is known."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,17 +25,25 @@ from scenes import RED, bank_of, car, straight_road
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)))
+    seen = ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2)
+    return Simulator(Task(observation=seen, metrics="none"))
 
 
-def act(planner, simulator, bank, slot=0):
-    def one(bank):
-        state = simulator.reset(bank, 0, 10, slot)
-        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.scene)
-        key = jax.random.key(0)
-        return planner.act(planner.init(bank, state, key), bank, state, situation, seen, key)[0]
+@partial(jax.jit, static_argnums=0)
+def first_moment(simulator, bank):
+    """What every planner is given at step 10."""
+    state = simulator.reset(bank, 0, 10, 0)
+    return state, simulator.situation(bank, state), simulator.observe(bank, state.scene)
 
-    return np.asarray(jax.jit(one)(bank))
+
+@jax.jit
+def first_action(planner, bank, state, situation, seen):
+    key = jax.random.key(0)
+    return planner.act(planner.init(bank, state, key), bank, state, situation, seen, key)[0]
+
+
+def act(planner, simulator, bank):
+    return np.asarray(first_action(planner, bank, *first_moment(simulator, bank)))
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
@@ -95,15 +105,14 @@ def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
     policy = Policy(NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,)), spec, nnx.Rngs(3))
     graph, weights = nnx.split(policy)
     mode, sample = (act(NetworkPlanner(weights, graph, samples=s), simulator, bank) for s in (False, True))
-    seen = jax.jit(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)))(bank)
+    _, _, seen = first_moment(simulator, bank)
     np.testing.assert_allclose(mode, policy(seen).mode(), rtol=1e-4, atol=1e-6)
     assert np.abs(sample - mode).max() > 1e-3 and (jnp.abs(sample) < 1).all()
 
 
 def test_random_actions_fill_the_action_space_evenly_and_follow_the_key(simulator):
     planner, bank = RandomActions(), bank_of(straight_road([car(0, 0, 0, 9)]))
-    state = jax.jit(simulator.reset)(bank, 0, 10, 0)
-    situation = jax.jit(simulator.situation)(bank, state)
+    state, situation, _ = first_moment(simulator, bank)
     keys = jax.random.split(jax.random.key(3), 4000)
     actions = np.asarray(jax.vmap(lambda key: planner.act((), bank, state, situation, None, key)[0])(keys))
     # Uniform over [-1, 1): mean 0, variance 1/3, axes independent.

@@ -18,11 +18,10 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
-from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from scenes import RED, SMALL, bank_of, car, moved, straight_road
+from scenes import GLIMPSE, RED, SMALL, bank_of, car, moved, straight_road
 
-TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2))
+TASK = Task(observation=GLIMPSE, metrics="none")
 SIMULATOR = Simulator(TASK)
 PERSON = partial(car, length=0.6, width=0.6, kind=AgentKind.PEDESTRIAN)
 

@@ -42,7 +42,8 @@ def corners_of(xy, heading):
     return (xy[:, None] + local @ turn).astype(np.float32)
 
 
-def look(bank, index, xy, heading):
+@jax.jit
+def _look(bank, index, xy, heading, corners):
     def one(p, h, points):
         direction = jnp.stack([jnp.cos(h), jnp.sin(h)])
         z = jnp.zeros(())
@@ -51,7 +52,15 @@ def look(bank, index, xy, heading):
         off = offroad_distance(bank, index, p, points, lanes.points_near, z)
         return lanes, jnp.where(known, distance, 0.0), known, off
 
-    return jax.jit(jax.vmap(one))(xy, heading, jnp.asarray(corners_of(np.asarray(xy), np.asarray(heading))))
+    return jax.vmap(one)(xy, heading, corners)
+
+
+def look(bank, index, xy, heading):
+    return _look(bank, index, xy, heading, jnp.asarray(corners_of(np.asarray(xy), np.asarray(heading))))
+
+
+lanes_at, edges_at, course_at = jax.jit(around_lanes), jax.jit(left_of_edges), jax.jit(lane_course)
+crossing = jax.jit(light_crossing)
 
 
 def test_grid_equals_brute_force(scenarios):
@@ -105,9 +114,8 @@ def test_side_of_a_sharp_vertex():
     bank = bank_of(replace(recording, features=(*recording.features, wedge)))
     tips = jnp.array([[31.0, 30.5], [31.0, 29.8], [28.0, 30.3], [22.0, 31.0], [19.0, 31.0], [25.0, 29.0]])
     expected = [False, False, True, True, False, False]
-    side = jax.jit(lambda tip: left_of_edges(bank, jnp.asarray(0), tip, tip[None], jnp.zeros(())))
     for tip, inside in zip(tips, expected, strict=True):
-        distance, known = side(tip)
+        distance, known = edges_at(bank, jnp.asarray(0), tip, tip[None], jnp.zeros(()))
         assert bool(known[0])
         assert bool(distance[0] > 0) == inside, tip
 
@@ -115,9 +123,9 @@ def test_side_of_a_sharp_vertex():
 def test_another_level_is_ignored():
     bank = bank_of(straight_road([car(0, 0, 0, 5)]))
     point = jnp.array([[0.0, -3.0]])
-    below, known = left_of_edges(bank, jnp.asarray(0), point[0], point, jnp.asarray(0.0))
+    below, known = edges_at(bank, jnp.asarray(0), point[0], point, jnp.asarray(0.0))
     assert bool(known[0]) and float(below[0]) == pytest.approx(-1.15, abs=1e-3)
-    assert not bool(left_of_edges(bank, jnp.asarray(0), point[0], point, jnp.asarray(5.0))[1][0])
+    assert not bool(edges_at(bank, jnp.asarray(0), point[0], point, jnp.asarray(5.0))[1][0])
 
 
 def test_lanes_of_a_two_lane_road():
@@ -126,7 +134,7 @@ def test_lanes_of_a_two_lane_road():
     def at(x, y, heading):
         xy = jnp.array([x, y], jnp.float32)
         box = jnp.asarray(corners_of(np.array([[x, y]]), np.array([heading]))[0])
-        return around_lanes(
+        return lanes_at(
             bank, jnp.asarray(0), xy, jnp.array([np.cos(heading), np.sin(heading)]), box, jnp.zeros(())
         )
 
@@ -150,7 +158,7 @@ def test_a_car_follows_the_lane_that_fits_place_and_heading():
 
     def follow(y, heading):
         direction = jnp.array([np.cos(heading), np.sin(heading)], jnp.float32)
-        return lane_course(bank, jnp.asarray(0), jnp.array([10.0, y], jnp.float32), direction, jnp.zeros(()))
+        return course_at(bank, jnp.asarray(0), jnp.array([10.0, y], jnp.float32), direction, jnp.zeros(()))
 
     for y, centre in ((0.4, 0.0), (-1.2, 0.0), (2.5, 3.7), (4.2, 3.7)):
         direction, offset, there = follow(y, 0.3)
@@ -176,9 +184,9 @@ def test_route_projection_and_lookahead():
 def test_stop_line_is_finite():
     bank = bank_of(straight_road([car(0, 0, 0, 5)], light=4))
     z = jnp.zeros(())
-    through, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]), z)
-    beside, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 3.0]), jnp.array([41.0, 3.0]), z)
-    back, before = light_crossing(bank, jnp.asarray(0), jnp.array([41.0, 0.5]), jnp.array([39.0, 0.5]), z)
-    above, _ = light_crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]), z + 8.0)
+    through, _ = crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]), z)
+    beside, _ = crossing(bank, jnp.asarray(0), jnp.array([39.0, 3.0]), jnp.array([41.0, 3.0]), z)
+    back, before = crossing(bank, jnp.asarray(0), jnp.array([41.0, 0.5]), jnp.array([39.0, 0.5]), z)
+    above, _ = crossing(bank, jnp.asarray(0), jnp.array([39.0, 0.5]), jnp.array([41.0, 0.5]), z + 8.0)
     assert bool(through[0]) and not bool(beside[0]) and not bool(back[0]) and not bool(above[0])
     assert float(before[0]) == pytest.approx(1.0, abs=1e-3)

@@ -18,6 +18,7 @@ from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 from drivax.testing.worlds import padded
+from scenes import GLIMPSE
 
 BATCH = 4096
 
@@ -46,12 +47,17 @@ def operations(bank, simulator=None):
     return traced.cost_analysis()["flops"] / BATCH
 
 
-def test_a_step_costs_the_same_on_a_map_of_twice_the_segments(bank):
-    assert operations(with_segments(bank, 4096)) == pytest.approx(operations(bank), rel=1e-3)
+@pytest.fixture(scope="module")
+def plain(bank):
+    return operations(bank)
 
 
-def test_a_step_costs_at_most_in_proportion_to_agents(bank):
-    few, many = operations(bank), operations(padded(bank, bank.agents.shape[2]))
+def test_a_step_costs_the_same_on_a_map_of_twice_the_segments(bank, plain):
+    assert operations(with_segments(bank, 4096)) == pytest.approx(plain, rel=1e-3)
+
+
+def test_a_step_costs_at_most_in_proportion_to_agents(bank, plain):
+    few, many = plain, operations(padded(bank, bank.agents.shape[2]))
     assert few < many < 1.5 * few
 
 
@@ -61,8 +67,8 @@ def test_the_count_would_see_pairs_of_agents(bank):
             xy = bank.agents[scene.index, scene.step, :, :2]
             return {"apart": jnp.sum((xy[:, None] - xy) ** 2)}
 
-    few = operations(bank, Pairs(Task()))
-    many = operations(padded(bank, bank.agents.shape[2]), Pairs(Task()))
+    few = operations(bank, Pairs(Task(metrics="none")))
+    many = operations(padded(bank, bank.agents.shape[2]), Pairs(Task(metrics="none")))
     assert many - few > 3 * 64 * 64 * 2  # differences and squares of pairs, four times as many
 
 
@@ -80,18 +86,34 @@ def test_what_is_measured_on_request_costs_nothing_where_nobody_asks(bank, monke
 
     noted("lane_passage")
     noted("nearest_gap")
-    plain = operations(bank, Simulator(Task(rewards=RewardConfig(preset="published"))))
+    less = operations(bank, Simulator(Task(observation=GLIMPSE, rewards=RewardConfig(preset="published"))))
     assert asked == set()
     rewards = RewardConfig(preset="published", lane_change=0.2, close=-0.1)
-    assert operations(bank, Simulator(Task(rewards=rewards))) > plain
+    assert operations(bank, Simulator(Task(observation=GLIMPSE, rewards=rewards))) > less
     assert asked == {"lane_passage", "nearest_gap"}
 
 
 @pytest.mark.parametrize(("traffic", "most"), [("log", 4096), ("idm", 16384)])
 def test_states_are_small(bank, traffic, most):
     chosen = make_traffic(traffic)
-    state = jax.eval_shape(Simulator(Task(), chosen).reset, prepared(chosen, bank), jnp.zeros((), jnp.int32))
+    state = jax.eval_shape(
+        Simulator(Task(observation=GLIMPSE), chosen).reset, prepared(chosen, bank), jnp.zeros((), jnp.int32)
+    )
     assert sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) <= most
+
+
+@pytest.mark.parametrize("traffic", ["log", "idm"])
+def test_a_state_has_the_same_types_after_a_reset_and_after_a_step(bank, traffic):
+    """Else whoever steps compiles twice, and every loop over steps is traced twice."""
+    model = make_traffic(traffic)
+    simulator, bank = Simulator(Task(observation=GLIMPSE), model), prepared(model, bank)
+
+    def types(state):
+        return [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(state)]
+
+    state = jax.eval_shape(simulator.reset, bank, jnp.zeros((), jnp.int32))
+    after = jax.eval_shape(lambda bank, s: simulator.step(bank, s, jnp.zeros(2))[0], bank, state)
+    assert types(after) == types(state)
 
 
 @pytest.mark.slow
@@ -115,7 +137,7 @@ def test_one_configuration_is_compiled_once(traffic):
 def test_parts_are_timed_on_states_as_they_are(part):
     # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
-    simulator, config = Simulator(Task()), BenchConfig(batch=2, steps=3)
+    simulator, config = Simulator(Task(observation=GLIMPSE)), BenchConfig(batch=2, steps=3)
     states = jax.jit(jax.vmap(simulator.reset, (None, 0)))(bank, jnp.zeros(2, jnp.int32))
     shift = _rounds(config, _parts(simulator)[part])(bank, states)
     assert (jnp.abs(shift) < 1e-9).all()

@@ -15,12 +15,12 @@ from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
-from scenes import bank_of, car, line, straight_road
+from scenes import GLIMPSE, bank_of, car, line, straight_road
 
 METRICS = (
     "collision", "offroad", "lane_straddle", "min_ttc", "speeding_max", "wrong_way", "off_route", "distance",
 )  # fmt: skip
-SIMULATOR = Simulator(Task(metrics=METRICS, to_the_end=True))
+SIMULATOR = Simulator(Task(observation=GLIMPSE, metrics=METRICS, to_the_end=True))
 DECK_X, CAR_M = 40.0, 0.75
 
 

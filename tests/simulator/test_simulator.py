@@ -14,22 +14,36 @@ from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
-from scenes import RED, bank_of, car, moved, straight_road
+from scenes import GLIMPSE, RED, bank_of, car, moved, straight_road
 
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(judging(Task()))
+    return Simulator(judging(Task(observation=GLIMPSE)))
+
+
+def measuring(*metrics):
+    """A simulator of tests that need a few metrics: a program of half the size."""
+    return Simulator(Task(observation=GLIMPSE, metrics=metrics, to_the_end=True))
 
 
 @pytest.fixture(scope="module")
 def world():
-    return ScenarioBank.from_scenarios([assemble(generate_recording(7, i)) for i in range(6)])
+    """The scenarios of ``tests/evaluation/test_audit.py``, which drives the expert in the same compiled program."""
+    return ScenarioBank.from_scenarios([assemble(generate_recording(9, i)) for i in range(6)])
 
 
-def episodes(simulator, planner, bank, **options):
+@pytest.fixture(scope="module")
+def single():
+    """A simulator whose episodes may end, and its compiled reset and step of one environment."""
+    simulator = Simulator(Task(observation=GLIMPSE))
+    return simulator, jax.jit(simulator.reset), jax.jit(simulator.step)
+
+
+def episodes(simulator, planner, bank, slot=0):
     keys = jax.random.split(jax.random.key(0), len(bank))
-    return drive(simulator, planner, bank, jnp.arange(len(bank)), keys, **options)
+    # Which agent is driven is told each time, so that one program serves all of them.
+    return drive(simulator, planner, bank, jnp.arange(len(bank)), keys, slot=slot)
 
 
 def metric(result, name):
@@ -38,15 +52,16 @@ def metric(result, name):
 
 
 def test_the_exact_expert_is_clean_and_never_diverges(simulator, world):
-    result = episodes(simulator, Expert(), world)
+    keys = jax.random.split(jax.random.key(0), len(world))
+    result = drive(simulator, Expert(), world, jnp.arange(len(world)), keys)
     for name, expected in (("accuracy", 1.0), ("success", 1.0), ("collision", 0.0), ("offroad", 0.0)):
         np.testing.assert_array_equal(metric(result, name), expected)
     np.testing.assert_allclose(metric(result, "fde"), 0.0, atol=1e-5)
     np.testing.assert_allclose(metric(result, "progress_ratio"), 1.0, atol=1e-3)
 
 
-def test_the_driven_expert_follows_the_log(simulator, world):
-    assert metric(episodes(simulator, Expert(replays=False), world), "fde").max() < 0.2
+def test_the_driven_expert_follows_the_log(world):
+    assert metric(episodes(measuring("fde"), Expert(replays=False), world), "fde").max() < 0.2
 
 
 def test_a_state_is_small(simulator, world):
@@ -154,22 +169,24 @@ def test_order_and_padding_of_agents_change_nothing(simulator):
             )
 
 
-def test_step_or_begin_is_step_or_reset(world):
-    simulator = Simulator(Task())
-    reset, step, either = (jax.jit(f) for f in (simulator.reset, simulator.step, simulator.step_or_begin))
-    state, another = reset(world, 1), jax.jit(simulator.beginning)(world, 3)
+def test_step_or_begin_is_step_or_reset(single, world):
+    simulator, reset, step = single
+    either = jax.jit(simulator.step_or_begin)
+    rows = jnp.arange(4)
+    state, another = reset(world, rows[1]), jax.jit(simulator.beginning)(world, rows[3])
     action = jnp.array([0.2, 0.05])
     plain, _ = step(world, state, action)
     same, _ = either(world, state, action, jnp.asarray(False), another)
     seen = simulator.now(world, state.scene)
     at_hand, _ = either(world, state, action, jnp.asarray(False), another, seen)
     fresh, transition = either(world, plain, action, jnp.asarray(True), another)
-    for a, b in ((plain, same), (plain, at_hand), (reset(world, 3), fresh)):
+    for a, b in ((plain, same), (plain, at_hand), (reset(world, rows[3]), fresh)):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-6), a, b)
     assert not bool(transition.terminated) and not bool(transition.truncated)
 
 
-def test_two_driven_agents_see_each_other(simulator):
+def test_two_driven_agents_see_each_other():
+    simulator = measuring("collision")
     bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 0, 0, 8)]))
     # The one in front brakes fully, the one behind keeps its speed.
     actions = jnp.array([[0.0, 0.0], [-1.0, 0.0]])
@@ -194,16 +211,21 @@ def test_other_vehicles_as_ego_replay_cleanly(simulator):
     assert metric(result, "fde")[0] < 1e-4 and metric(result, "distance")[0] == pytest.approx(72.0, abs=0.1)
 
 
-def test_vmap_is_a_loop(simulator, world):
+def test_vmap_is_a_loop(single, world):
+    simulator, reset, step = single
     action = jnp.array([0.3, -0.1])
     rows = jnp.array([0, 2, 5])
-    many = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(world, rows)
-    batch, _ = jax.jit(jax.vmap(simulator.step, in_axes=(None, 0, None)))(world, many, action)
-    one = jax.jit(lambda row: simulator.step(world, simulator.reset(world, row), action)[0])
+
+    @jax.jit
+    def together(bank, rows):
+        many = jax.vmap(simulator.reset, in_axes=(None, 0))(bank, rows)
+        return jax.vmap(simulator.step, in_axes=(None, 0, None))(bank, many, action)[0]
+
+    batch = together(world, rows)
     for place, row in enumerate(rows):
-        single = one(row)
+        alone, _ = step(world, reset(world, row), action)
         part = jax.tree.map(lambda leaf, place=place: leaf[place], batch)
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-4), single, part)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-4), alone, part)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from drivax.planners.simple import ConstantVelocity, Expert
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN
 from drivax.settings import dump, load, parse_yaml
+from drivax.simulator.contact import Contact
 from drivax.simulator.dynamics import GRIP_MPS2, command_between
 from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.simulator import Simulator
@@ -30,6 +31,11 @@ def noisy(bank, step, keys):
     return jax.vmap(lambda key: NOISY.scene(bank, 0, step, 0, key))(keys)
 
 
+@jax.jit
+def draw_at(speed, keys):
+    return jax.vmap(lambda key: NoisyStart().draw(key, speed))(keys)
+
+
 def keys(count, seed=0):
     return jax.random.split(jax.random.key(seed), count)
 
@@ -41,7 +47,7 @@ def open_road():
 
 @pytest.mark.parametrize("speed", [0.0, 5.0, 30.0])
 def test_draws_are_distributed_as_published(speed):
-    draws = jax.jit(jax.vmap(lambda key: NoisyStart().draw(key, jnp.asarray(speed))))(keys(20_000))
+    draws = draw_at(jnp.float32(speed), keys(20_000))
     acceleration, curvature = (np.asarray(part, np.float64) for part in draws)
     bound = 0.3 * (0.4 - 0.37 * min(speed / (40 / 3.6), 1.0))
     strong = (acceleration >= 6 * 0.54) & (np.abs(curvature) >= 0.9 * bound)
@@ -106,11 +112,12 @@ def test_a_start_is_free_of_those_who_are_told_where_to_be():
     bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
     told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
     given = with_given(bank, jnp.asarray([[1]]), told)
-    simulator = Simulator(Task(), OverrideTraffic(), NoisyStart(tries=16))
+    simulator = Simulator(Task(metrics=("collision",)), OverrideTraffic(), NoisyStart(tries=16))
     state = jax.jit(jax.vmap(lambda key: simulator.reset(given, 0, 10, 0, key)))(keys(256))
-    assert not np.asarray(state.facts.ignored).any()
-    alone = jax.jit(jax.vmap(lambda key: Simulator(Task(), start=NoisyStart()).scene(bank, 0, 10, 0, key)))
-    beside = np.asarray(alone(keys(256)).history)[:, -1]
+    # Who overlaps at the start is ignored.
+    assert not (np.asarray(state.contacts) == Contact.IGNORED).any()
+    alone = [noisy(bank, 10, part).history for part in keys(256).reshape(4, 64)]
+    beside = np.concatenate(alone)[:, -1]
     near = (np.abs(beside[:, 0] - 5.3) < 4.8) & (np.abs(beside[:, 1] - 2.4) < 2.0)
     assert near.any(), "some draws would have touched"
 

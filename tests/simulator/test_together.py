@@ -1,5 +1,7 @@
 """Several driven agents in one scenario, and agents that do what they are told."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,12 +11,14 @@ from drivax.scenario.bank import AGENT_VALID
 from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.together import is_driven, slots_of
-from drivax.tasks.observations import PRESETS
+from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
-from scenes import bank_of, car, straight_road
+from scenes import GLIMPSE, bank_of, car, straight_road
 
-TASK = Task(observation=PRESETS["minimal"])
-REACTIVE = Simulator(TASK, IdmTraffic())
+SEEN = ObservationConfig(agents=8, steps=1, road=0, lights=1, route=2)
+REACTIVE = Simulator(Task(observation=SEEN, metrics="training"), IdmTraffic())
+#: With all that can be measured: half a minute of compilation.
+MEASURED = Simulator(Task(observation=SEEN), IdmTraffic())
 CARS = [car(0, 0, 0, 10), car(40, 0, 0, 10), car(-15, 3.7, 0, 10), car(-50, 0, 0, 10)]
 
 
@@ -23,27 +27,27 @@ def bank():
     return IdmTraffic().prepare(bank_of(straight_road(CARS)))
 
 
-@jax.jit
-def together(bank, slots, actions):
+@partial(jax.jit, static_argnums=0)
+def together(simulator, bank, slots, actions):
     """Actions per step for a stack of agents: states and transitions of every step, and what each sees last."""
-    states = REACTIVE.reset_together(bank, 0, slots)
+    states = simulator.reset_together(bank, 0, slots)
 
     def one(states, action):
-        after, done = REACTIVE.step_together(bank, states, action)
+        after, done = simulator.step_together(bank, states, action)
         return after, (after, done)
 
     last, out = jax.lax.scan(one, states, actions)
-    return out, REACTIVE.observe_together(bank, last)
+    return out, simulator.observe_together(bank, last)
 
 
-@jax.jit
-def single(bank, actions):
+@partial(jax.jit, static_argnums=0)
+def single(simulator, bank, actions):
     def one(state, action):
-        after, done = REACTIVE.step(bank, state, action)
+        after, done = simulator.step(bank, state, action)
         return after, (after, done)
 
-    last, out = jax.lax.scan(one, REACTIVE.reset(bank, 0), actions)
-    return out, REACTIVE.observe(bank, last.scene)
+    last, out = jax.lax.scan(one, simulator.reset(bank, 0), actions)
+    return out, simulator.observe(bank, last.scene)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,7 @@ def braking(bank):
     slots = slots_of(bank, 0, jnp.isin(jnp.arange(16), jnp.asarray([0, leader])), 3)
     actions = np.zeros((30, 3, 2), np.float32)
     actions[:, 1, 0] = -1.0
-    return slots, leader, together(bank, slots, jnp.asarray(actions))
+    return slots, leader, together(REACTIVE, bank, slots, jnp.asarray(actions))
 
 
 def test_slots_are_those_of_the_mask_that_are_there(bank):
@@ -90,6 +94,10 @@ def test_what_fills_up_the_stack_does_nothing(bank, braking):
     ]
     assert not np.asarray(done.reward)[:, 2].any() and not np.asarray(done.terminated)[:, 2].any()
     assert not np.asarray(done.truncated)[:, 2].any()
+    check_finite(states, done)
+
+
+def check_finite(states, done):
     for leaf in jax.tree.leaves((states.facts, done.reward)):
         assert np.isfinite(np.asarray(leaf, np.float64)).all()
 
@@ -103,7 +111,7 @@ def test_reactive_traffic_sees_every_driven_agent(bank, braking):
     np.testing.assert_array_equal(free[:, 0], free[:, 1])
     # The last car follows ego: when ego brakes it does, too.
     brakes = jnp.zeros((30, 3, 2)).at[:, 0, 0].set(-0.7)
-    (slowed, _), _ = together(bank, slots, brakes)
+    (slowed, _), _ = together(REACTIVE, bank, slots, brakes)
     assert np.asarray(slowed.scene.traffic.speed)[-1, 0, -1, row] < free[-1, 0] - 0.5
 
 
@@ -111,15 +119,16 @@ def test_reactive_traffic_sees_every_driven_agent(bank, braking):
 def test_a_stack_of_one_is_a_single_agent(bank):
     actions = jax.random.uniform(jax.random.key(0), (30, 3, 2), minval=-0.5, maxval=0.3)
     slots = jnp.asarray([0, 16, 16])
-    (states, done), seen = together(bank, slots, actions)
-    (wanted, wanted_done), observation = single(bank, actions[:, 0])
+    (states, done), seen = together(MEASURED, bank, slots, actions)
+    check_finite(states, done)
+    (wanted, wanted_done), observation = single(MEASURED, bank, actions[:, 0])
     pairs = (states.scene.history[:, 0], wanted.scene.history), (done.reward[:, 0], wanted_done.reward)
     for got, expected in (*pairs, *((seen[name][0], observation[name]) for name in observation)):
         np.testing.assert_allclose(np.asarray(got, np.float32), np.asarray(expected, np.float32), atol=1e-5)
 
 
 def test_whose_episode_is_over_is_neither_rewarded_nor_judged_any_more(bank):
-    simulator = Simulator(Task(metrics=("training", "comfort")))
+    simulator = Simulator(Task(observation=GLIMPSE, metrics=("distance", "comfort")))
     crash = bank_of(straight_road([car(0, 0, 0, 10), car(22, 0, 0, 0)]))
 
     @jax.jit

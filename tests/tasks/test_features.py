@@ -22,7 +22,14 @@ from drivax.testing import check_feature
 from scenes import LANE_M, RED, bank_of, car, line, straight_road
 
 RADIUS_M, STRAIGHT_M = 50.0, 40.0
-EXAMPLES = ("relative_velocity", "lane_curvature", "recommended_speed", "time_gap", "stop_line")
+EXAMPLES = (
+    "relative_velocity",
+    "lane_curvature",
+    "recommended_speed",
+    "time_gap",
+    "stop_line",
+    "car_following",
+)
 EVERYTHING = ObservationConfig(
     agents=3, steps=2, road=150, road_ahead_m=100.0, road_side_m=60.0, lights=2, route=16,
     features=Features(**{g: tuple(c) for g, c in COLUMNS.items()}),
@@ -177,6 +184,19 @@ def test_examples(seen):
     np.testing.assert_allclose(own["stop_line"][:2], [[37.6 / 50, 1, 1], [1, 0, 0]], atol=0.02)
 
 
+def test_car_following_sees_what_the_idm_reacts_to(seen):
+    """The car that stands across the route leads, 16.6 m ahead, at no speed along it; nothing leads on the arc."""
+    wanted_gap = 2 + 1.5 * 9 + 9 * 9 / (2 * np.sqrt(1.5 * 3))
+    braking = 1.5 * (1 - (9 / 13.4) ** 4 - (wanted_gap / 16.6) ** 2)
+    curve = np.sqrt(2.5 * RADIUS_M)
+    free = 1.5 * (1 - (9 / curve) ** 4)
+    expected = [
+        [16.6 / 50, 9 / 15, 0, 1, 13.4 / 15, braking / 6],
+        [90 / 50, 0, 0, 0, curve / 15, free / 6],
+    ]
+    np.testing.assert_allclose(seen["everything"]["car_following"][:2], expected, atol=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_keep_to_the_rules(name):
@@ -215,6 +235,7 @@ def test_presets_by_name_in_yaml():
             r"features\.agents has no 'positon'; did you mean 'position'\?",
         ),
         ("{features: {agents: [type, type]}}", "features.agents names 'type' twice"),
+        ("{lights: -1}", r"observation\.lights is -1; use 0 or more"),
         ("{road: 12, road_cut: 5}", r"road_cut is 5; use a number that divides road \(12\)"),
         ("{perception: {range_m: 0}}", r"range_m is 0\.0; use a positive number, or null"),
         ("{perception: {noise_m: -1}}", r"noise_m is -1\.0; use 0 or a positive"),

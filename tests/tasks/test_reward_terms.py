@@ -113,6 +113,10 @@ CASES = [
     ("log_divergence", {"log_divergence_m": 2.5}, 2.5),
     ("log_divergence", {"log_divergence_m": 25.0}, 10.0),
     ("log_divergence", {"log_divergence_m": 2.5, "logged": False}, 0.0),
+    ("lag", {"lag_m": 2.5}, 2.5),
+    ("lag", {"lag_m": 25.0}, 10.0),
+    ("lag", {"lag_m": -2.5}, 0.0),
+    ("lag", {"lag_m": 2.5, "logged": False}, 0.0),
     ("speed_ratio", {"speed_mps": 6.7}, 0.5),
     ("speed_ratio", {"speed_mps": 20.0}, 1.0),
     ("speed_ratio", {"limit_mps": -1.0}, 0.0),
@@ -190,6 +194,7 @@ def in_numpy(before, now, near):
             "wrong_way": n["wrong_way"],
             "straddling": n["straddling"] and near[i],
             "log_divergence": min(n["log_divergence_m"], 10) if n["logged"] else 0,
+            "lag": min(max(n["lag_m"], 0), 10) if n["logged"] else 0,
             "speed_ratio": min(n["speed_mps"] / n["limit_mps"], 1) if known else 0,
             "goal": routed and n["goal_distance_m"] <= 3 < b["goal_distance_m"],
             "lane_change": n["lane_changed"],
@@ -204,6 +209,7 @@ def in_numpy(before, now, near):
 RANGES = {
     "speed_mps": (0, 30), "acceleration_mps2": (-6, 4), "lateral_acceleration_mps2": (-6, 6), "jerk_mps3": (-12, 12),
     "log_divergence_m": (0, 15), "goal_distance_m": (0, 6), "progress_m": (0, 3), "ttc_s": (0, 3), "gap_m": (0, 3),
+    "lag_m": (-5, 15),
 }  # fmt: skip
 
 

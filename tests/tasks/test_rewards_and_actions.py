@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivax.planners.simple import logged_motion
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
 from drivax.tasks.rewards import PRESETS, RewardConfig
@@ -86,3 +87,27 @@ def test_termination_and_truncation_are_separate(measured):
     assert jax.tree.map(bool, replace(task, to_the_end=True).ended(bank, scene, crash)) == (False, True)
     away = replace(facts, left_map=jnp.asarray(True))
     assert jax.tree.map(bool, task.ended(bank, Simulator(task).scene(bank, 0, 20), away)) == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "heading", "lag"),
+    [(-3.0, 0.0, 0.0, 3.0), (2.0, 0.5, 0.0, -2.0), (-3.0, 1.0, np.pi / 3, 0.634)],
+)
+def test_lag_is_how_far_the_log_is_ahead(x, y, heading, lag):
+    """At a pose displaced from the logged one: x ahead of it, y to its left, turned by an angle.
+
+    The log is then at (-x, -y), of which the part along the heading is -x cos - y sin: 3/2 - 0.866 in the last case.
+    """
+    bank = bank_of(straight_road([car(0, 0, 0, 9)]))
+    task = Task(rewards=RewardConfig(preset="safety", lag=-1.0), metrics="none", ends=())
+    simulator = Simulator(task)
+
+    @jax.jit
+    def displaced(bank, shift):
+        state = simulator.reset(bank, 0)
+        motion = logged_motion(bank, state.scene, 1)
+        return simulator.replay(bank, state, motion + shift, jnp.zeros(2))
+
+    after, done = displaced(bank, jnp.asarray([x, y, heading, 0.0]))
+    assert float(after.facts.lag_m) == pytest.approx(lag, abs=1e-3)
+    assert float(done.reward_terms["lag"]) == pytest.approx(-max(lag, 0.0), abs=1e-3)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError
-from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.checkpoints import Checkpoints, pack, unpack
 
 
 class State(NamedTuple):
@@ -194,3 +194,46 @@ def test_later_checkpoints_are_dropped(tmp_path: Path):
         checkpoints.save(step, {"step": step})
     checkpoints.drop_after(20)
     assert checkpoints.steps() == [10, 20] and len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_packed_tree_comes_back_and_is_plain_numpy(tmp_path: Path):
+    tree = {"w": jnp.arange(6.0).reshape(2, 3), "deep": {"b": jnp.int32(3)}, "none": None}
+    file = tmp_path / "tree.npz"
+    pack(file, tree)
+    assert [path.name for path in tmp_path.iterdir()] == ["tree.npz"]
+    with np.load(file, allow_pickle=False) as stored:
+        assert sorted(stored.files) == ["['deep']['b']", "['w']"]
+        np.testing.assert_array_equal(stored["['w']"], [[0, 1, 2], [3, 4, 5]])
+    back = unpack(file, jax.eval_shape(lambda: tree))
+    assert jax.tree.structure(back) == jax.tree.structure(tree)
+    for one, other in zip(jax.tree.leaves(back), jax.tree.leaves(tree), strict=True):
+        assert one.dtype == other.dtype and (one == other).all()
+
+
+@pytest.mark.parametrize(
+    ("template", "words"),
+    [
+        ({"w": jnp.zeros(3)}, r"\['w'\] is float32\[2\] in the checkpoint, not float32\[3\]"),
+        ({"w": jnp.zeros(2, jnp.int32)}, r"not int32\[2\]"),
+        ({"w": jnp.zeros(2), "v": jnp.zeros(1)}, r"has no \['v'\]"),
+        ({}, r"holds \['w'\], which is not wanted"),
+    ],
+)
+def test_a_packed_tree_that_does_not_fit_is_told_by_its_leaf(tmp_path: Path, template: Any, words: str):
+    pack(tmp_path / "tree.npz", {"w": jnp.zeros(2)})
+    with pytest.raises(DataError, match=words):
+        unpack(tmp_path / "tree.npz", template)
+
+
+def test_a_damaged_packed_tree_is_told(tmp_path: Path):
+    file = tmp_path / "tree.npz"
+    pack(file, {"w": jnp.arange(100.0)})
+    whole = bytearray(file.read_bytes())
+    with pytest.raises(DataError, match="is damaged"):
+        unpack(tmp_path / "none.npz", {})
+    for damage in (slice(300, 304), slice(len(whole) // 2, None)):
+        spoilt = whole.copy()
+        spoilt[damage] = b"" if damage.stop is None else bytes(255 - byte for byte in whole[damage])
+        file.write_bytes(spoilt)
+        with pytest.raises(DataError, match="is damaged"):
+            unpack(file, {"w": jnp.zeros(100)})

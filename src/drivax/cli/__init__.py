@@ -51,6 +51,9 @@ COMMANDS = {
     "evaluate": Command(
         "drivax.cli.evaluate", "Evaluate", "drive a planner through a scenario set and judge it"
     ),
+    "compare": Command(
+        "drivax.cli.compare", "Compare", "is one planner better than another? a tested answer"
+    ),
     "report": Command("drivax.cli.report", "Report", "one HTML page with tables and pictures from runs"),
     "bench": Command(
         "drivax.cli.bench", "Bench", "simulation speed on this machine, by part", overrides=True

@@ -45,7 +45,7 @@ class Bench:
     encoders: bool = False
     """Count the parameters of the encoders and time them, instead of the simulator."""
     traffic: str = "log"
-    """How the others move: log, idm, or package.module:name."""
+    """How the others move: log, idm, package.module:name, a run folder or zoo:NAME."""
     json: bool = False
     """Print one JSON object instead of text."""
 

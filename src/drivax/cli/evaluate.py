@@ -8,32 +8,35 @@ from pathlib import Path
 from drivax.api import find_planner, load
 from drivax.errors import UsageError
 from drivax.evaluation.runs import EvaluationConfig, format_summary, run_evaluation
+from drivax.learning.policy_traffic import find_traffic
 from drivax.metrics.selection import selected
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.catalogue import make_traffic
 
 
 @dataclass(frozen=True)
 class Evaluate:
     """Drive a planner through every scenario of a set, to the end of each log, and measure it.
 
-    A planner is expert, expert_actions, constant_velocity, random, idm, search, or the run folder of
-    `drivax train`.
+    A planner is expert, expert_actions, constant_velocity, random, idm, pdm, search, module:name of your own, the
+    run folder of `drivax train`, or zoo:aggressive, a policy that comes with the package.
 
     Writes episodes.csv, summary.json and trajectories.npz.
 
     Example: drivax evaluate --planner idm --data sets/test --out runs/idm
+
+    Example: drivax evaluate --planner idm --data sets/test --traffic zoo:aggressive --out runs/idm-pushed
     """
 
     planner: str
-    """Name of a planner, or run folder of a training run (RUN or RUN@STEP for an earlier checkpoint)."""
+    """Name of a planner, run folder of a training run (RUN or RUN@STEP for an earlier checkpoint), or zoo:NAME."""
     data: Path
     """Scenario set."""
     out: Path
     """Run folder to write."""
     traffic: str = "log"
-    """How the others move: log replays them, idm lets vehicles react, or module:name of your own."""
+    """How the others move: log replays them, idm lets vehicles react, a run folder or zoo:NAME drives those near ego
+    (with +idm behind it the others react), or module:name of your own."""
     noisy_start: bool = False
     """Begin after a second of wrong driving, drawn per scenario from --seed (docs/guide/dynamics.md)."""
     start_step: int = CURRENT_STEP
@@ -55,7 +58,7 @@ def run(args: Evaluate) -> int:
     if args.limit is not None and args.limit < 1:
         raise UsageError(f"--limit {args.limit} leaves no scenario", cure="use 1 or more")
     # Names that do not exist are refused before the long work.
-    make_traffic(args.traffic)
+    traffic = find_traffic(args.traffic)
     selected(args.metrics)
     data = ScenarioSet.open(args.data)
     bank = load(args.data, args.limit).bank
@@ -69,7 +72,9 @@ def run(args: Evaluate) -> int:
         seed=args.seed,
         metrics=args.metrics,
     )
-    results = run_evaluation(config, planner, data, args.out, bank=bank, task=task, overwrite=args.overwrite)
+    results = run_evaluation(
+        config, planner, data, args.out, bank=bank, task=task, traffic=traffic, overwrite=args.overwrite
+    )
     print(format_summary([results.summary()]))
     print(f"wrote {args.out}")
     return 0

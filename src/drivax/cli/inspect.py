@@ -45,7 +45,7 @@ class Inspect:
     observations: bool = False
     """Describe what a policy observes: every feature's spread, what it has to do with collisions and actions."""
     planner: str | None = None
-    """Who drives for --observations: a planner or the run folder of a training run; the log by default."""
+    """Who drives for --observations: a planner, the run folder of a training run or zoo:NAME; the log by default."""
     task: str | None = None
     """Whose observations: a training configuration (file or preset); a run brings its own."""
     draw: Path | None = None
@@ -112,6 +112,7 @@ def _console() -> Console:
 
 def _refuse_misfits(args: Inspect) -> None:
     from drivax.errors import UsageError
+    from drivax.learning.zoo import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
         raise UsageError(
@@ -120,7 +121,7 @@ def _refuse_misfits(args: Inspect) -> None:
     for name in ("planner", "task", "draw"):
         if getattr(args, name) is not None and not args.observations:
             raise UsageError(f"--{name} needs --observations", cure="add --observations")
-    if args.planner is not None and args.task is not None and Path(args.planner.partition("@")[0]).is_dir():
+    if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
         raise UsageError("a trained policy has a task of its own", cure="leave out --task")
     if args.draw is not None and args.draw.exists() and not args.overwrite:
         raise UsageError("exists already", file=args.draw, cure="choose another name or pass --overwrite")

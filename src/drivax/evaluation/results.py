@@ -112,11 +112,11 @@ def _cell(value: Any) -> str:
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
 
 
-def interval_of(name: str, values: np.ndarray[Any, Any], clusters: np.ndarray[Any, Any]) -> Interval:
-    """Mean and 95 % interval over the episodes that define the metric."""
+def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95, seed: int = 0) -> Interval:
+    """Mean and interval over the episodes that define the metric; the interval of a rate is Wilson's."""
     if name in RATES:
-        return rate(values, clusters)
-    return bootstrap_mean(values, clusters, seed=0)
+        return rate(values, clusters, confidence)
+    return bootstrap_mean(values, clusters, confidence, seed=seed)
 
 
 def paired_differences(one: Results, other: Results, metric: str) -> Interval:

@@ -19,6 +19,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.catalogue import make_traffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
+from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
 from drivax.tracking.runs import RunFolder, refuse_existing
@@ -52,17 +53,19 @@ def run_evaluation(
     *,
     bank: ScenarioBank | None = None,
     task: Task | None = None,
+    traffic: Traffic | None = None,
     overwrite: bool = False,
 ) -> Results:
     """Evaluates a planner on a set and writes the run folder.
 
     Args:
-        config: Traffic, starts, start step, seed and limit.
+        config: Starts, start step, seed and limit; what planner and traffic are called.
         planner: The driver.
         data: The scenarios; the first ``config.limit`` of them.
         out: Run folder; it appears after the drive.
         bank: The bank of these scenarios, where it exists already.
         task: Action space and observation of the planner.
+        traffic: How the others move; by default what ``config.traffic`` is called in the simulator's catalogue.
         overwrite: Replace an existing run folder.
     """
     count = len(data) if config.limit is None else min(len(data), config.limit)
@@ -72,7 +75,9 @@ def run_evaluation(
     with Progress(f"driving {planner.name}", "scenarios", count) as bar:
         start = NoisyStart() if config.noisy_start else LogStart()
         results = evaluate_in(
-            Simulator(_with_metrics(task or Task(), config.metrics), make_traffic(config.traffic), start),
+            Simulator(
+                _with_metrics(task or Task(), config.metrics), traffic or make_traffic(config.traffic), start
+            ),
             planner,
             bank,
             scenario_names(scenarios),

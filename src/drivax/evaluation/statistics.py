@@ -2,20 +2,34 @@
 
 Every function takes one value per episode. ``None`` or NaN means that the metric is undefined there: the
 episode is left out and does not count in ``n``. Episodes that share a cluster (a ``segment``: windows of one
-recording, seeds of one scenario) are not independent, so whole clusters are resampled. Seeds are explicit;
-results are repeatable.
+recording, seeds of one scenario) are not independent, so whole clusters are resampled, within strata where these are
+given. Seeds are explicit; results are repeatable. Tests are in ``hypotheses``, effect sizes and power in ``effects``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64
 from scipy import special
 
 from drivax.errors import UsageError
+from drivax.evaluation.clusters import (
+    Labels,
+    Strata,
+    Totals,
+    Values,
+    defined,
+    dense,
+    design_effect,
+    differences,
+    numbers,
+    stratum_of_clusters,
+    totals,
+)
 
 RESAMPLES = 10_000
 #: Random indices drawn at once: bounds the memory of a bootstrap to about 16 MB.
@@ -57,7 +71,7 @@ def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> 
     Raises:
         UsageError: If the counts or the confidence are impossible.
     """
-    z = _normal_quantile(confidence)
+    z = normal_quantile(confidence)
     if not 0 <= successes <= n:
         raise UsageError(
             f"{successes} successes of {n} trials cannot be", cure="count trials and successes again"
@@ -77,9 +91,7 @@ def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interva
     """Wilson interval of a share of 0/1 values whose episodes may come in clusters.
 
     The trials are replaced by the effective sample size ``n / deff`` (Kish 1965; Dean and Pagano, J. Surv.
-    Stat. Methodol. 3, 2015). The design effect ``deff`` is the variance of the ratio of cluster totals, ``C /
-    (C - 1) * sum((s_c - p m_c)^2) / n^2``, over the binomial ``p (1 - p) / n``, at least 1. Where all values
-    agree nothing can be said about the variance, and clusters count as single trials.
+    Stat. Methodol. 3, 2015) with the design effect of :func:`~drivax.evaluation.clusters.design_effect`.
 
     Args:
         values: 0, 1, or undefined, one per episode.
@@ -89,14 +101,13 @@ def rate(values: Any, clusters: Any = None, confidence: float = 0.95) -> Interva
     Raises:
         UsageError: If a value is neither 0 nor 1, or lengths disagree.
     """
-    x, labels = _defined(values, clusters)
+    x, labels = defined(values, clusters)
     if x.size == 0:
         return NOTHING
     if not np.isin(x, (0.0, 1.0)).all():
         raise UsageError("a rate takes only 0 and 1", cure="use bootstrap_mean for other values")
-    n, successes = x.size, float(x.sum())
-    effective = n / _design_effect(*_totals(x, labels))
-    p = successes / n
+    n, p = x.size, float(x.mean())
+    effective = n / design_effect(x, labels)
     found = wilson(p * effective, effective, confidence)
     return Interval(p, found.low, found.high, n)
 
@@ -107,37 +118,85 @@ def bootstrap_mean(
     confidence: float = 0.95,
     resamples: int = RESAMPLES,
     *,
+    strata: Any = None,
     seed: int,
 ) -> Interval:
-    """Percentile bootstrap interval of a mean, resampling whole clusters.
+    """Percentile bootstrap interval of a mean, resampling whole clusters, within strata where these are given.
 
     Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3; clusters: Davison and Hinkley,
     Bootstrap Methods, 1997, section 3.8: draw as many clusters as there are, with replacement; the mean of a
-    resample is its sum over its number of episodes.
+    resample is its sum over its number of episodes. Strata: of the ``C_h`` clusters of each draw ``C_h - 1`` and weigh
+    them by ``C_h / (C_h - 1)``, so that the variance is right however small strata are (Rao, Wu and Yue, Surv.
+    Methodol. 18, 1992).
 
     Args:
         values: Numbers or undefined, one per episode.
         clusters: Labels of the clusters, one per episode; None: every episode is its own.
         confidence: Coverage, between 0 and 1.
         resamples: Number of resamples.
+        strata: Labels of the strata, one per episode, the same throughout a cluster; None: no strata. Those of a
+            single cluster are taken together.
         seed: Seed of the random numbers.
 
     Raises:
-        UsageError: If lengths disagree, a value is infinite, or an option is impossible.
+        UsageError: If lengths disagree, a value is infinite, a cluster lies in two strata, or an option is impossible.
     """
-    _normal_quantile(confidence)
-    if resamples < 1:
-        raise UsageError(f"{resamples} resamples cannot be", cure="use 1000 or more")
-    x, labels = _defined(values, clusters)
+    check_draws(confidence, resamples)
+    x, labels = defined(values, clusters)
     if x.size == 0:
         return NOTHING
-    sums, counts = _totals(x, labels)
+    of = None
+    if strata is not None:
+        keep = ~np.isnan(numbers(values))
+        of = stratum_of_clusters(dense(strata, keep.size, "stratum")[keep], labels)
     mean = float(x.mean())
-    if sums.size < 2:
+    if labels.max() == 0:
         return Interval(mean, None, None, x.size)
-    means = _resampled_means(sums, counts, resamples, np.random.default_rng(seed))
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(mean, float(low), float(high), x.size)
+    means = _resampled_means(x, labels, of, resamples, np.random.default_rng(seed))
+    return Interval(mean, *_percentiles(means, confidence), x.size)
+
+
+def split_bootstrap(
+    values: Any,
+    first: Bool[np.ndarray, " n"],
+    clusters: Any = None,
+    confidence: float = 0.95,
+    resamples: int = RESAMPLES,
+    *,
+    strata: Any = None,
+    seed: int,
+) -> Interval:
+    """Percentile bootstrap interval of the difference of the means of two arms that share no cluster, first - second.
+
+    Each arm is resampled by itself, as :func:`bootstrap_mean` does (Efron and Tibshirani 1993, section 8.3).
+
+    Args:
+        values: Numbers or undefined, one per episode.
+        first: Which episodes belong to the first arm.
+        clusters: As for :func:`bootstrap_mean`, as the rest.
+        confidence: Coverage, between 0 and 1.
+        resamples: Number of resamples.
+        strata: Labels of the strata.
+        seed: Seed of the random numbers.
+
+    Raises:
+        UsageError: As :func:`bootstrap_mean`.
+    """
+    check_draws(confidence, resamples)
+    x = numbers(values)
+    rng, parts = np.random.default_rng(seed), []
+    of = None if strata is None else dense(strata, x.size, "stratum")
+    for arm in (first, ~first):
+        chosen = arm & ~np.isnan(x)
+        part, labels = defined(x[chosen], dense(clusters, x.size, "cluster")[chosen])
+        if part.size == 0:
+            return NOTHING
+        parts.append((part, labels, None if of is None else stratum_of_clusters(of[chosen], labels)))
+    mean, n = float(parts[0][0].mean() - parts[1][0].mean()), sum(part.size for part, _, _ in parts)
+    if min(labels.max() for _, labels, _ in parts) == 0:
+        return Interval(mean, None, None, n)
+    means = [_resampled_means(part, labels, own, resamples, rng) for part, labels, own in parts]
+    return Interval(mean, *_percentiles(means[0] - means[1], confidence), n)
 
 
 def paired_bootstrap(
@@ -165,13 +224,7 @@ def paired_bootstrap(
     Raises:
         UsageError: If lengths disagree, a value is infinite, or an option is impossible.
     """
-    first, second = _numbers(a), _numbers(b)
-    if first.shape != second.shape:
-        raise UsageError(
-            f"pairs need equally many values, not {first.size} and {second.size}",
-            cure="pair by scenario first",
-        )
-    return bootstrap_mean(first - second, clusters, confidence, resamples, seed=seed)
+    return bootstrap_mean(differences(a, b), clusters, confidence, resamples, seed=seed)
 
 
 def crossed_bootstrap(
@@ -180,6 +233,8 @@ def crossed_bootstrap(
     confidence: float = 0.95,
     resamples: int = RESAMPLES,
     *,
+    against: Any = None,
+    across: Literal["mean", "interquartile_mean"] = "mean",
     seed: int,
 ) -> Interval:
     """Percentile bootstrap interval of a mean over agents (training seeds) and episodes, both resampled.
@@ -193,47 +248,102 @@ def crossed_bootstrap(
         clusters: Labels of the clusters, one per episode; None: every episode is its own.
         confidence: Coverage, between 0 and 1.
         resamples: Number of resamples.
+        against: Values of other agents in the same episodes, whose mean is subtracted; drawn by themselves.
+        across: The mean of everything, or the :func:`interquartile_mean` of the agents' means.
         seed: Seed of the random numbers.
+
+    Returns:
+        ``n`` counts the values of the first agents.
 
     Raises:
         UsageError: If lengths disagree, a value is infinite, or an option is impossible.
     """
-    _normal_quantile(confidence)
-    if resamples < 1:
-        raise UsageError(f"{resamples} resamples cannot be", cure="use 1000 or more")
-    rows = [_numbers(row) for row in values]
-    labels = np.arange(rows[0].size) if clusters is None else np.unique(clusters, return_inverse=True)[1]
-    if any(row.size != labels.size for row in rows):
+    check_draws(confidence, resamples)
+    sides = [[numbers(row) for row in side] for side in (values, against) if side is not None]
+    labels = dense(clusters, sides[0][0].size, "cluster")
+    if any(row.size != labels.size for side in sides for row in side):
         raise UsageError("agents drove different episodes", cure="give one value per agent and episode")
-    x = np.stack(rows)
-    there = ~np.isnan(x)
-    count = int(labels.max()) + 1
-    sums = np.stack(
-        [np.bincount(labels, np.where(one, row, 0.0), count) for row, one in zip(x, there, strict=True)]
-    )
-    counts = np.stack([np.bincount(labels, one, count) for one in there])
-    if not there.any():
+    arms = [_agent_totals(np.stack(side), labels) for side in sides]
+    n, count = int(arms[0][1].sum()), arms[0][0].shape[1]
+    if not all(counts.any() for _, counts in arms):
         return NOTHING
-    mean, n = float(sums.sum() / counts.sum()), int(there.sum())
+    statistic, rng = _pooled if across == "mean" else _interquartile, np.random.default_rng(seed)
+
+    def resampled(drawn: np.ndarray[Any, Any], agents: Sequence[np.ndarray[Any, Any]]) -> float:
+        parts = [statistic(some, s @ drawn, c @ drawn) for some, (s, c) in zip(agents, arms, strict=True)]
+        return parts[0] - sum(parts[1:])
+
+    mean = resampled(np.ones(count, int), [np.ones(len(sums), int) for sums, _ in arms])
     if count < 2:
         return Interval(mean, None, None, n)
-    rng = np.random.default_rng(seed)
     means = np.empty(resamples)
     for number in range(resamples):
-        agents = np.bincount(rng.integers(0, len(x), len(x)), minlength=len(x))
-        drawn = np.bincount(rng.integers(0, count, count), minlength=count)
-        means[number] = _ratio(float(agents @ sums @ drawn), float(agents @ counts @ drawn))
-    low, high = np.nanquantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(mean, float(low), float(high), n)
+        agents = [_times_drawn(len(sums), rng) for sums, _ in arms]
+        means[number] = resampled(_times_drawn(count, rng), agents)
+    return Interval(mean, *_percentiles(means, confidence), n)
 
 
-def _ratio(total: float, count: float) -> float:
-    """A mean; NaN of nothing, which a resample of sparse values may be."""
-    return total / count if count else float("nan")
+def _agent_totals(
+    x: Float64[np.ndarray, "agent n"], labels: Labels
+) -> tuple[Float64[np.ndarray, "agent cluster"], Float64[np.ndarray, "agent cluster"]]:
+    """Sum and number of the defined values of each cluster, agent by agent."""
+    count, there = int(labels.max()) + 1, ~np.isnan(x)
+    rows = list(zip(x, there, strict=True))
+    sums = np.stack([np.bincount(labels, np.where(one, row, 0.0), count) for row, one in rows])
+    return sums, np.stack([np.bincount(labels, one, count) for _, one in rows])
 
 
-def _normal_quantile(confidence: float) -> float:
-    """Two-sided quantile z of the standard normal distribution."""
+def _times_drawn(count: int, rng: np.random.Generator) -> Labels:
+    """How often each of ``count`` things comes in as many draws with replacement."""
+    return np.bincount(rng.integers(0, count, count), minlength=count)
+
+
+def interquartile_mean(values: Any) -> float | None:
+    """Mean of the middle half of the values, as of the agents of one training; None of nothing.
+
+    Less moved by one failed agent than the mean, and it uses more than the median does (Agarwal et al., NeurIPS 2021,
+    "Deep reinforcement learning at the edge of the statistical precipice"). The value of rank ``i`` of ``n`` stands for
+    the quantiles from ``i / n`` to ``(i + 1) / n`` and counts by how much of them lies between 1/4 and 3/4, so that it
+    is defined for any number; of three values the outer ones count a sixth each.
+    """
+    x = np.sort(numbers(values))
+    x = x[~np.isnan(x)]
+    if x.size == 0:
+        return None
+    edges = np.clip(np.arange(x.size + 1) / x.size, 0.25, 0.75)
+    return float(2.0 * np.diff(edges) @ x)
+
+
+def _pooled(agents: Labels, sums: Totals, counts: Totals) -> float:
+    """Mean of all episodes of the agents that were drawn; NaN of nothing, which a resample of sparse values may be."""
+    count = float(agents @ counts)
+    return float(agents @ sums) / count if count else float("nan")
+
+
+def _interquartile(agents: Labels, sums: Totals, counts: Totals) -> float:
+    """Interquartile mean of the means of the agents that were drawn."""
+    means = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    found = interquartile_mean(np.repeat(means, agents))
+    return float("nan") if found is None else found
+
+
+def check_draws(confidence: float, resamples: int) -> None:
+    """Refuses an impossible confidence or number of resamples.
+
+    Raises:
+        UsageError: They are.
+    """
+    normal_quantile(confidence)
+    if resamples < 1:
+        raise UsageError(f"{resamples} resamples cannot be", cure="use 1000 or more")
+
+
+def normal_quantile(confidence: float) -> float:
+    """Two-sided quantile z of the standard normal distribution.
+
+    Raises:
+        UsageError: If the confidence is not between 0 and 1.
+    """
     if not 0 < confidence < 1:
         raise UsageError(
             f"a confidence of {confidence} cannot be", cure="use a number between 0 and 1, as 0.95"
@@ -241,62 +351,38 @@ def _normal_quantile(confidence: float) -> float:
     return float(special.ndtri((1 + confidence) / 2))
 
 
-def _numbers(values: Any) -> Float64[np.ndarray, " n"]:
-    """Values as float64 with NaN where undefined."""
-    x = np.asarray(values, dtype=np.float64)
-    if x.ndim != 1 or np.isinf(x).any():
-        raise UsageError(
-            "values must be a list of finite numbers, NaN or None", cure="leave infinite ones undefined"
-        )
-    return x
-
-
-def _defined(values: Any, clusters: Any) -> tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
-    """The defined values and the dense number of the cluster of each."""
-    x = _numbers(values)
-    if clusters is not None and len(clusters) != x.size:
-        raise UsageError(
-            f"{len(clusters)} cluster labels for {x.size} values", cure="give one cluster label per value"
-        )
-    keep = ~np.isnan(x)
-    labels = np.arange(x.size) if clusters is None else np.asarray(clusters)
-    dense = np.unique(labels[keep], return_inverse=True)[1]
-    return x[keep], dense.astype(np.int64)
-
-
-def _totals(
-    x: Float64[np.ndarray, " n"], labels: Int64[np.ndarray, " n"]
-) -> tuple[Float64[np.ndarray, " cluster"], Float64[np.ndarray, " cluster"]]:
-    """Sum and number of the values of each cluster."""
-    return np.bincount(labels, weights=x), np.bincount(labels).astype(np.float64)
-
-
-def _design_effect(sums: Float64[np.ndarray, " cluster"], counts: Float64[np.ndarray, " cluster"]) -> float:
-    """How much larger the variance of a share is than for independent trials; between 1 and n / 1."""
-    n, clusters = float(counts.sum()), counts.size
-    p = float(sums.sum()) / n
-    if clusters == n:
-        return 1.0
-    if clusters == 1 or p in (0.0, 1.0):
-        return n / clusters
-    variance = clusters / (clusters - 1) * float(np.square(sums - p * counts).sum()) / n**2
-    return min(max(1.0, variance / (p * (1 - p) / n)), n)
+def _percentiles(found: Float64[np.ndarray, " resample"], confidence: float) -> tuple[float, float]:
+    """The bounds that leave out as much on either side."""
+    low, high = np.nanquantile(found, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
 
 
 def _resampled_means(
-    sums: Float64[np.ndarray, " cluster"],
-    counts: Float64[np.ndarray, " cluster"],
-    resamples: int,
-    rng: np.random.Generator,
+    x: Values, labels: Labels, strata: Strata | None, resamples: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, " resample"]:
-    """Means of ``resamples`` draws of as many clusters as there are, with replacement."""
-    clusters = sums.size
-    means = np.empty(resamples)
-    rows = max(1, _CHUNK // clusters)
+    """Means of resamples of whole clusters, within the strata of the clusters."""
+    sums, counts = totals(x, labels)
+    if strata is None:
+        drawn = _drawn_totals(sums, counts, sums.size, resamples, rng)
+        return drawn[0] / drawn[1]
+    total = np.zeros((2, resamples))
+    for stratum in range(int(strata.max()) + 1):
+        inside = strata == stratum
+        size = int(inside.sum())
+        total += size / (size - 1) * _drawn_totals(sums[inside], counts[inside], size - 1, resamples, rng)
+    return total[0] / total[1]
+
+
+def _drawn_totals(
+    sums: Totals, counts: Totals, draws: int, resamples: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "2 resample"]:
+    """Sum and number of the values of ``resamples`` times ``draws`` clusters, drawn with replacement."""
+    found = np.empty((2, resamples))
+    rows = max(1, _CHUNK // draws)
     same = bool((counts == counts[0]).all())
     for begin in range(0, resamples, rows):
         end = min(begin + rows, resamples)
-        drawn = rng.integers(0, clusters, size=(end - begin, clusters), dtype=np.int32)
-        total = counts[0] * clusters if same else counts[drawn].sum(axis=1)
-        means[begin:end] = sums[drawn].sum(axis=1) / total
-    return means
+        drawn = rng.integers(0, sums.size, size=(end - begin, draws), dtype=np.int32)
+        found[0, begin:end] = sums[drawn].sum(axis=1)
+        found[1, begin:end] = counts[0] * draws if same else counts[drawn].sum(axis=1)
+    return found

@@ -13,7 +13,6 @@ from drivax.learning.sac import SacConfig
 from drivax.learning.validation import Rule
 from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.simulator.catalogue import make_traffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.actions import DirectState
@@ -32,7 +31,8 @@ class TrainConfig:
         seed: Of networks, environments and exploration.
         task: Actions, observation, reward, termination, and the metrics that are logged on the way.
         algorithm: What learns, and how.
-        traffic: How the others move, while learning and in validation: ``log``, ``idm``, or ``package.module:name``.
+        traffic: How the others move, while learning and in validation: ``log``, ``idm``, ``package.module:name``, or a
+            trained policy (its run folder or ``zoo:NAME``).
         start: How episodes begin while learning; validation begins as logged.
         latest_start: Episodes of learning begin at a random step of the log between 10 and this one.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
@@ -72,7 +72,10 @@ class TrainConfig:
 
     def environment(self) -> Driving:
         """What is learned in."""
-        return Driving(Simulator(self.task, make_traffic(self.traffic), self.start), self.latest_start)
+        # Here, because a policy that drives the others was trained with such a configuration itself.
+        from drivax.learning.policy_traffic import find_traffic
+
+        return Driving(Simulator(self.task, find_traffic(self.traffic), self.start), self.latest_start)
 
     @property
     def iterations(self) -> int:

@@ -17,12 +17,13 @@ from drivax.learning.algorithm import LearnerState
 from drivax.learning.config import TrainConfig
 from drivax.learning.folders import create_folders, resumed_folders
 from drivax.learning.journal import Journal
+from drivax.learning.policy_traffic import find_traffic
 from drivax.learning.program import Program
 from drivax.learning.stopping import Preempted, StopSignal
 from drivax.learning.validation import Validation, validate
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.catalogue import make_traffic, prepared
+from drivax.simulator.catalogue import prepared
 from drivax.tracking.progress import Progress
 from drivax.tracking.runs import RunFolder, refuse_existing
 
@@ -161,7 +162,7 @@ def _record(
             # The other devices of a run have no part in driving.
             parameters = jax.device_put(agents.one(state.parameters, number), run.program.devices[0])
             planner = agents.learner.planner(parameters, "policy", samples=False)
-            row |= validate(planner, run.validation, config.task, make_traffic(config.traffic))
+            row |= validate(planner, run.validation, config.task, find_traffic(config.traffic))
         found = journal.write(done, row)
         if last or due or stops or iteration % config.checkpoint_every == 0:
             journal.save(done, agents.one(state, number), found)

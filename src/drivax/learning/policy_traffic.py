@@ -1,17 +1,19 @@
-"""Trained policies as traffic: a run folder whose policy drives the vehicles around ego."""
+"""Trained policies as traffic, and every kind of traffic by name: the simulator's, and a policy around ego."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivax.learning.config import TrainConfig
-from drivax.learning.policies import load_policy
+from drivax.errors import UsageError
+from drivax.learning.policies import load_policy, open_policy
+from drivax.learning.zoo import is_policy, zoo
+from drivax.named import is_dotted
 from drivax.planners.driven import PlannerTraffic, with_driver
 from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.catalogue import TRAFFIC, make_traffic
 from drivax.simulator.traffic import LogTraffic
 from drivax.simulator.types import Traffic
-from drivax.tracking.runs import RunFolder
 
 
 @dataclass(frozen=True)
@@ -19,7 +21,7 @@ class PolicyTraffic(PlannerTraffic):
     """The policy of a run drives the vehicles nearest to ego (``planners.driven``); :func:`policy_traffic` makes one.
 
     Attributes:
-        run: The run folder.
+        run: The folder of the policy.
         samples: Whether the policy acts by a sample instead of the mode.
     """
 
@@ -48,14 +50,37 @@ def policy_traffic(
     """Traffic in which the best policy of a training run drives up to ``count`` vehicles around ego.
 
     Args:
-        run: Run folder of ``drivax train``.
+        run: Run folder of ``drivax train``, folder of ``pack_policy``, or ``zoo:NAME``.
         count: How many vehicles it drives, at most; the nearest.
         base: How the others move; they replay the log by default.
         samples: Whether it acts by a sample instead of the mode.
 
     Raises:
+        UsageError: If the folder holds several agents, or the zoo has no such policy.
         DataError: If the folder is no training run.
     """
-    folder = RunFolder.open(run)
-    task = folder.config(TrainConfig).task
-    return PolicyTraffic(task, count, base or LogTraffic(), run=str(folder.path), samples=samples)
+    folder, config = open_policy(run)
+    return PolicyTraffic(config.task, count, base or LogTraffic(), run=str(folder.path), samples=samples)
+
+
+def find_traffic(name: str) -> Traffic:
+    """The traffic of a name, as a command line or a configuration says it.
+
+    Args:
+        name: One of ``simulator.catalogue.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
+            ``zoo:NAME``, which then drives the vehicles nearest to ego, while the others replay the log, or behave as
+            in a kind of traffic that is named behind it, ``zoo:NAME+idm``.
+
+    Raises:
+        UsageError: There is none of that name.
+        DataError: A folder is no training run.
+    """
+    run, plus, base = name.rpartition("+")
+    if plus and base in TRAFFIC and is_policy(run):
+        return policy_traffic(run, base=make_traffic(base))
+    if is_policy(name) and name not in TRAFFIC:
+        return policy_traffic(name)
+    if name not in TRAFFIC and not is_dotted(name):
+        kinds = [*TRAFFIC, "package.module:name", "the folder of a training run", *zoo()]
+        raise UsageError(f"there is no traffic {name!r}", cure=f"use {', '.join(kinds)}")
+    return make_traffic(name)

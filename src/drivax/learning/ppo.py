@@ -126,6 +126,10 @@ class Ppo:
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
+    def with_policy(self, parameters: Any, of: Any) -> Any:
+        """Parameters whose policy, a shared encoder included, is that ``of`` other ones."""
+        return nnx.State({**parameters.raw_mapping, "policy": of.raw_mapping["policy"]})
+
     def iterate(
         self, data: Any, state: PpoState, also: Also | None = None
     ) -> tuple[PpoState, dict[str, Array]]:

@@ -173,6 +173,10 @@ class Sac:
         """The policy as a planner."""
         return NetworkPlanner(parameters, self.policy_graph, name, samples)
 
+    def with_policy(self, parameters: Any, of: Any) -> Any:
+        """Parameters whose policy is that ``of`` other ones: these, since there are no others among them."""
+        return of
+
     def iterate(
         self, data: Any, state: SacState, also: Also | None = None
     ) -> tuple[SacState, dict[str, Array]]:

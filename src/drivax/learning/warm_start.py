@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
@@ -45,6 +46,10 @@ class Online(Protocol):
         """The policy as a planner."""
         ...
 
+    def with_policy(self, parameters: Any, of: Any) -> Any:
+        """Parameters whose policy is that ``of`` other ones."""
+        ...
+
 
 @dataclass(frozen=True)
 class WarmStart:
@@ -53,17 +58,20 @@ class WarmStart:
     Attributes:
         iterations: Iterations that only clone; each counts as many steps as one that drives.
         cloning: How the expert is cloned.
+        settle: Iterations after them in which the policy stays the clone, so that values are not made up any more when
+            it begins to follow them.
         weight: Of the imitation loss beside the policy's own, once it learns by reward; 0 leaves it out.
         half_life: Iterations after which that weight has halved; 0: it stays.
     """
 
     iterations: int = 50
     cloning: Cloning = field(default_factory=Cloning)
+    settle: int = 0
     weight: float = 0.0
     half_life: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.iterations, self.half_life) < 0 or self.weight < 0.0:
+        if min(self.iterations, self.settle, self.half_life) < 0 or self.weight < 0.0:
             raise UsageError("a warm start has negative settings", cure="use 0 or more")
 
     def rest(self, iterations: int) -> int:
@@ -211,6 +219,11 @@ class WarmStarted:
 
         learner = replace(state.learner, parameters=state.parameters)
         after, logs = self.online.iterate(data, learner, also if self.config.weight else None)
+        if self.config.settle:
+            clone = self.online.with_policy(after.parameters, state.parameters)
+            settling = state.learner.iteration < self.config.settle
+            parameters = jax.tree.map(partial(jnp.where, settling), clone, after.parameters)
+            after = replace(after, parameters=parameters)
         return self._apart(after, state.optimiser, state.iteration + 1), _counted(logs)
 
     def _imitation(self, data: Any) -> Callable[[Any, Array], tuple[Array, dict[str, Array]]]:

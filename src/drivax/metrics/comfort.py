@@ -36,18 +36,26 @@ LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS
 def tail_operator(window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
     """The Savitzky-Golay filter as a matrix ``[8, 15]`` from the last 15 samples to the values at the last 8.
 
+    Row 0 is an interior point; the last ``window // 2`` rows are read off the last window's polynomial.
+    """
+    return filter_operator(WINDOW, window, order, derivative)[-TAIL:]
+
+
+@cache
+def filter_operator(samples: int, window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
+    """The Savitzky-Golay filter of so many samples as a matrix ``[samples, samples]``.
+
     Least-squares polynomial of ``order`` over ``window`` samples, differentiated ``derivative`` times per sample
-    (Savitzky and Golay 1964). Row 0 is an interior point; the last ``window // 2`` rows are read off the last window's
-    polynomial. As in SciPy, an even window's interior value belongs to half a sample later.
+    (Savitzky and Golay 1964). Rows near an end are read off the polynomial of the first or last window. As in SciPy,
+    an even window's interior value belongs to half a sample later.
     """
     half = window // 2
-    rows = np.zeros((TAIL, WINDOW))
-    for row in range(TAIL):
-        at = WINDOW - TAIL + row
-        interior = at + (window - half - 1 if window % 2 else half) < WINDOW
-        first = (at - half + (window % 2 == 0)) if interior else WINDOW - window
+    rows = np.zeros((samples, samples))
+    for at in range(samples):
+        interior = half <= at < samples - half
+        first = at - half + (window % 2 == 0) if interior else (0 if at < half else samples - window)
         where = (half - 0.5 if window % 2 == 0 else half) if interior else at - first
-        rows[row, first : first + window] = _weights(window, order, derivative, where)
+        rows[at, first : first + window] = _weights(window, order, derivative, where)
     return rows
 
 

@@ -6,6 +6,7 @@ Each accumulator has one entry per step value that some selected metric needs un
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -61,16 +62,18 @@ def episode_start(wanted: Wanted = "full") -> Episode:
     selection = selected(wanted)
     added, high = len(selection.rows(*_ADDED)), len(selection.rows(*_HIGH))
     windows = len(selection.rows(*_WORST))
+    # Types as strong as those of later steps: else a program that steps is traced and compiled twice.
+    full = partial(jnp.full, dtype=float)
     return Episode(
         total=jnp.zeros(added),
         count=jnp.zeros(added, jnp.int16),
-        low=jnp.full(len(selection.rows("min")), jnp.inf),
-        high=jnp.full(high, -jnp.inf),
-        last=jnp.full(len(selection.rows("last")), jnp.nan),
-        first=jnp.full(len(selection.rows("first")), jnp.nan),
+        low=full(len(selection.rows("min")), jnp.inf),
+        high=full(high, -jnp.inf),
+        last=full(len(selection.rows("last")), jnp.nan),
+        first=full(len(selection.rows("first")), jnp.nan),
         event_step=jnp.full(len(selection.events), _NEVER, jnp.int16),
         second=jnp.zeros((windows, _SECOND)),
-        worst=jnp.full(windows, -jnp.inf),
+        worst=full(windows, -jnp.inf),
         selection=selection,
     )
 

@@ -72,7 +72,9 @@ def selected(wanted: Wanted) -> Selection:
     for name in names:
         _close(name, METRICS | own, closed)
     steps = [m.of for m in closed.values() if m.of is not None]
-    reads = FACTS if set(METRICS) <= set(names) else frozenset[str]().union(*(s.reads for s in steps))
+    reads = frozenset[str]().union(*(s.reads for s in steps))
+    if set(METRICS) <= set(names):
+        reads |= FACTS
     return Selection(tuple(names), tuple(closed.items()), reads)
 
 

@@ -74,8 +74,17 @@ class Attention(nnx.Module):
         )
 
     def _times(self, axes: str, one: Any, other: Any) -> Array:
+        def product(one: Array, other: Array) -> Array:
+            return jnp.einsum(axes, one, other, preferred_element_type=jnp.float32)
+
+        def rounded(one: Array, other: Array) -> Array:
+            return product(one.astype(jnp.float32), other.astype(jnp.float32))
+
         one, other = jnp.asarray(one[...], self.dtype), jnp.asarray(other[...], self.dtype)
-        return jnp.einsum(axes, one, other, preferred_element_type=jnp.float32)
+        if self.dtype == "float32":
+            return product(one, other)
+        # XLA for CPUs knows some products of bfloat16 only; those of the rounded numbers in float32 are the same.
+        return jax.lax.platform_dependent(one, other, cpu=rounded, default=product)
 
 
 def _weights(

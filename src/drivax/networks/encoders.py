@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from drivax.errors import UsageError
 from drivax.networks.pooling import Activation, Layers, dense, largest
 
 Groups = Mapping[str, Array]
@@ -125,5 +126,13 @@ def group_spec(observation: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 
 def group_names(spec: GroupSpec) -> tuple[str, ...]:
-    """The groups that are no mask of another, in alphabetical order."""
-    return tuple(sorted(n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec)))
+    """The groups that are no mask of another, in alphabetical order, but for those that hold nothing (no rows).
+
+    Raises:
+        UsageError: There is none.
+    """
+    groups = (n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec))
+    names = tuple(sorted(name for name in groups if math.prod(spec[name])))
+    if not names:
+        raise UsageError("there is nothing to encode: every group is empty", cure="observe at least one row")
+    return names

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from drivax.errors import UsageError
 from drivax.named import find_named, is_dotted
 from drivax.planners.idm import IdmPlanner
+from drivax.planners.pdm import PdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.search import SearchPlanner
 from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
@@ -17,6 +18,7 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     "constant_velocity": ConstantVelocity,
     "random": RandomActions,
     "idm": IdmPlanner,
+    "pdm": PdmPlanner,
     "search": SearchPlanner,
 }
 

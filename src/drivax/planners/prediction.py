@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH
-from drivax.planners.idm import project
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.scenario.queries import LEVEL_M, lane_course
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind
+from drivax.simulator.ahead import project
 from drivax.simulator.types import Frame, Scene
 
 #: Times at which others are predicted: how many, and how far apart, s; lanes are followed in longer steps.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, corners, overlap
-from drivax.planners.idm import STOP_SHORT_M, desired_speed, project, pursuit, stop_line_m
+from drivax.planners.idm import pursuit
 from drivax.planners.prediction import (
     HORIZON,
     SAME_WAY,
@@ -23,6 +23,7 @@ from drivax.planners.prediction import (
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
 from drivax.scenario.record import record, static
+from drivax.simulator.ahead import STOP_SHORT_M, desired_speed, project, stop_line_m
 from drivax.simulator.dynamics import GRIP_MPS2
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import SimState, Situation
@@ -94,7 +95,7 @@ class SearchPlanner:
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
         wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
-        stop = stop_line_m(bank, situation)
+        stop = stop_line_m(bank, scene, me[4])
         trend = carry.updated(frame)
         others = Others.near(bank, scene, frame, trend, (path, there, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)

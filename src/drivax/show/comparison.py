@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from drivax.evaluation.results import interval_of
 from drivax.evaluation.statistics import NOTHING, Interval, paired_bootstrap
+from drivax.evaluation.stored import Pairs
 from drivax.show.glossary import note
 from drivax.show.runs import Evaluation
 
@@ -42,27 +42,14 @@ def summarise(run: Evaluation, metric: str) -> Interval:
     """
     if metric not in run.metrics:
         return NOTHING
-    return interval_of(metric, run.metrics[metric], np.array(_clusters(run)))
-
-
-def comparable(one: Evaluation, other: Evaluation) -> bool:
-    """Whether two runs drove the same scenarios in the same traffic, so that their episodes can be paired."""
-    hashes = {run.data.get("hash") for run in (one, other)} - {None}
-    return len(hashes) <= 1 and one.traffic == other.traffic
+    return interval_of(metric, run.metrics[metric], np.array(run.clusters))
 
 
 def difference(run: Evaluation, other: Evaluation, metric: str) -> Difference:
     """Paired difference ``run - other`` of a metric; repeated episodes of a scenario are averaged first."""
-    mine, theirs = _by_scenario(run, metric), _by_scenario(other, metric)
-    shared = [key for key in mine if key in theirs]
-    segments = dict(zip(_scenarios(run), _clusters(run), strict=True))
-    interval = paired_bootstrap(
-        [mine[key] for key in shared],
-        [theirs[key] for key in shared],
-        [segments[key] for key in shared],
-        CONFIDENCE,
-        seed=SEED,
-    )
+    pairs = Pairs.of(run, other)
+    mine, theirs = pairs.values(run, metric), pairs.values(other, metric)
+    interval = paired_bootstrap(mine, theirs, pairs.clusters, CONFIDENCE, seed=SEED)
     return Difference(metric, other.name, interval, _verdict(interval, note(metric, [run]).better))
 
 
@@ -80,28 +67,3 @@ def _verdict(interval: Interval, better: str) -> str:
     if low <= 0 <= high:
         return "unclear"
     return "better" if (low > 0) == (better == "up") else "worse"
-
-
-def _scenarios(run: Evaluation) -> list[tuple[str, str]]:
-    return list(zip(run.keys["dataset"], run.keys["scenario_id"], strict=True))
-
-
-def _clusters(run: Evaluation) -> list[str]:
-    """Cluster of every episode: its segment, or its scenario where no segment is known."""
-    keys = run.keys
-    rows = zip(keys["dataset"], keys["segment"], keys["scenario_id"], strict=True)
-    return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
-
-
-def _by_scenario(run: Evaluation, metric: str) -> dict[tuple[str, str], float]:
-    """Mean of a metric per scenario over its defined episodes; NaN where there is none."""
-    values: Any = run.metrics.get(metric)
-    gathered: dict[tuple[str, str], list[float]] = {}
-    for row, key in enumerate(_scenarios(run)):
-        cell = np.nan if values is None else float(values[row])
-        gathered.setdefault(key, []).append(cell)
-    means = {}
-    for key, cells in gathered.items():
-        defined = [cell for cell in cells if not np.isnan(cell)]
-        means[key] = float(np.mean(defined)) if defined else np.nan
-    return means

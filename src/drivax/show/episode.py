@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from drivax.metrics.catalogue import EVENTS
 from drivax.scenario.schema import Scenario
 from drivax.show.palette import agent_colour, light_colour
 from drivax.show.roads import LAYERS, Box, light_rows, road_lines, route, stop_signs
-from drivax.show.runs import EVENTS
 
 Array = np.ndarray[Any, Any]
 #: Map and agents further than this from every ego path are left out, metres.

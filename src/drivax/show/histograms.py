@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.errors import UsageError
 from drivax.scenario.selection import FINDINGS
 from drivax.show.curves import compact, ticks
 from drivax.show.inspection import QUANTITIES, Inspection, speeds
 from drivax.show.inspection_tables import content_rows, short
 from drivax.show.palette import SERIES
-from drivax.show.report import asset, colours, publish
+from drivax.show.report import asset, colours, publish, refuse_page
 
 Values = Float[np.ndarray[Any, Any], "_"]
 _WIDTH, _HEIGHT = 380, 210
@@ -40,9 +39,7 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
     Raises:
         UsageError: ``out`` exists.
     """
-    if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
-        raise UsageError("exists already", file=out, cure=cure)
+    refuse_page(out, overwrite)
     names = ", ".join(one.name for one in inspections)
     sections = [_overview(inspections), _quantities(inspections), _shares(inspections), _meaning(inspections)]
     page = Template(asset("report.html.template")).substitute(

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.stored import comparable, open_driven_set
 from drivax.scenario.schema import Scenario
-from drivax.scenario.store import ScenarioSet
-from drivax.show.comparison import CONFIDENCE, comparable, metric_names, summarise
+from drivax.show.comparison import CONFIDENCE, metric_names, summarise
 from drivax.show.curves import curve_sections
 from drivax.show.episode import Drive, pack_episode
 from drivax.show.glossary import headline, ordered
@@ -57,9 +57,7 @@ def write_report(
         DataError: A run folder or the scenario set is missing, damaged, or not the one that was driven.
         UsageError: ``out`` exists, or the arguments make no sense.
     """
-    if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
-        raise UsageError("exists already", file=out, cure=cure)
+    refuse_page(out, overwrite)
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
@@ -75,7 +73,7 @@ def _packed_episodes(
     choices = choose(runs, count)
     if not choices:
         return []
-    scenarios = _open_set(runs[-1], data)
+    scenarios = open_driven_set(runs[-1], data)
     rows = {(entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(scenarios.entries)}
     packed = []
     for choice in choices:
@@ -95,28 +93,6 @@ def _packed_episodes(
         ]
         packed.append((choice, pack_episode(scenario, drives, f"{choice.scenario_id}: {choice.outcome}")))
     return packed
-
-
-def _open_set(run: Evaluation, data: Path | None) -> ScenarioSet:
-    named = run.data.get("path")
-    if data is None and named is None:
-        raise DataError("names no scenario set", file=run.folder / "run.json", cure="pass it with --data SET")
-    path = data if data is not None else Path(str(named))
-    if data is None and not path.exists():
-        raise DataError(
-            "the scenario set of this run is not there any more",
-            file=path,
-            cure="pass its new place with --data SET",
-        )
-    scenarios = ScenarioSet.open(path)
-    wanted = run.data.get("hash")
-    if wanted and scenarios.hash != wanted:
-        raise DataError(
-            f"is not the set that {run.name!r} was evaluated on (hash {scenarios.hash[:12]}, not {str(wanted)[:12]})",
-            file=path,
-            cure="pass the set that was evaluated with --data SET",
-        )
-    return scenarios
 
 
 def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
@@ -335,6 +311,17 @@ def colours() -> str:
 def asset(name: str) -> str:
     """Text of a file of this package."""
     return resources.files("drivax.show").joinpath(name).read_text(encoding="utf-8")
+
+
+def refuse_page(out: Path, overwrite: bool) -> None:
+    """Refuses a page that may not be written, before any work is done.
+
+    Raises:
+        UsageError: ``out`` is a folder, or exists and ``overwrite`` is not given.
+    """
+    if out.is_dir() or (out.exists() and not overwrite):
+        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
+        raise UsageError("exists already", file=out, cure=cure)
 
 
 def publish(out: Path, page: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import zipfile
@@ -15,12 +14,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.stored import AGAIN, EpisodeTable, present, read_about, read_episodes
+from drivax.metrics.catalogue import EVENTS
 from drivax.tracking.runs import seed_folders
-
-#: Columns of ``episodes.csv`` that say which episode it was; all others are metrics.
-KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
-EVENTS = ("collision", "offroad", "red_light")
-_AGAIN = "run drivax evaluate again"
 
 Array = np.ndarray[Any, Any]
 
@@ -43,55 +39,14 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
-class OwnMetric:
-    """A metric that drivax does not know: unit, direction (``high``, ``low``, ``-``) and one line of text."""
-
-    unit: str
-    better: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """One planner driven through one scenario set.
+class Evaluation(EpisodeTable):
+    """One planner driven through one scenario set; its name is made unique by :func:`read_runs`.
 
     Attributes:
-        folder: The run folder.
-        name: Name of the planner in tables; made unique by :func:`read_runs`.
-        about: ``run.json``.
-        keys: Columns of :data:`KEYS`, as text.
-        metrics: Columns of metrics; NaN where undefined.
         trajectories: What was driven.
     """
 
-    folder: Path
-    name: str
-    about: Mapping[str, Any]
-    keys: Mapping[str, tuple[str, ...]]
-    metrics: Mapping[str, Float[Array, " episode"]]
     trajectories: Trajectories
-
-    @property
-    def episodes(self) -> int:
-        """Number of episodes."""
-        return len(self.keys["scenario_id"])
-
-    @property
-    def traffic(self) -> str:
-        """How the other agents moved: ``log`` or ``idm``."""
-        return str(self.about.get("traffic", "log"))
-
-    @property
-    def own_metrics(self) -> Mapping[str, OwnMetric]:
-        """What the run says about metrics of the user's own."""
-        told = self.about.get("own_metrics") or {}
-        return {name: OwnMetric(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in told.items()}
-
-    @property
-    def data(self) -> Mapping[str, Any]:
-        """Path, hash and name of the scenario set, as far as they are known."""
-        data = self.about.get("data") or {}
-        return data[0] if isinstance(data, list) and data else data if isinstance(data, dict) else {}
 
     @property
     def occurrences(self) -> list[tuple[str, int]]:
@@ -139,7 +94,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]
     names: set[str] = set()
     charts: set[str] = set()
     for folder in folders:
-        about = _about(folder)
+        about = read_about(folder)
         if about.get("kind") == "training":
             trainings.append(Training(folder, _unique(folder.name, folder, charts), about, _curves(folder)))
         elif about.get("kind") == "evaluation":
@@ -163,63 +118,9 @@ def _unique(name: str, folder: Path, names: set[str]) -> str:
     return candidate
 
 
-def _about(folder: Path) -> dict[str, Any]:
-    if not folder.is_dir():
-        raise DataError(
-            "there is no such run folder", file=folder, cure="check the path, or run drivax evaluate"
-        )
-    path = _present(folder / "run.json", "give a folder written by drivax evaluate or drivax train")
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DataError(f"is not JSON ({error})", file=path, cure="run the command again") from error
-    if not isinstance(about, dict):
-        raise DataError("holds no table of facts", file=path, cure="run the command again")
-    return about
-
-
-def _present(path: Path, cure: str = _AGAIN) -> Path:
-    if not path.is_file():
-        raise DataError("is missing", file=path, cure=cure)
-    return path
-
-
 def _evaluation(folder: Path, name: str, about: Mapping[str, Any]) -> Evaluation:
-    keys, metrics = _episodes(_present(folder / "episodes.csv"))
-    trajectories = _trajectories(_present(folder / "trajectories.npz"))
-    return Evaluation(folder, name, about, keys, metrics, trajectories)
-
-
-def _episodes(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))
-    header = rows[0] if rows else []
-    missing = [key for key in KEYS if key not in header]
-    if missing or len(set(header)) < len(header):
-        problem = f"lacks the column {missing[0]!r}" if missing else "names a column twice"
-        raise DataError(problem, file=path, record="header", cure=_AGAIN)
-    if len(rows) < 2:
-        raise DataError("holds no episodes", file=path, cure=_AGAIN)
-    for number, row in enumerate(rows[1:], start=1):
-        if len(row) != len(header):
-            raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=_AGAIN)
-    columns = {name: [row[place] for row in rows[1:]] for place, name in enumerate(header)}
-    keys = {name: tuple(columns[name]) for name in KEYS}
-    return keys, {name: _column(path, name, columns[name]) for name in header if name not in KEYS}
-
-
-def _column(path: Path, name: str, cells: Sequence[str]) -> Array:
-    """A metric's cells as float64; an empty cell is NaN (undefined)."""
-    values = np.full(len(cells), np.nan)
-    for row, cell in enumerate(cells):
-        try:
-            values[row] = float(cell) if cell.strip() else math.nan
-        except ValueError:
-            problem = f"{name} is {cell!r}, not a number or empty"
-            raise DataError(problem, file=path, record=row + 1, cure=_AGAIN) from None
-        if math.isinf(values[row]):
-            raise DataError(f"{name} is infinite", file=path, record=row + 1, cure=_AGAIN)
-    return values
+    columns = read_episodes(folder)
+    return Evaluation(folder, name, about, *columns, _trajectories(present(folder / "trajectories.npz")))
 
 
 def _trajectories(path: Path) -> Trajectories:
@@ -230,14 +131,14 @@ def _trajectories(path: Path) -> Trajectories:
             start = stored["start"].astype(np.int64)
             events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
     except KeyError as error:
-        raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=_AGAIN) from error
+        raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=AGAIN) from error
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"cannot be read ({error})", file=path, cure=_AGAIN) from error
+        raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
     n = len(ids)
     if ego.ndim != 3 or ego.shape[0] != n or ego.shape[2] != 4 or any(
         array.shape != (n,) for array in (start, *events.values())
     ):  # fmt: skip
-        raise DataError("its arrays disagree in shape", file=path, cure=_AGAIN)
+        raise DataError("its arrays disagree in shape", file=path, cure=AGAIN)
     seen: dict[str, int] = {}
     rows = {}
     for row, scenario_id in enumerate(ids):
@@ -251,7 +152,7 @@ def _text(value: Any) -> str:
 
 
 def _curves(folder: Path) -> dict[str, Array]:
-    path = _present(folder / "metrics.jsonl", "train again, or leave this run out")
+    path = present(folder / "metrics.jsonl", "train again, or leave this run out")
     points: dict[str, list[tuple[float, float]]] = {}
     lines = path.read_text(encoding="utf-8").splitlines()
     for number, line in enumerate(lines, start=1):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivax.show.comparison import comparable
+from drivax.evaluation.stored import comparable
 from drivax.show.runs import Evaluation
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).

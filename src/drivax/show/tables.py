@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from html import escape
 
 from drivax.evaluation.statistics import Interval
-from drivax.show.comparison import Difference, comparable, difference, summarise
+from drivax.evaluation.stored import comparable
+from drivax.show.comparison import Difference, difference, summarise
 from drivax.show.glossary import ARROWS, Note, note
 from drivax.show.runs import Evaluation
 

@@ -180,9 +180,15 @@ def _requested(
 ) -> dict[str, Array]:
     """The facts that are measured on request; what ``reads`` does not ask for is zero."""
     none, no = jnp.int16(-1), jnp.zeros((), bool)
-    found: dict[str, Array] = {"gap_m": jnp.zeros(()), "strand": none, "lane_changed": no, "merged": no}
+    zero = jnp.zeros(())
+    found: dict[str, Array] = {
+        "gap_m": zero, "lag_m": zero, "strand": none, "lane_changed": no, "merged": no
+    }  # fmt: skip
     if "gap_m" in reads:
         found["gap_m"] = nearest_gap(frame, scene.slot, codes == Contact.IGNORED)
+    if "lag_m" in reads:
+        me, logged = frame.box[scene.slot], bank.agents[scene.index, scene.step, scene.slot]
+        found["lag_m"] = jnp.sum((logged[:2] - me[:2]) * me[2:4])
     if reads & _PASSAGES:
         ground, me = _ground(bank, scene, frame), frame.box[scene.slot]
         if strand is None:

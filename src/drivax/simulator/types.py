@@ -70,7 +70,8 @@ class Facts:
     whether the log has the agent at this step; ``ignored`` counts overlaps that do not count. A fact that the task does
     not ask for (``Task.reads``) is neither measured nor carried: it is None.
 
-    The last four are measured for who names them only (``ON_REQUEST``): ``gap_m`` to the nearest other, at most 50 m;
+    The last five are measured for who names them only (``ON_REQUEST``): ``gap_m`` to the nearest other, at most 50 m;
+    ``lag_m``, how far ahead the log has the agent, along the agent's heading (negative: behind);
     ``strand`` of lanes that the agent is on (``scenario.passages``), and whether it changed lanes or merged just now.
     """
 
@@ -100,13 +101,14 @@ class Facts:
     acceleration_mps2: Float[Array, "*batch"]
     jerk_mps3: Float[Array, "*batch"]
     gap_m: Any = None
+    lag_m: Any = None
     strand: Any = None
     lane_changed: Any = None
     merged: Any = None
 
 
 #: Facts that few look at, measured only where they are asked for by name.
-ON_REQUEST = frozenset({"gap_m", "strand", "lane_changed", "merged"})
+ON_REQUEST = frozenset({"gap_m", "lag_m", "strand", "lane_changed", "merged"})
 #: Names of all other facts.
 FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
 

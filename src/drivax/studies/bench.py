@@ -22,13 +22,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
+from drivax.learning.policy_traffic import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import Wanted
 from drivax.planners.idm import IdmPlanner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.exhaustive import without_grid
 from drivax.scenario.queries import around_lanes, left_of_edges, project_on_route
-from drivax.simulator.catalogue import make_traffic, prepared
+from drivax.simulator.catalogue import prepared
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
@@ -204,7 +205,7 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
             f"a batch of {config.batch} does not divide among {jax.device_count()} devices",
             cure="give a multiple",
         )
-    traffic = make_traffic(config.traffic)
+    traffic = find_traffic(config.traffic)
     return Simulator(config.task, traffic), spread(prepared(traffic, bank))
 
 
@@ -215,8 +216,13 @@ def spread(bank: ScenarioBank) -> ScenarioBank:
 
 def _states(simulator: Simulator, bank: ScenarioBank, batch: int) -> SimState:
     index = jax.random.randint(jax.random.key(1), (batch,), 0, len(bank))
-    states = jax.jit(jax.vmap(simulator.reset, in_axes=(None, 0)))(bank, index)
+    states = _reset(simulator, bank, index)
     return jax.device_put(states, NamedSharding(_mesh(), PartitionSpec("device")))
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset(simulator: Simulator, bank: ScenarioBank, index: Int[Array, " B"]) -> SimState:
+    return jax.vmap(simulator.reset, in_axes=(None, 0))(bank, index)
 
 
 def _mesh() -> Mesh:
@@ -355,8 +361,7 @@ def _rounds(config: BenchConfig, part: Part) -> Callable[[ScenarioBank, SimState
 def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimState) -> float:
     """Microseconds per environment and step of one part."""
     many = _rounds(config, part)
-    seconds = _median(lambda: many(bank, states), config.repeats)
-    return seconds / config.steps / config.batch * 1e6
+    return _median(lambda: many(bank, states), config.repeats) / config.steps / config.batch * 1e6
 
 
 def _shifted(state: SimState, by: Array) -> SimState:

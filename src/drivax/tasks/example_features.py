@@ -14,7 +14,9 @@ from drivax.geometry.vectors import first_smallest, norm
 from drivax.scenario.bank import LIGHT_ARC, NEVER_M, ROAD_LANE, ScenarioBank
 from drivax.scenario.queries import route_ahead
 from drivax.scenario.schema import LightState
-from drivax.simulator.types import Scene
+from drivax.simulator.ahead import ahead
+from drivax.simulator.idm import IdmParameters
+from drivax.simulator.types import MOTION_SPEED, Scene
 from drivax.tasks import features
 from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
 
@@ -22,6 +24,9 @@ from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
 _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
 #: Half the width of the stripe ahead in which a leader drives, m; the longest gap that is told apart, s.
 _STRIPE_M, _LONGEST_S = 1.5, 10.0
+#: The driver whose acceleration is shown, its hardest braking, m/s2, and how far it looks, m.
+_IDM = IdmParameters()
+_HARDEST_MPS2, _FARTHEST_M = 6.0, 90.0
 #: A car that is slower keeps the time gap of this speed, m/s.
 _SLOWEST_MPS = 1.0
 
@@ -92,6 +97,32 @@ def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, "
 def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Array, " S"]:
     """How far boxes of these directions (ego frame) reach back from their centres along ego's heading, m."""
     return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
+
+
+def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 6"]:
+    """What a car-following driver looks at along the route, and what the IDM would do with it.
+
+    Gap to the leader or a light that asks to stop (90 m at most, in 50 m); speed towards it and its own (15 m/s);
+    whether there is one; the speed that the limit and the curves ahead allow (15 m/s); the acceleration of the
+    Intelligent Driver Model with its default parameters (6 m/s2). Without a leader both of its speeds are 0.
+    """
+    speed = scene.history[-1, MOTION_SPEED]
+    seen = ahead(bank, scene, frames(0), _IDM.min_gap_m)
+    leads = seen.gap < _FARTHEST_M
+    speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads
+    return jnp.concatenate(
+        [
+            jnp.minimum(seen.gap, _FARTHEST_M)[None] / POSITION_M,
+            speeds / SPEED_MPS,
+            jnp.stack(
+                [
+                    leads.astype(jnp.float32),
+                    seen.wanted / SPEED_MPS,
+                    seen.acceleration(speed, _IDM) / _HARDEST_MPS2,
+                ]
+            ),
+        ]
+    )
 
 
 def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 3"]:

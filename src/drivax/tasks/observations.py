@@ -127,6 +127,10 @@ class ObservationConfig:
 
     def __post_init__(self) -> None:
         refuse_taken("observation.own", [group.name for group in self.own], GROUPS)
+        counts = {name: getattr(self, name) for name in ("agents", "road", "lights", "route")}
+        for name, count in counts.items():
+            if count < 0:
+                raise ValueError(f"observation.{name} is {count}; use 0 or more")
         if not 1 <= self.steps <= 10:
             raise ValueError(f"observation.steps is {self.steps}; use 1 to 10")
         if self.road_cut < 1 or self.road % self.road_cut:

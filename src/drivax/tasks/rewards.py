@@ -118,6 +118,11 @@ def log_divergence(before: Facts, now: Facts, around: Surroundings) -> Float[Arr
     return now.logged * jnp.minimum(now.log_divergence_m, _FAR_FROM_LOG_M)
 
 
+def lag(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
+    """How far ahead the log has the agent at this step, along its heading, m, 0 to 10; 0 where it has not."""
+    return now.logged * jnp.clip(now.lag_m, 0.0, _FAR_FROM_LOG_M)
+
+
 def speed_ratio(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
     """Speed as a share of the limit, in [0, 1]; 0 where no limit is known."""
     known = now.limit_mps > 0
@@ -189,6 +194,7 @@ TERMS: dict[str, Term] = {
     "wrong_way": wrong_way,
     "straddling": straddling,
     "log_divergence": log_divergence,
+    "lag": lag,
     "speed_ratio": speed_ratio,
     "goal": goal,
     "lane_change": lane_change,
@@ -212,6 +218,7 @@ READS: dict[str, frozenset[str]] = {
     "wrong_way": frozenset({"wrong_way"}),
     "straddling": frozenset({"straddling"}),
     "log_divergence": frozenset({"log_divergence_m", "logged"}),
+    "lag": frozenset({"lag_m", "logged"}),
     "speed_ratio": frozenset({"limit_mps", "speed_mps"}),
     "goal": frozenset({"routed", "goal_distance_m"}),
     "lane_change": frozenset({"lane_changed"}),
@@ -286,6 +293,7 @@ class RewardConfig:
     wrong_way: float | None = None
     straddling: float | None = None
     log_divergence: float | None = None
+    lag: float | None = None
     speed_ratio: float | None = None
     goal: float | None = None
     lane_change: float | None = None

@@ -22,6 +22,7 @@ from drivax.testing.contract import check_numbers, expect, same
 #: A small observation: compiling is what a check takes.
 _TASK = Task(
     observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=3),
+    metrics="training",
 )
 _ITERATIONS = 4
 

@@ -74,6 +74,16 @@ def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+def forms(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Shapes and types of what a function gives.
+
+    Raises:
+        BrokenContract: It cannot be compiled.
+    """
+    with _told(what):
+        return jax.eval_shape(function, *arguments)
+
+
 class Program:
     """A function of one row, batched; compiled once for all arguments of one form.
 

@@ -14,13 +14,13 @@ from drivax.networks.encoders import EncoderConfig
 from drivax.testing.contract import CLOSE, check_numbers, expect, program, same
 from drivax.testing.worlds import GARBAGE
 
-#: Groups with one and two axes of rows, with and without masks; the second set lacks some.
+#: Groups with one and two axes of rows, with and without masks; the second set lacks some, and one has no rows.
 _SPECS = (
     {
         "agents": (4, 2, 3), "agents_mask": (4, 2), "ego": (2, 6), "ego_static": (4,), "route": (5, 5),
         "route_mask": (5,),
     },
-    {"ego": (1, 6), "lights": (2, 7), "lights_mask": (2,)},
+    {"ego": (1, 6), "lights": (2, 7), "lights_mask": (2,), "route": (0, 5), "route_mask": (0,)},
 )  # fmt: skip
 _BATCH = 6
 #: How far results may lie apart where settings say ``dtype: bfloat16``, which has eight significant bits.
@@ -30,10 +30,10 @@ _COARSE = 5e-2
 def check_encoder(config: EncoderConfig | str) -> None:
     """Whether an encoder keeps to the rules.
 
-    It builds for any groups; embeds one observation or a batch as ``[..., width]`` float32, the same compiled or not;
-    its parameters follow from the key and are all that it keeps; values and gradients are finite, also where every row
-    is masked; what masked rows hold does not matter, and what the others hold does. What is alike is compared more
-    coarsely where the settings have ``dtype`` bfloat16.
+    It builds for any groups, one without rows among them; embeds one observation or a batch as ``[..., width]``
+    float32, the same compiled or not; its parameters follow from the key and are all that it keeps; values and
+    gradients are finite, also where every row is masked; what masked rows hold does not matter, and what the others
+    hold does. What is alike is compared more coarsely where the settings have ``dtype`` bfloat16.
 
     Args:
         config: The encoder's settings, or the dotted name of such a class or instance.

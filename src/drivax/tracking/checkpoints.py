@@ -2,14 +2,16 @@
 
 Orbax stores the arrays; ``about.json`` beside them names every leaf with its dtype, shape and CRC-32, so that a state
 that does not fit, or a damaged file, is told by the name of the leaf. A checkpoint appears under its name only when
-it is complete.
+it is complete. What is shipped is one plain file instead (:func:`pack`), which holds a policy and no training state.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
+import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -158,6 +160,48 @@ class Checkpoints:
         doomed = self.folder / f".step-{step}.old-{os.getpid()}"
         self._path(step).rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
+
+
+def pack(file: Path, tree: Any) -> None:
+    """Writes the leaves of a pytree to one ``.npz``, by name, which NumPy alone can read; a zip has checksums.
+
+    Args:
+        file: The file; it is either the old one or the whole new one.
+        tree: Arrays of NumPy's own types.
+    """
+    named: dict[str, Any] = {
+        jax.tree_util.keystr(key): np.asarray(leaf) for key, leaf in jax.tree.leaves_with_path(tree)
+    }
+    partial = file.with_name(f".{file.name}.partial-{os.getpid()}")
+    with partial.open("wb") as out:
+        np.savez(out, **named)
+    partial.replace(file)
+
+
+def unpack(file: Path, template: State) -> State:
+    """What :func:`pack` wrote.
+
+    Args:
+        file: The file.
+        template: A pytree of the same structure; ``jax.ShapeDtypeStruct`` leaves will do.
+
+    Raises:
+        DataError: It is damaged, or does not fit the template; names the first leaf.
+    """
+    try:
+        with zipfile.ZipFile(file) as found:
+            # Read to the end, which is when a zip compares its checksum.
+            members = {name.removesuffix(".npy"): io.BytesIO(found.read(name)) for name in found.namelist()}
+        arrays = {name: np.load(member, allow_pickle=False) for name, member in members.items()}
+    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise DataError(f"is damaged ({error})", file=file, cure="use another copy") from error
+    wanted, structure = jax.tree_util.tree_flatten_with_path(template)
+    named = [(jax.tree_util.keystr(key), leaf) for key, leaf in wanted]
+    stored = [
+        {"name": name, "type": str(array.dtype), "shape": list(array.shape)} for name, array in arrays.items()
+    ]
+    _compare(file, stored, named)
+    return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name, _ in named])
 
 
 def _describe(state: Any) -> tuple[dict[str, np.ndarray[Any, Any]], list[dict[str, Any]]]:

@@ -102,13 +102,13 @@ class RunFolder:
             raise DataError(f"is damaged ({error})", file=path / RUN_FILE, cure="run again") from error
         return cls(path, info)
 
-    def config(self, cls: type[Record]) -> Record:
-        """The run's configuration as a record.
+    def config(self, cls: type[Record], overrides: Sequence[str] = ()) -> Record:
+        """The run's configuration as a record, with settings replaced as on a command line.
 
         Raises:
             UsageError: ``config.yaml`` does not fit ``cls``.
         """
-        return settings.load(cls, self.path / CONFIG_FILE)
+        return settings.load(cls, self.path / CONFIG_FILE, overrides)
 
     def note(self, **notes: Any) -> RunFolder:
         """The run with more facts in ``run.json`` (an end time, a result)."""

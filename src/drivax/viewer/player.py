@@ -26,6 +26,7 @@ from drivax.show.report import embedded_json as json_text
 from drivax.show.report import legend_item as legend_item
 from drivax.show.report import logged_drive as logged_drive
 from drivax.show.report import publish as publish
+from drivax.show.report import refuse_page as refuse_page
 
 #: Findings of the audit that make a log unclean, and how the list says so.
 _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red"}
@@ -68,9 +69,7 @@ def write_player(
     Raises:
         UsageError: ``out`` exists or is a folder, or there is no scenario.
     """
-    if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
-        raise UsageError("exists already", file=out, cure=cure)
+    refuse_page(out, overwrite)
     if not scenarios:
         raise UsageError("there is no scenario to show", cure="name at least one")
     publish(out, _page(scenarios, title))

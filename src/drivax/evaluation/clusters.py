@@ -1,0 +1,124 @@
+"""Values of episodes that come in clusters: windows of one recording are not independent of each other.
+
+A cluster is a recording (``segment``); whole clusters are resampled, flipped or assigned, never parts of them. Clusters
+may lie in strata (kinds of scenario), within which they are resampled or assigned.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from drivax.errors import UsageError
+
+Values = Float64[np.ndarray, " n"]
+Labels = Int64[np.ndarray, " n"]
+#: Of each cluster: a sum, or the number of its stratum.
+Totals = Float64[np.ndarray, " cluster"]
+Strata = Int64[np.ndarray, " cluster"]
+
+
+def numbers(values: Any) -> Values:
+    """Values as float64 with NaN where undefined.
+
+    Raises:
+        UsageError: If they are no list, or one is infinite.
+    """
+    x = np.asarray(values, dtype=np.float64)
+    if x.ndim != 1 or np.isinf(x).any():
+        raise UsageError(
+            "values must be a list of finite numbers, NaN or None", cure="leave infinite ones undefined"
+        )
+    return x
+
+
+def differences(a: Any, b: Any) -> Values:
+    """``a - b`` pair by pair, NaN where either is undefined.
+
+    Raises:
+        UsageError: If they are not equally many.
+    """
+    first, second = numbers(a), numbers(b)
+    if first.shape != second.shape:
+        raise UsageError(
+            f"pairs need equally many values, not {first.size} and {second.size}",
+            cure="pair by scenario first",
+        )
+    return first - second
+
+
+def defined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
+    """The defined values and the dense number of the cluster of each; without clusters each is its own.
+
+    Raises:
+        UsageError: If lengths disagree, or a value is infinite.
+    """
+    x = numbers(values)
+    labels, keep = dense(clusters, x.size, "cluster"), ~np.isnan(x)
+    return x[keep], dense(labels[keep], int(keep.sum()), "cluster")
+
+
+def dense(labels: Any, count: int, kind: str) -> Labels:
+    """Labels as numbers from 0 on; None gives each of ``count`` values its own.
+
+    Raises:
+        UsageError: If there are not ``count`` of them.
+    """
+    if labels is None:
+        return np.arange(count, dtype=np.int64)
+    if len(labels) != count:
+        raise UsageError(
+            f"{len(labels)} {kind} labels for {count} values", cure=f"give one {kind} label per value"
+        )
+    return np.unique(np.asarray(labels), return_inverse=True)[1].astype(np.int64)
+
+
+def totals(x: Values, labels: Labels) -> tuple[Totals, Totals]:
+    """Sum and number of the values of each cluster."""
+    return np.bincount(labels, weights=x), np.bincount(labels).astype(np.float64)
+
+
+def design_effect(x: Values, labels: Labels) -> float:
+    """How much larger the variance of a mean is than for independent values; between 1 and ``n``.
+
+    ``deff = V / (s^2 / n)`` with ``V = C / (C - 1) * sum((S_c - m n_c)^2) / n^2``, the variance of the ratio of cluster
+    totals (Kish, Survey Sampling, 1965, section 8.2; Cochran, Sampling Techniques, 1977, section 6.3), and ``s^2`` the
+    mean squared deviation, for shares ``p (1 - p)``. Where all values agree, or there is one cluster, nothing can be
+    said about ``V``, and clusters count as single values: ``n / C``.
+    """
+    sums, counts = totals(x, labels)
+    n, clusters, mean = x.size, sums.size, float(x.mean())
+    if clusters == n:
+        return 1.0
+    spread = float(np.square(x - mean).mean())
+    if clusters == 1 or spread == 0.0:
+        return n / clusters
+    variance = clusters / (clusters - 1) * float(np.square(sums - mean * counts).sum()) / n**2
+    return min(max(1.0, variance / (spread / n)), float(n))
+
+
+def stratum_of_clusters(strata: Any, labels: Labels, least: int = 2) -> Strata:
+    """The stratum of each cluster; small strata are pooled (Cochran 1977, section 5A.12, "collapsed strata").
+
+    Args:
+        strata: Labels of strata, one per value; all values of a cluster have the same.
+        labels: Dense number of the cluster of each value.
+        least: Strata with fewer clusters are taken together; if these are still fewer, they join the smallest other.
+
+    Raises:
+        UsageError: If a cluster lies in two strata.
+    """
+    own = dense(strata, labels.size, "stratum")
+    _, first = np.unique(labels, return_index=True)
+    of = own[first]
+    if (of[labels] != own).any():
+        raise UsageError("a cluster lies in two strata", cure="give all values of a cluster one stratum")
+    sizes = np.bincount(of)
+    of = np.where(sizes[of] < least, sizes.size, of)
+    sizes = np.bincount(of, minlength=sizes.size + 1)
+    others = np.flatnonzero(sizes[:-1])
+    if 0 < sizes[-1] < least and others.size:
+        of = np.where(of == sizes.size - 1, others[sizes[others].argmin()], of)
+    return dense(of, of.size, "stratum")

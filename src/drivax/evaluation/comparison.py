@@ -1,0 +1,307 @@
+"""Is one planner better than another? Intervals, tests, power, and a decision by the rule of a plan.
+
+The primary metric decides; secondary ones are told with p-values that are adjusted for their number. Differences are
+``A - B``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.evaluation.clusters import defined, design_effect
+from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, judged
+from drivax.evaluation.effects import (
+    ROUNDING,
+    cohens_d,
+    cohens_d_paired,
+    detectable,
+    pooled_deviation,
+    power,
+    scenarios_needed,
+)
+from drivax.evaluation.hypotheses import (
+    Evidence,
+    holm,
+    mcnemar,
+    paired_bootstrap_test,
+    paired_permutation,
+    split_permutation,
+)
+from drivax.evaluation.misfits import refuse_metric, refuse_misfits, refuse_undefined
+from drivax.evaluation.plan import ComparisonPlan
+from drivax.evaluation.results import RATES, interval_of
+from drivax.evaluation.split import Split, assign, strata_of
+from drivax.evaluation.statistics import (
+    Interval,
+    bootstrap_mean,
+    crossed_bootstrap,
+    paired_bootstrap,
+    split_bootstrap,
+)
+from drivax.evaluation.stored import EpisodeTable, Pairs
+
+#: Without a smallest difference of its own, a plan takes this share of the standard deviation.
+SMALL_EFFECT = 0.1
+Values = Float64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class SeedSpread:
+    """How the seeds of a policy differ in the primary metric.
+
+    Attributes:
+        means: Of each seed; None where it is undefined throughout.
+        interquartile: Interquartile mean over seeds, with an interval that resamples seeds and recordings.
+    """
+
+    means: tuple[float | None, ...]
+    interquartile: Interval
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A plan carried out.
+
+    Attributes:
+        plan: What was planned.
+        names: Of A and B.
+        folders: Run folders of A and B.
+        traffic: In which both drove.
+        scenarios: Of A and of B; the same ones where they are paired.
+        recordings: Of A and of B.
+        strata: How many strata the split kept alike; 1 without.
+        primary: The metric that decides.
+        secondary: The others.
+        sensitivity: Of the primary metric; None where it does not vary.
+        seeds: Spread over seeds of A and B; None for a single one.
+        decision: What follows.
+    """
+
+    plan: ComparisonPlan
+    names: tuple[str, str]
+    folders: tuple[Path, Path]
+    traffic: str
+    scenarios: tuple[int, int]
+    recordings: tuple[int, int]
+    strata: int
+    primary: MetricComparison
+    secondary: tuple[MetricComparison, ...]
+    sensitivity: Sensitivity | None
+    seeds: tuple[SeedSpread | None, SeedSpread | None]
+    decision: Decision
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; what cannot be said is null."""
+        found = asdict(self) | {"plan": settings.plain(self.plan), "folders": [*map(str, self.folders)]}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+
+
+@dataclass(frozen=True)
+class _Side:
+    """One planner: the evaluations of its seeds, and its scenarios among the common ones."""
+
+    tables: Sequence[EpisodeTable]
+    pairs: Pairs
+    arm: Bool[np.ndarray, " n"]
+
+    def by_seed(self, metric: str) -> Float64[np.ndarray, "seed n"]:
+        return np.stack([self.pairs.values(table, metric) for table in self.tables])
+
+    def values(self, metric: str) -> Values:
+        """Mean over the seeds where it is defined; NaN elsewhere and outside of the arm."""
+        x = self.by_seed(metric)
+        there = ~np.isnan(x) & self.arm
+        sums = np.where(there, x, 0.0).sum(axis=0)
+        return np.divide(sums, there.sum(axis=0), out=np.full(sums.shape, np.nan), where=there.any(axis=0))
+
+    @property
+    def folder(self) -> Path:
+        return self.tables[0].folder if len(self.tables) == 1 else self.tables[0].folder.parent
+
+    @property
+    def name(self) -> str:
+        return self.tables[0].name if len(self.tables) == 1 else self.folder.name
+
+    @property
+    def recordings(self) -> int:
+        return len({cluster for cluster, mine in zip(self.pairs.clusters, self.arm, strict=True) if mine})
+
+
+def compare(
+    plan: ComparisonPlan,
+    a: Sequence[EpisodeTable],
+    b: Sequence[EpisodeTable],
+    entries: Sequence[Mapping[str, Any]] = (),
+) -> Comparison:
+    """Carries a plan out.
+
+    Args:
+        plan: What to compare and how to decide.
+        a: The evaluations of A's seeds; one for a planner without.
+        b: B's.
+        entries: What the manifest of the set says about each scenario, for a stratified split.
+
+    Raises:
+        UsageError: The evaluations cannot be compared, or lack a metric of the plan.
+    """
+    refuse_misfits(a, b)
+    for metric in (plan.primary, *plan.secondary):
+        refuse_metric(metric, (*a, *b), primary=metric == plan.primary)
+    pairs = Pairs.of(*a, *b)
+    if not pairs.keys:
+        raise UsageError("A and B have no scenario in common", cure="evaluate both on the same scenarios")
+    split = None if plan.split == "paired" else _split(plan, pairs, entries)
+    everyone = np.ones(len(pairs.keys), bool)
+    arms = (everyone, everyone) if split is None else (split.first, ~split.first)
+    sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
+    first = _compared(plan, plan.primary, sides, split)
+    if min(first.a.n, first.b.n) == 0:
+        refuse_undefined(plan.primary, (*a, *b))
+    others = [_compared(plan, metric, sides, split) for metric in plan.secondary]
+    adjusted = holm([one.evidence.p for one in others])
+    secondary = tuple(judged(plan, one, p) for one, p in zip(others, adjusted, strict=True))
+    primary = judged(plan, first, first.evidence.p)
+    sensitivity = _sensitivity(plan, sides, split)
+    return Comparison(
+        plan=plan,
+        names=_names(*sides),
+        folders=(sides[0].folder, sides[1].folder),
+        traffic=a[0].traffic,
+        scenarios=(int(arms[0].sum()), int(arms[1].sum())),
+        recordings=(sides[0].recordings, sides[1].recordings),
+        strata=1 if split is None else split.strata_count,
+        primary=primary,
+        secondary=secondary,
+        sensitivity=sensitivity,
+        seeds=(_spread(plan, sides[0]), _spread(plan, sides[1])),
+        decision=decide(plan, primary, secondary, sensitivity),
+    )
+
+
+def _names(a: _Side, b: _Side) -> tuple[str, str]:
+    if a.name != b.name:
+        return a.name, b.name
+    return f"{a.name} ({a.folder.name})", f"{b.name} ({b.folder.name})"
+
+
+def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:
+    strata = None
+    if plan.split == "stratified":
+        known = {(entry["dataset"], entry["scenario_id"]): entry for entry in entries}
+        missing = next((key for key in pairs.keys if key not in known), None)
+        if missing is not None:
+            raise UsageError(
+                f"nothing tells the stratum of {missing[1]}", cure="name the set that was driven with --data"
+            )
+        strata = strata_of([known[key] for key in pairs.keys], plan.strata)
+    return assign(pairs.clusters, strata, plan.ratio, plan.seed)
+
+
+def _compared(
+    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None
+) -> MetricComparison:
+    """One metric, not yet judged."""
+    clusters, seeds = sides[0].pairs.clusters, max(len(side.tables) for side in sides)
+    x, y = (side.values(metric) for side in sides)
+    undefined = [int((np.isnan(v) & side.arm).sum()) for v, side in zip((x, y), sides, strict=True)]
+    draws = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
+    if split is None:
+        both = ~np.isnan(x) & ~np.isnan(y)
+        x, y = np.where(both, x, np.nan), np.where(both, y, np.nan)
+        if seeds == 1:
+            difference = paired_bootstrap(x, y, clusters, **draws)
+        else:
+            mine, theirs = (np.where(both, side.by_seed(metric), np.nan) for side in sides)
+            difference = crossed_bootstrap(mine, clusters, against=theirs, **draws)
+            if both.any():
+                difference = replace(difference, mean=float((x - y)[both].mean()), n=int(both.sum()))
+        effects = asdict(cohens_d_paired(x, y))
+        evidence = _paired_test(plan, metric, x, y, clusters)
+    else:
+        values = np.where(split.first, x, y)
+        difference = split_bootstrap(values, split.first, clusters, strata=split.strata, **draws)
+        effects = {"d": cohens_d(x, y)}
+        evidence = split_permutation(
+            values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
+        )
+    a, b = (_interval(plan, metric, one, clusters) for one in (x, y))
+    found = sides[0].tables[0].metric(metric)
+    unit, better = ("", "-") if found is None else (found.unit, found.better)
+    return MetricComparison(
+        metric, unit, better, a, b, difference, effects, evidence, None, None, seeds, *undefined
+    )
+
+
+def _interval(plan: ComparisonPlan, metric: str, x: Values, clusters: Sequence[str]) -> Interval:
+    if metric in RATES and not _is_binary(x):  # shares of several seeds
+        return bootstrap_mean(x, clusters, plan.confidence, plan.resamples, seed=plan.seed)
+    return interval_of(metric, x, clusters, plan.confidence, plan.seed)
+
+
+def _is_binary(x: Values) -> bool:
+    return bool(np.isin(x[~np.isnan(x)], (0.0, 1.0)).all())
+
+
+def _paired_test(
+    plan: ComparisonPlan, metric: str, x: Values, y: Values, clusters: Sequence[str]
+) -> Evidence:
+    """McNemar's test of rates in independent pairs; else the plan's test of means, by recordings."""
+    _, labels = defined(x, clusters)
+    alone = labels.size == 0 or int(labels.max()) + 1 == labels.size
+    if metric in RATES and alone and _is_binary(x) and _is_binary(y):
+        return mcnemar(x, y)
+    test = paired_permutation if plan.test == "permutation" else paired_bootstrap_test
+    return test(x, y, clusters, plan.resamples, seed=plan.seed)
+
+
+def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split | None) -> Sensitivity | None:
+    """What the primary metric could have shown."""
+    x, y = (side.values(plan.primary) for side in sides)
+    if split is None:
+        apart, labels = defined(x - y, sides[0].pairs.clusters)
+        share, deviation = None, float(apart.std(ddof=1)) if apart.size > 1 else 0.0
+    else:
+        residuals = np.where(split.first, x - np.nanmean(x), y - np.nanmean(y))
+        apart, labels = defined(residuals, sides[0].pairs.clusters)
+        a, b = x[~np.isnan(x)], y[~np.isnan(y)]
+        share = a.size / apart.size
+        deviation = pooled_deviation(a, b) if apart.size > 2 else 0.0
+    if deviation <= ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
+        return None
+    smallest = plan.smallest_difference or SMALL_EFFECT * deviation
+    effect, inflation = smallest / deviation, design_effect(apart, labels)
+    n = apart.size / inflation
+    seen = detectable(n, plan.power, plan.confidence, share)
+    return Sensitivity(
+        deviation=deviation,
+        design_effect=inflation,
+        smallest=smallest,
+        power=power(effect, n, plan.confidence, share),
+        detectable=None if seen is None else seen * deviation,
+        needed=math.ceil(inflation * scenarios_needed(effect, plan.power, plan.confidence, share)),
+    )
+
+
+def _spread(plan: ComparisonPlan, side: _Side) -> SeedSpread | None:
+    if len(side.tables) == 1:
+        return None
+    x = np.where(side.arm, side.by_seed(plan.primary), np.nan)
+    middle = crossed_bootstrap(
+        x,
+        side.pairs.clusters,
+        plan.confidence,
+        plan.resamples,
+        across="interquartile_mean",
+        seed=plan.seed,
+    )
+    means = [row[~np.isnan(row)] for row in x]
+    return SeedSpread(tuple(float(row.mean()) if row.size else None for row in means), middle)

@@ -1,0 +1,119 @@
+"""Why two evaluations cannot be compared, each reason in one line with its cure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.evaluation.results import NOT_SUMMARISED
+from drivax.evaluation.stored import EpisodeTable
+from drivax.named import nearest
+from drivax.tracking.runs import CONFIG_FILE
+
+#: Settings of an evaluation that make other episodes.
+_ALIKE = ("noisy_start", "start_step")
+
+
+def refuse_misfits(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
+    """Refuses evaluations whose episodes are no pairs.
+
+    Args:
+        a: The evaluations of A's seeds.
+        b: Those of B's.
+
+    Raises:
+        UsageError: One is named twice; a side holds several planners; or they drove different sets, in different
+            traffic, or from different starts.
+    """
+    tables = (*a, *b)
+    if len({table.folder.resolve() for table in tables}) < len(tables):
+        raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
+    for side in (a, b):
+        planners = {re.sub(r"[0-9]+$", "", table.name): table.name for table in side}
+        if len(planners) > 1:
+            names = ", ".join(sorted(planners.values()))
+            raise UsageError(
+                f"holds evaluations of several planners ({names})",
+                file=side[0].folder.parent,
+                cure=f"name one of them, as {side[0].folder}",
+            )
+    for table in tables[1:]:
+        _refuse_pair(tables[0], table)
+
+
+def _refuse_pair(one: EpisodeTable, other: EpisodeTable) -> None:
+    where = f"{one.folder} and {other.folder}"
+    hashes = [str(run.data.get("hash") or "") for run in (one, other)]
+    if all(hashes) and hashes[0] != hashes[1]:
+        raise UsageError(
+            f"{where} drove different scenario sets ({hashes[0][:12]} and {hashes[1][:12]})",
+            cure="evaluate both with the same --data",
+        )
+    if one.traffic != other.traffic:
+        raise UsageError(
+            f"{where} drove in different traffic ({one.traffic} and {other.traffic})",
+            cure="evaluate both with the same --traffic",
+        )
+    settings_of = [_settings(run) for run in (one, other)]
+    for name in _ALIKE:
+        values = [found.get(name) for found in settings_of]
+        if None not in values and values[0] != values[1]:
+            raise UsageError(
+                f"{where} differ in {name} ({values[0]} and {values[1]})", cure="evaluate both with the same"
+            )
+
+
+def _settings(run: EpisodeTable) -> dict[str, Any]:
+    file = run.folder / CONFIG_FILE
+    found = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
+    return found if isinstance(found, dict) else {}
+
+
+def refuse_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) -> None:
+    """Refuses a metric that a comparison cannot use.
+
+    Args:
+        metric: Its name.
+        tables: The evaluations.
+        primary: Whether it decides, which takes a direction.
+
+    Raises:
+        UsageError: An evaluation lacks it; it is a code or count, or a partial score; or it cannot decide.
+    """
+    for table in tables:
+        if metric not in table.metrics:
+            known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
+            raise UsageError(f"{table.folder} has no metric {metric!r}", cure=nearest(metric, known))
+    if metric in NOT_SUMMARISED:
+        raise UsageError(f"no mean of {metric} makes sense", cure="choose another metric")
+    if metric.endswith("_partial"):
+        whole = metric.removesuffix("_partial")
+        raise UsageError(
+            f"{metric} is made up differently from scenario to scenario, so that no mean makes sense",
+            cure=f"choose {whole}, or one of its inputs",
+        )
+    found = tables[0].metric(metric)
+    if primary and (found is None or found.better == "-"):
+        raise UsageError(f"{metric} is neither better high nor low", cure="choose another primary metric")
+
+
+def refuse_undefined(metric: str, tables: Sequence[EpisodeTable]) -> None:
+    """Refuses a primary metric without a single value to compare.
+
+    Raises:
+        UsageError: Always; it says whether the scores are partial.
+    """
+    partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
+    if any(not np.isnan(values).all() for values in partial):
+        raise UsageError(
+            f"every {metric} is partial: one of its inputs is undefined in these scenarios",
+            cure="choose another primary metric, as success or accuracy",
+        )
+    raise UsageError(
+        f"{metric} is defined for A and B in no common scenario", cure="choose another primary metric"
+    )

@@ -1,0 +1,266 @@
+"""Evaluations read back from their run folders, and the pairs of episodes that two of them make."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from drivax.errors import DataError
+from drivax.evaluation.results import KEYS
+from drivax.metrics.catalogue import METRICS, Metric
+from drivax.scenario.store import ScenarioSet
+
+#: The cure for a run folder that is damaged.
+AGAIN = "run drivax evaluate again"
+
+Array = np.ndarray[Any, Any]
+#: A scenario of a data set: ``(dataset, scenario_id)``.
+ScenarioKey = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class OwnMetric:
+    """A metric that drivax does not know: unit, direction (``high``, ``low``, ``-``) and one line of text."""
+
+    unit: str
+    better: str
+    text: str
+
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """What one planner did in one scenario set: the rows of its ``episodes.csv``.
+
+    Attributes:
+        folder: The run folder.
+        name: Name of the planner in tables.
+        about: ``run.json``.
+        keys: Columns of :data:`KEYS`, as text.
+        metrics: Columns of metrics; NaN where undefined.
+    """
+
+    folder: Path
+    name: str
+    about: Mapping[str, Any]
+    keys: Mapping[str, tuple[str, ...]]
+    metrics: Mapping[str, Float[Array, " episode"]]
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.keys["scenario_id"])
+
+    @property
+    def traffic(self) -> str:
+        """How the other agents moved: ``log`` or ``idm``."""
+        return str(self.about.get("traffic", "log"))
+
+    @property
+    def own_metrics(self) -> Mapping[str, OwnMetric]:
+        """What the run says about metrics of the user's own."""
+        told = self.about.get("own_metrics") or {}
+        return {name: OwnMetric(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in told.items()}
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """Path, hash and name of the scenario set, as far as they are known."""
+        data = self.about.get("data") or {}
+        return data[0] if isinstance(data, list) and data else data if isinstance(data, dict) else {}
+
+    @property
+    def scenarios(self) -> list[ScenarioKey]:
+        """The scenario of every episode."""
+        return list(zip(self.keys["dataset"], self.keys["scenario_id"], strict=True))
+
+    @property
+    def clusters(self) -> list[str]:
+        """Cluster of every episode: its segment, or its scenario where no segment is known."""
+        keys = self.keys
+        rows = zip(keys["dataset"], keys["segment"], keys["scenario_id"], strict=True)
+        return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
+
+    def metric(self, name: str) -> Metric | OwnMetric | None:
+        """Unit and direction of a metric; None where nobody told."""
+        return METRICS.get(name) or self.own_metrics.get(name)
+
+    def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
+        """Mean of a metric per scenario over its defined episodes; NaN where there is none."""
+        values = self.metrics.get(metric)
+        gathered: dict[ScenarioKey, list[float]] = {}
+        for row, key in enumerate(self.scenarios):
+            gathered.setdefault(key, []).append(math.nan if values is None else float(values[row]))
+        means = {}
+        for key, cells in gathered.items():
+            there = [cell for cell in cells if not math.isnan(cell)]
+            means[key] = float(np.mean(there)) if there else math.nan
+        return means
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The scenarios that evaluations have in common, in the order of the first.
+
+    Attributes:
+        keys: The scenarios.
+        clusters: Cluster of each.
+    """
+
+    keys: tuple[ScenarioKey, ...]
+    clusters: tuple[str, ...]
+
+    @classmethod
+    def of(cls, one: EpisodeTable, *others: EpisodeTable) -> Pairs:
+        """The common scenarios of evaluations."""
+        cluster = dict(zip(one.scenarios, one.clusters, strict=True))
+        driven = [set(other.scenarios) for other in others]
+        keys = tuple(key for key in cluster if all(key in theirs for theirs in driven))
+        return cls(keys, tuple(cluster[key] for key in keys))
+
+    def values(self, table: EpisodeTable, metric: str) -> Float64[Array, " scenario"]:
+        """A metric of one of the evaluations, scenario by scenario; repeated episodes are averaged."""
+        means = table.by_scenario(metric)
+        return np.array([means[key] for key in self.keys], np.float64)
+
+
+def comparable(one: EpisodeTable, other: EpisodeTable) -> bool:
+    """Whether two runs drove the same scenario set in the same traffic, so that their episodes can be paired."""
+    hashes = {run.data.get("hash") for run in (one, other)} - {None}
+    return len(hashes) <= 1 and one.traffic == other.traffic
+
+
+def read_evaluation(folder: Path) -> EpisodeTable:
+    """The episodes of a run folder of ``drivax evaluate``.
+
+    Raises:
+        DataError: The folder or a file is missing or damaged, or it is no evaluation.
+    """
+    about = read_about(folder)
+    if about.get("kind") != "evaluation":
+        raise DataError(
+            f"is of kind {about.get('kind')!r}, not evaluation",
+            file=folder / "run.json",
+            cure="give a folder written by drivax evaluate",
+        )
+    return EpisodeTable(folder, str(about.get("planner", folder.name)), about, *read_episodes(folder))
+
+
+def read_seeds(folder: Path) -> tuple[EpisodeTable, ...]:
+    """The evaluation in a folder; or those in its sub-folders, one for each seed of a policy, in order of their names.
+
+    Raises:
+        DataError: A folder or a file is missing or damaged, or there is no evaluation.
+    """
+    inside = sorted(file.parent for file in folder.glob("*/episodes.csv"))
+    if (folder / "run.json").is_file() or not inside:
+        return (read_evaluation(folder),)
+    return tuple(read_evaluation(one) for one in inside)
+
+
+def open_driven_set(run: EpisodeTable, data: Path | None = None) -> ScenarioSet:
+    """The scenario set that a run drove.
+
+    Args:
+        run: The evaluation.
+        data: Where the set is, if it has moved.
+
+    Raises:
+        DataError: It is not there, or another one is.
+    """
+    named = run.data.get("path")
+    if data is None and named is None:
+        raise DataError("names no scenario set", file=run.folder / "run.json", cure="pass it with --data SET")
+    path = data if data is not None else Path(str(named))
+    if data is None and not path.exists():
+        raise DataError(
+            "the scenario set of this run is not there any more",
+            file=path,
+            cure="pass its new place with --data SET",
+        )
+    scenarios = ScenarioSet.open(path)
+    wanted = run.data.get("hash")
+    if wanted and scenarios.hash != wanted:
+        raise DataError(
+            f"is not the set that {run.name!r} was evaluated on (hash {scenarios.hash[:12]}, not {str(wanted)[:12]})",
+            file=path,
+            cure="pass the set that was evaluated with --data SET",
+        )
+    return scenarios
+
+
+def read_about(folder: Path) -> dict[str, Any]:
+    """``run.json`` of a run folder.
+
+    Raises:
+        DataError: The folder or the file is missing or damaged.
+    """
+    if not folder.is_dir():
+        raise DataError(
+            "there is no such run folder", file=folder, cure="check the path, or run drivax evaluate"
+        )
+    path = present(folder / "run.json", "give a folder written by drivax evaluate or drivax train")
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DataError(f"is not JSON ({error})", file=path, cure="run the command again") from error
+    if not isinstance(about, dict):
+        raise DataError("holds no table of facts", file=path, cure="run the command again")
+    return about
+
+
+def present(path: Path, cure: str = AGAIN) -> Path:
+    """A file that has to be there.
+
+    Raises:
+        DataError: It is not.
+    """
+    if not path.is_file():
+        raise DataError("is missing", file=path, cure=cure)
+    return path
+
+
+def read_episodes(folder: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
+    """Columns of ``episodes.csv``: those of :data:`KEYS` as text, and the metrics, NaN where undefined.
+
+    Raises:
+        DataError: The file is missing or damaged.
+    """
+    path = present(folder / "episodes.csv")
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    header = rows[0] if rows else []
+    missing = [key for key in KEYS if key not in header]
+    if missing or len(set(header)) < len(header):
+        problem = f"lacks the column {missing[0]!r}" if missing else "names a column twice"
+        raise DataError(problem, file=path, record="header", cure=AGAIN)
+    if len(rows) < 2:
+        raise DataError("holds no episodes", file=path, cure=AGAIN)
+    for number, row in enumerate(rows[1:], start=1):
+        if len(row) != len(header):
+            raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=AGAIN)
+    columns = {name: [row[place] for row in rows[1:]] for place, name in enumerate(header)}
+    keys = {name: tuple(columns[name]) for name in KEYS}
+    return keys, {name: _column(path, name, columns[name]) for name in header if name not in KEYS}
+
+
+def _column(path: Path, name: str, cells: Sequence[str]) -> Array:
+    """A metric's cells as float64; an empty cell is NaN (undefined)."""
+    values = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cells):
+        try:
+            values[row] = float(cell) if cell.strip() else math.nan
+        except ValueError:
+            problem = f"{name} is {cell!r}, not a number or empty"
+            raise DataError(problem, file=path, record=row + 1, cure=AGAIN) from None
+        if cell.strip() and not math.isfinite(values[row]):
+            # An undefined value is an empty cell; a number that is none is a defect, not a missing value.
+            problem = f"{name} is {'infinite' if math.isinf(values[row]) else 'NaN'}"
+            raise DataError(problem, file=path, record=row + 1, cure=AGAIN)
+    return values

@@ -1,0 +1,165 @@
+"""A car that tracks a trajectory: two one-step linear-quadratic regulators and a bicycle with lags.
+
+Source: nuPlan's planner simulation (its LQR tracker and kinematic bicycle), which PDM-Closed drives its proposals with.
+The car itself moves by ``simulator.dynamics.bicycle``, as every driven agent does, so that the first step of what is
+tracked in thought is what happens.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from drivax.geometry.angles import wrap
+from drivax.scenario.record import record
+from drivax.scenario.schema import DT_S
+from drivax.simulator.dynamics import bicycle
+from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """The tracker and the car; the defaults are nuPlan's.
+
+    Attributes:
+        horizon: Steps over which the commands are held, and how far ahead errors are looked at.
+        speed_weight, acceleration_weight: Prices of a squared speed error and acceleration.
+        lateral_weight, heading_weight, steering_weight, rate_weight: Prices of a squared lateral error (m),
+            heading error (rad), steering angle (rad) and steering rate (rad/s).
+        stopping_mps, stopping_gain: Below this speed a car that is to stand is stopped by this gain, 1/s, instead.
+        acceleration_lag_s, steering_lag_s: Time constants of the actuators.
+        most_steering: Largest steering angle, rad.
+        wheelbase: As a share of the length (nuPlan's vehicle: 3.089 m of 5.176 m).
+    """
+
+    horizon: int = 10
+    speed_weight: float = 10.0
+    acceleration_weight: float = 1.0
+    lateral_weight: float = 1.0
+    heading_weight: float = 10.0
+    steering_weight: float = 0.0
+    rate_weight: float = 1.0
+    stopping_mps: float = 0.2
+    stopping_gain: float = 0.5
+    acceleration_lag_s: float = 0.2
+    steering_lag_s: float = 0.05
+    most_steering: float = math.pi / 3
+    wheelbase: float = 3.089 / 5.176
+
+
+@record
+class Car:
+    """A car with actuators.
+
+    Attributes:
+        motion: x, y, heading, speed.
+        acceleration: m/s2.
+        steering: Angle of the front wheels, rad.
+    """
+
+    motion: Float[Array, "*batch 4"]
+    acceleration: Float[Array, "*batch"]
+    steering: Float[Array, "*batch"]
+
+
+@record
+class Reference:
+    """What is tracked, at steps of 0.1 s from now on.
+
+    Attributes:
+        pose: x, y, cosine and sine of the heading.
+        speed: m/s.
+        curvature: Of the path there, 1/m.
+    """
+
+    pose: Float[Array, "*batch T 4"]
+    speed: Float[Array, "*batch T"]
+    curvature: Float[Array, "*batch T"]
+
+
+def acceleration_to(
+    speed: Float[Array, ""], wanted: Float[Array, ""], config: TrackingConfig
+) -> Float[Array, ""]:
+    """Acceleration that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a``, m/s2.
+
+    Args:
+        speed: v, m/s.
+        wanted: v*, the speed to have at the horizon, m/s.
+        config: Weights q and r, and the horizon N.
+    """
+    q, r, b = config.speed_weight, config.acceleration_weight, config.horizon * DT_S
+    return b * q * (wanted - speed) / (b * q * b + r)
+
+
+def steering_rate(
+    error: tuple[Array, Array, Array],
+    speeds: Float[Array, " N"],
+    curvatures: Float[Array, " N"],
+    wheelbase: Float[Array, ""],
+    config: TrackingConfig,
+) -> Float[Array, ""]:
+    """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
+
+    x is (lateral error e, heading error h, steering angle d), and per step
+    ``e += dt v h``, ``h += dt v (d / L - k)``, ``d += dt u``: linear in x and u. With z the state at the horizon for
+    ``u = 0`` and b that for ``x = 0, k = 0, u = 1``, ``u = -b' Q z / (b' Q b + r)``.
+
+    Args:
+        error: x now.
+        speeds: v at each step up to the horizon, m/s.
+        curvatures: k at each step, 1/m.
+        wheelbase: L, m.
+        config: Weights Q and r.
+    """
+    e, h, d = error
+    be, bh, bd = (jnp.zeros(()) for _ in range(3))
+    for step in range(config.horizon):
+        way, k = speeds[step] * DT_S, curvatures[step]
+        e, h = e + way * h, h + way * (d / wheelbase - k)
+        be, bh, bd = be + way * bh, bh + way * bd / wheelbase, bd + DT_S
+    h, d = wrap(h), wrap(d)
+    q_e, q_h, q_d = config.lateral_weight, config.heading_weight, config.steering_weight
+    gain = q_e * be * be + q_h * bh * bh + q_d * bd * bd + config.rate_weight
+    return -(q_e * be * e + q_h * bh * h + q_d * bd * d) / gain
+
+
+def moved(
+    car: Car, acceleration: Array, rate: Array, wheelbase: Float[Array, ""], config: TrackingConfig
+) -> Car:
+    """The car one step after a command: each actuator goes ``dt / (dt + lag)`` of the way to what is asked for."""
+    share = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
+    acceleration = car.acceleration + share[0] * (acceleration - car.acceleration)
+    steering = car.steering + share[1] * rate * DT_S
+    steering = jnp.clip(steering, -config.most_steering, config.most_steering)
+    motion = bicycle(car.motion, acceleration, jnp.tan(steering) / wheelbase)
+    return Car(motion, acceleration, steering)
+
+
+def tracked(car: Car, reference: Reference, wheelbase: Float[Array, ""], config: TrackingConfig) -> Car:
+    """The car at every step of a reference, the present one included, as it tracks it."""
+    last = reference.speed.shape[0] - 1
+    ahead = np.minimum(np.arange(last)[:, None] + np.arange(config.horizon), last)
+    to_have = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]
+
+    def step(car: Car, now: tuple[Any, Array, Array]) -> Any:
+        (x, y, cos, sin), wanted, curvatures = now
+        motion, speed = car.motion, car.motion[MOTION_SPEED]
+        stops = (wanted <= config.stopping_mps) & (speed <= config.stopping_mps)
+        gentle = config.stopping_gain * (wanted - speed)
+        acceleration = jnp.where(stops, gentle, acceleration_to(speed, wanted, config))
+        lateral = (motion[1] - y) * cos - (motion[0] - x) * sin
+        heading = wrap(motion[MOTION_HEADING] - jnp.arctan2(sin, cos))
+        speeds = jnp.maximum(speed + acceleration * DT_S * np.arange(config.horizon), 0.0)
+        rate = steering_rate((lateral, heading, car.steering), speeds, curvatures, wheelbase, config)
+        car = moved(car, acceleration, jnp.where(stops, 0.0, rate), wheelbase, config)
+        return car, car
+
+    poses = tuple(reference.pose[:last].T)
+    _, cars = jax.lax.scan(step, car, (poses, to_have, reference.curvature[ahead]))
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), car, cars)

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.evaluation.clusters import defined, dense, design_effect, stratum_of_clusters
+
+
+def test_undefined_values_leave_and_their_clusters_close_up():
+    x, labels = defined([1.0, None, 3.0, float("nan"), 5.0], ["b", "a", "b", "c", "d"])
+    np.testing.assert_array_equal(x, [1, 3, 5])
+    np.testing.assert_array_equal(labels, [0, 0, 1])
+    assert list(defined([1.0, None, 2.0])[1]) == [0, 1]
+
+
+def test_design_effect_by_hand():
+    # Totals 3 and 7 of two values each, mean 2.5: V = 2 (4 + 4) / 16 = 1; spread 1.25, over n 0.3125.
+    assert design_effect(
+        np.array([1.0, 2, 3, 4]), dense(["a", "a", "b", "b"], 4, "cluster")
+    ) == pytest.approx(3.2)
+    # Opposite values in a cluster cancel: no better than independent.
+    assert design_effect(np.array([1.0, 4, 2, 3]), dense(["a", "a", "b", "b"], 4, "cluster")) == 1.0
+    # Where nothing varies, or all is one cluster, clusters count.
+    assert design_effect(np.ones(6), dense([0, 0, 0, 1, 1, 1], 6, "cluster")) == 3.0
+    assert design_effect(np.array([1.0, 2, 3]), np.zeros(3, np.int64)) == 3.0
+
+
+def test_design_effect_of_equal_clusters_is_one_plus_m_minus_one_times_their_correlation():
+    """Kish: ``1 + (m - 1) rho`` for clusters of ``m`` (here m = 5, rho = 0.6)."""
+    rng = np.random.default_rng(0)
+    x = np.sqrt(0.6) * rng.normal(size=(20_000, 1)) + np.sqrt(0.4) * rng.normal(size=(20_000, 5))
+    assert design_effect(x.ravel(), np.repeat(np.arange(20_000), 5)) == pytest.approx(1 + 4 * 0.6, rel=0.03)
+
+
+def test_strata_of_clusters_and_their_pooling():
+    labels = np.array([0, 0, 1, 2, 3, 4])
+    strata = ["x", "x", "x", "y", "z", "z"]
+    assert list(stratum_of_clusters(strata, labels, least=1)) == [0, 0, 1, 2, 2]
+    # y alone is too small, and there is nothing to take it together with but the smallest other (x before z).
+    assert list(stratum_of_clusters(strata, labels, least=2)) == [0, 0, 0, 1, 1]
+    # y and w are small and make a stratum of two.
+    assert list(stratum_of_clusters(["x", "x", "y", "w"], np.arange(4), least=2)) == [0, 0, 1, 1]
+    # All small: one stratum.
+    assert list(stratum_of_clusters(["x", "y"], np.arange(2), least=5)) == [0, 0]
+    with pytest.raises(UsageError, match="lies in two strata"):
+        stratum_of_clusters(["x", "y"], np.array([0, 0]))

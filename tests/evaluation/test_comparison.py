@@ -1,0 +1,294 @@
+"""Comparisons of hand-made evaluations: what is paired, what is refused, and what the rule says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.evaluation.comparison import compare
+from drivax.evaluation.effects import power, scenarios_needed
+from drivax.evaluation.hypotheses import holm, mcnemar, paired_permutation
+from drivax.evaluation.plan import ComparisonPlan
+from drivax.evaluation.statistics import paired_bootstrap, rate
+from drivax.evaluation.stored import EpisodeTable, read_evaluation, read_seeds
+
+N = 60
+PLAN = ComparisonPlan(minimum_scenarios=10, resamples=400, secondary=("collision", "comfortable"))
+
+
+def table(name, shift=0.0, seed=1, rows=range(N), per_recording=1, about=None, **metrics):
+    """An evaluation with a score, collisions and comfort; rows are numbers of scenarios."""
+    rng, rows = np.random.default_rng(seed), np.array(rows)
+    scene = np.random.default_rng(0).normal(0.6, 0.2, 10 * N)[rows]
+    values = {
+        "vmax_score": scene + shift + rng.normal(0, 0.05, rows.size),
+        "collision": (rng.random(rows.size) < 0.3 - shift).astype(float),
+        "comfortable": (rng.random(rows.size) < 0.5).astype(float),
+        "min_ttc": np.full(rows.size, np.nan),
+        "steps": np.full(rows.size, 80.0),
+    }
+    keys = {
+        "planner": (name,) * rows.size,
+        "dataset": ("d",) * rows.size,
+        "scenario_id": tuple(f"s{row}" for row in rows),
+        "segment": tuple(f"r{row // per_recording}" for row in rows),
+        "seed": ("0",) * rows.size,
+        "traffic": ("log",) * rows.size,
+    }
+    known = {"traffic": "log", "data": {"hash": "abc"}} | (about or {})
+    return EpisodeTable(Path("runs") / name, name, known, keys, values | metrics)
+
+
+def test_paired_by_hand():
+    a, b = table("one", 0.1, seed=2), table("two")
+    found = compare(PLAN, [a], [b])
+    one = found.primary
+    x, y = a.metrics["vmax_score"], b.metrics["vmax_score"]
+    assert one.difference == paired_bootstrap(x, y, a.clusters, resamples=400, seed=0)
+    assert one.evidence == paired_permutation(x, y, a.clusters, 400, seed=0)
+    assert one.effects["d_z"] == pytest.approx((x - y).mean() / (x - y).std(ddof=1))
+    assert (found.scenarios, found.recordings, found.strata) == ((N, N), (N, N), 1)
+    assert one.winner == "A" and found.decision.recommendation == "A" and found.decision.because == "test"
+    rates = found.secondary
+    assert rates[0].evidence == mcnemar(a.metrics["collision"], b.metrics["collision"])
+    assert rates[0].a == rate(a.metrics["collision"])
+    assert [r.p_adjusted for r in rates] == holm([r.evidence.p for r in rates])
+
+
+def test_turned_round():
+    a, b = table("one", 0.1, seed=2), table("two")
+    forth, back = compare(PLAN, [a], [b]), compare(PLAN, [b], [a])
+    assert back.decision.recommendation == "B"
+    assert back.primary.difference.mean == pytest.approx(-forth.primary.difference.mean)
+    assert back.primary.evidence.p == pytest.approx(forth.primary.evidence.p, abs=0.01)
+
+
+def test_less_is_better_where_the_metric_says_so():
+    worse = table("one", collision=np.ones(N))
+    plan = dataclasses.replace(PLAN, primary="collision", secondary=("vmax_score",))
+    assert compare(plan, [worse], [table("two", seed=2)]).decision.recommendation == "B"
+
+
+def test_recordings_are_kept_together():
+    a, b = table("one", per_recording=3, seed=2), table("two", per_recording=3)
+    found = compare(PLAN, [a], [b])
+    assert found.recordings == (20, 20) and found.secondary[0].evidence.name == "permutation"
+    assert found.primary.evidence.units == 20
+
+
+def test_order_does_not_matter_and_only_common_scenarios_count():
+    a = table("one", rows=range(N))
+    part = table("two", rows=list(reversed(range(20, N + 10))))
+    found = compare(PLAN, [a], [part])
+    y = dict(zip(part.keys["scenario_id"], part.metrics["vmax_score"], strict=True))
+    expected = np.mean([a.metrics["vmax_score"][row] - y[f"s{row}"] for row in range(20, N)])
+    assert found.scenarios == (40, 40) and found.primary.difference.mean == pytest.approx(expected)
+
+
+def test_undefined_values_leave_in_pairs():
+    a, b = table("one", seed=2), table("two")
+    a.metrics["vmax_score"][:5], b.metrics["vmax_score"][3:10] = np.nan, np.nan
+    one = compare(PLAN, [a], [b]).primary
+    assert (one.a.n, one.b.n, one.difference.n, one.undefined_a, one.undefined_b) == (50, 50, 50, 5, 7)
+    assert one.a.mean - one.b.mean == pytest.approx(one.difference.mean)
+
+
+def test_too_few_scenarios_decide_nothing():
+    found = compare(
+        dataclasses.replace(PLAN, minimum_scenarios=61), [table("one", 0.3)], [table("two", seed=2)]
+    )
+    assert found.primary.winner == "A", "the test is told all the same"
+    assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "minimum")
+    assert found.decision.needed >= 61
+
+
+def test_power_tells_no_difference_from_not_knowing():
+    a, b = table("one", seed=2), table("two")
+    deviation = (a.metrics["vmax_score"] - b.metrics["vmax_score"]).std(ddof=1)
+    for smallest, recommendation in ((0.05, "no difference"), (0.01, "not enough scenarios")):
+        found = compare(dataclasses.replace(PLAN, smallest_difference=smallest), [a], [b])
+        assert found.primary.winner is None and found.decision.because == "power"
+        assert found.decision.recommendation == recommendation
+        seen = found.sensitivity
+        assert seen.power == pytest.approx(power(smallest / deviation, N)) and seen.design_effect == 1.0
+        assert seen.needed == scenarios_needed(smallest / deviation)
+        assert power(seen.detectable / deviation, N) == pytest.approx(0.8)
+    assert found.decision.needed == found.sensitivity.needed > N
+    # Without a number of its own: a tenth of the deviation, for which textbooks ask for 787 pairs.
+    assert compare(PLAN, [a], [b]).sensitivity.needed == scenarios_needed(0.1) == 787
+
+
+def test_recordings_of_several_scenarios_take_more_of_them():
+    a, b = table("one", per_recording=4, seed=2), table("two", per_recording=4)
+    a.metrics["vmax_score"][:] += np.repeat(np.random.default_rng(5).normal(0, 0.2, N // 4), 4)
+    seen = compare(PLAN, [a], [b]).sensitivity
+    assert 3 < seen.design_effect <= 4.5 and seen.needed > 3 * 787
+
+
+def test_planners_that_are_alike():
+    found = compare(PLAN, [table("one")], [table("two")])
+    assert (found.decision.recommendation, found.decision.because) == ("no difference", "alike")
+    assert found.primary.evidence.p == 1.0 and found.sensitivity is None
+
+
+def test_a_better_score_with_more_collisions_is_said():
+    found = compare(PLAN, [table("one", 0.3, collision=np.ones(N))], [table("two", seed=2)])
+    assert found.decision.recommendation == "A" and found.decision.caveats == ("collision",)
+
+
+def entries():
+    tags = [{"difficulty": "hard" if row % 3 == 0 else "easy"} for row in range(10 * N)]
+    return [{"dataset": "d", "scenario_id": f"s{row}", "tags": tag} for row, tag in enumerate(tags)]
+
+
+@pytest.mark.parametrize("split", ["random", "stratified"])
+def test_splits_give_each_planner_its_own_scenarios(split):
+    rows = range(10 * N)
+    plan = dataclasses.replace(PLAN, split=split, strata=("difficulty",), ratio=0.4)
+    a, b = table("one", 0.2, seed=2, rows=rows), table("two", rows=rows)
+    found = compare(plan, [a], [b], entries())
+    assert found.scenarios == (240, 360) and found.strata == (2 if split == "stratified" else 1)
+    one = found.primary
+    assert (one.a.n, one.b.n, one.difference.n) == (240, 360, 600) and list(one.effects) == ["d"]
+    assert one.difference.mean == pytest.approx(one.a.mean - one.b.mean)
+    assert one.difference.mean == pytest.approx(0.2, abs=0.05)
+    assert found.decision.recommendation == "A"
+    # Nearly the width of an ordinary interval of two means.
+    spread = np.sqrt(0.2**2 + 0.05**2) * np.sqrt(1 / 240 + 1 / 360)
+    assert one.difference.high - one.difference.low == pytest.approx(2 * 1.96 * spread, rel=0.15)
+    expected = scipy.stats.norm.ppf([0.975, 0.8]).sum() ** 2 / 0.1**2 / (0.4 * 0.6)
+    assert found.sensitivity.needed == pytest.approx(expected, rel=0.01)
+
+
+def test_seeds_are_averaged_and_resampled():
+    seeds = [table(f"seed-{n}", 0.03 * n, seed=3 + n) for n in range(3)]
+    seeds = [dataclasses.replace(one, folder=Path("runs/bc") / one.name) for one in seeds]
+    found = compare(PLAN, seeds, [table("two")])
+    mean = np.mean([one.metrics["vmax_score"] for one in seeds], axis=0)
+    other = table("two").metrics["vmax_score"]
+    assert found.names[0] == "bc" and found.folders[0] == Path("runs/bc")
+    assert found.primary.difference.mean == pytest.approx((mean - other).mean())
+    assert found.primary.difference.n == N
+    alone = paired_bootstrap(mean, other, resamples=400, seed=0)
+    width = found.primary.difference.high - found.primary.difference.low
+    assert width > 1.3 * (alone.high - alone.low), "seeds that differ widen it"
+    # The test alone, which does not know that seeds differ, would be sure.
+    assert found.primary.evidence.p < 0.05 and (found.primary.winner is None) == (
+        found.primary.difference.low <= 0
+    )
+    spread = found.seeds[0]
+    assert spread.means == pytest.approx([one.metrics["vmax_score"].mean() for one in seeds])
+    assert spread.interquartile.low < spread.interquartile.mean < spread.interquartile.high
+    assert found.seeds[1] is None and found.secondary[0].a.n == N, "shares of several seeds are no 0 or 1"
+
+
+def test_everything_is_plain_json():
+    found = compare(PLAN, [table("one", 0.1)], [table("two", seed=2)])
+    stored = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert stored["decision"]["recommendation"] == "A" and stored["primary"]["difference"]["n"] == N
+    assert stored["plan"]["primary"] == "vmax_score" and stored["secondary"][0]["metric"] == "collision"
+    assert settings.load(ComparisonPlan, stored["plan"]) == PLAN
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"about": {"data": {"hash": "other"}}}, "different scenario sets"),
+        ({"about": {"traffic": "idm"}}, "different traffic (log and idm)"),
+        ({"rows": range(N, 2 * N)}, "no scenario in common"),
+        ({"vmax_score": np.full(N, np.nan)}, "in no common scenario"),
+        ({"vmax_score": np.full(N, np.nan), "vmax_score_partial": np.ones(N)}, "every vmax_score is partial"),
+        ({"name": "one"}, "the same run"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(change, words):
+    with pytest.raises(UsageError) as caught:
+        compare(PLAN, [table("one")], [table(**{"name": "two"} | change)])
+    assert words in str(caught.value) and caught.value.cure and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"primary": "vmaxscore"}, "has no metric 'vmaxscore'; did you mean 'vmax_score'?"),
+        ({"secondary": ("steps",)}, "no mean of steps"),
+        ({"primary": "vmax_score_partial"}, "made up differently"),
+        ({"primary": "ade"}, "neither better high nor low"),
+        ({"split": "stratified"}, "--data"),
+        ({"split": "random", "ratio": 0.999}, "leave an arm empty"),
+    ],
+)
+def test_plans_that_cannot_be_carried_out_are_refused(change, words):
+    more = {"vmax_score_partial": np.ones(N), "ade": np.ones(N)}
+    with pytest.raises(UsageError) as caught:
+        compare(dataclasses.replace(PLAN, **change), [table("one", **more)], [table("two", **more)])
+    assert words in str(caught.value) and caught.value.cure and "\n" not in str(caught.value)
+
+
+def test_seeds_of_several_planners_are_no_seeds():
+    with pytest.raises(UsageError, match=r"several planners \(idm, one\)"):
+        compare(PLAN, [table("one"), table("idm", seed=2)], [table("two", seed=3)])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "ratio: 1.0", "confidence: 95", "power: 0", "minimum_scenarios: 1", "resamples: 10", "smallest_difference: 0",
+        "secondary: [collision, vmax_score]", "secondary: [offroad, offroad]", "split: halves",
+        "{split: random, test: bootstrap}", "minimum: 3",
+    ],
+)  # fmt: skip
+def test_impossible_plans_are_refused(change):
+    with pytest.raises(UsageError) as caught:
+        settings.load(ComparisonPlan, settings.parse_yaml(change))
+    assert "\n" not in str(caught.value) and ";" in str(caught.value)
+
+
+def test_plans_round_trip():
+    plan = ComparisonPlan(name="weekly", a=Path("runs/a"), b=Path("runs/b"), smallest_difference=0.02)
+    assert settings.load(ComparisonPlan, settings.parse_yaml(settings.dump(plan))) == plan
+    default = ComparisonPlan()
+    assert (default.primary, default.minimum_scenarios, default.confidence) == ("vmax_score", 1000, 0.95)
+    assert (default.power, default.ratio, default.split) == (0.8, 0.5, "paired")
+
+
+def written(folder, lines, about='{"kind": "evaluation", "planner": "p"}'):
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text(about)
+    head = "planner,dataset,scenario_id,segment,seed,traffic,success"
+    (folder / "episodes.csv").write_text("\n".join([head, *lines]) + "\n")
+    return folder
+
+
+def test_runs_are_read_back_and_damage_is_named(tmp_path):
+    run = written(tmp_path / "run", ["p,d,s1,,0,log,1", "p,d,s1,,1,log,0", "p,d,s2,r,0,log,"])
+    found = read_evaluation(run)
+    assert found.by_scenario("success")["d", "s1"] == 0.5 and np.isnan(
+        found.by_scenario("success")["d", "s2"]
+    )
+    assert found.clusters == ["d/s1", "d/s1", "d/r"]
+    bad = written(tmp_path / "nan", ["p,d,s1,,0,log,nan"])
+    with pytest.raises(Exception, match="record 1: success is NaN"):
+        read_evaluation(bad)
+    with pytest.raises(Exception, match="of kind 'training', not evaluation"):
+        read_evaluation(written(tmp_path / "train", [], '{"kind": "training"}'))
+    for seed in range(2):
+        written(tmp_path / "seeds" / f"seed-{seed}", [f"seed-{seed},d,s1,,0,log,1"])
+    assert len(read_seeds(tmp_path / "seeds")) == 2 and len(read_seeds(run)) == 1
+    with pytest.raises(Exception, match="there is no such run folder"):
+        read_seeds(tmp_path / "nowhere")
+
+
+def test_other_starts_are_refused(tmp_path):
+    a, b = (written(tmp_path / name, ["p,d,s1,,0,log,1"]) for name in "ab")
+    (a / "config.yaml").write_text("noisy_start: true\nstart_step: 10\n")
+    (b / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
+    with pytest.raises(UsageError, match=r"differ in noisy_start \(True and False\)"):
+        compare(PLAN, [read_evaluation(a)], [read_evaluation(b)])

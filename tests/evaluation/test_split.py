@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.evaluation.split import assign, strata_of
+
+CLUSTERS = [f"r{number // 2}" for number in range(120)]
+#: A third of the recordings is hard; of the easy ones every fourth has one hard scenario of two.
+HARD = ["hard" if (n // 2) % 3 == 0 or n % 8 == 3 else "easy" for n in range(120)]
+
+
+def test_whole_recordings_in_the_wanted_ratio():
+    found = assign(CLUSTERS, None, 0.25, seed=1)
+    arms = {cluster: set() for cluster in CLUSTERS}
+    for cluster, mine in zip(CLUSTERS, found.first, strict=True):
+        arms[cluster].add(bool(mine))
+    assert all(len(arm) == 1 for arm in arms.values()) and found.first.sum() == 30
+    assert found.strata_count == 1
+    np.testing.assert_array_equal(found.first, assign(CLUSTERS, None, 0.25, seed=1).first)
+    assert (found.first != assign(CLUSTERS, None, 0.25, seed=2).first).any()
+
+
+def test_strata_are_halved():
+    found = assign(CLUSTERS, HARD, 0.5, seed=0)
+    assert found.strata_count == 2
+    for stratum in range(2):
+        mine = found.first[found.strata == stratum]
+        assert abs(int(mine.sum()) - int((~mine).sum())) <= 2, "two scenarios of a recording"
+    # Recordings of both kinds belong to the first kind by name among equals: easy.
+    sizes = Counter(found.strata.tolist())
+    assert sizes == {0: 80, 1: 40}
+
+
+def test_rounding_is_made_up_for():
+    """Ten strata of eleven recordings each: halves of the whole, though no stratum can be halved."""
+    clusters = [str(number) for number in range(110)]
+    found = assign(clusters, [f"{number % 10}" for number in range(110)], 0.5, seed=0)
+    assert found.first.sum() == 55 and found.strata_count == 10
+
+
+def test_small_strata_are_taken_together():
+    clusters = [str(number) for number in range(40)]
+    strata = ["common"] * 28 + ["rare"] * 7 + ["rarer"] * 5
+    found = assign(clusters, strata, 0.5, seed=0)
+    assert found.strata_count == 2 and Counter(found.strata.tolist()) == {0: 28, 1: 12}
+
+
+def test_an_empty_arm_is_refused():
+    with pytest.raises(UsageError, match="leave an arm empty"):
+        assign(["a", "a"], None, 0.5, seed=0)
+
+
+def test_strata_are_the_words_of_tags():
+    entries = [{"tags": {"difficulty": "hard", "type": "straight"}}, {"tags": {"type": "merge"}}]
+    assert strata_of(entries, ["difficulty", "type"]) == ["hard straight", "unknown merge"]
+    with pytest.raises(UsageError, match=r"no scenario has a tag 'dificulty'.*difficulty"):
+        strata_of(entries, ["dificulty"])

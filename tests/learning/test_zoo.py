@@ -1,0 +1,218 @@
+"""Policies that are packed and shipped: what comes back is what was trained, under one name everywhere."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import drivax
+from drivax import settings
+from drivax.api import find_planner
+from drivax.cli import main
+from drivax.errors import DataError, UsageError
+from drivax.learning.config import TrainConfig
+from drivax.learning.policies import PACKED, load_policy, pack_policy
+from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_traffic
+from drivax.learning.zoo import is_policy, policy_folder, zoo
+from drivax.simulator.catalogue import prepared
+from drivax.simulator.reactive import IdmTraffic
+from drivax.simulator.traffic import LogTraffic
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.runs import RunFolder
+from scenes import bank_of, car, straight_road
+
+TINY = {
+    "task": {
+        "observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 2},
+        "metrics": "none",
+    },
+    "algorithm": {
+        "kind": "ppo", "network": {"encoder": {"rows": [4], "hidden": [8]}, "head": [4]},
+        "environments": 2, "unroll": 2, "minibatches": 1,
+    },
+    "traffic": "idm", "start": {"kind": "noisy_start"},
+}  # fmt: skip
+
+
+class Learned(NamedTuple):
+    """Of a state of training what is looked at here."""
+
+    parameters: Any
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return bank_of(straight_road([car(speed=10.0), car(20.0, speed=6.0)]))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, bank):
+    """A run folder as training leaves it, but for the training: two checkpoints, of which the older scored better."""
+    config = settings.load(TrainConfig, TINY)
+    folder = RunFolder.create(
+        tmp_path_factory.mktemp("runs") / "bold", config, kind="training", validation="c0de"
+    )
+    about = {"path": "/some/where/train", "hash": "f00d", "scenarios": 3}
+    folder = folder.note(data=[about], command="drivax train tiny")
+    learner = config.algorithm.build(replace(config, traffic="log").environment(), bank, 1)
+    shapes = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
+    for step, score in ((4, 0.5), (8, 0.4)):
+        rng = np.random.default_rng(step)
+        drawn = jax.tree.map(lambda leaf, rng=rng: rng.normal(size=leaf.shape).astype(np.float32), shapes)
+        Checkpoints(folder.checkpoints).save(step, Learned(drawn), score)
+    return folder
+
+
+def weights(planner):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(planner.parameters)]
+
+
+def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
+    packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
+    (one, task), (best, _) = load_policy(packed.path, bank), load_policy(run.path, bank, step=4)
+    assert task == settings.load(TrainConfig, TINY).task and one.name == "packed"
+    assert jax.tree.structure(replace(one, name="bold")) == jax.tree.structure(best)
+    for mine, its in zip(weights(one), weights(best), strict=True):
+        np.testing.assert_array_equal(mine, its)
+    newest, _ = load_policy(run.path, bank, step=8)
+    assert any((mine != its).any() for mine, its in zip(weights(one), weights(newest), strict=True))
+    assert load_policy(packed.path, bank, samples=True)[0].samples
+
+
+def test_a_packed_policy_says_where_it_comes_from_and_not_where_it_lay(run, bank, tmp_path):
+    packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
+    assert sorted(path.name for path in packed.path.iterdir()) == ["config.yaml", PACKED, "run.json"]
+    assert packed.config(TrainConfig) == settings.load(TrainConfig, TINY)
+    info = json.loads((packed.path / "run.json").read_text())
+    assert info["data"] == [{"hash": "f00d", "scenarios": 3}] and info["machine"] is None
+    assert (info["kind"], info["step"], info["command"]) == ("policy", 4, "drivax train tiny")
+    assert info["validation"] == "c0de" and info["measured"] == {"speed": 0.5} and "jax" in info["versions"]
+    # The value network stays behind.
+    stored = np.load(packed.path / PACKED)
+    assert sum(stored[name].size for name in stored.files) == sum(
+        leaf.size for leaf in weights(load_policy(run.path, bank)[0])
+    )
+
+
+def test_what_a_packed_policy_is_not(run, bank, tmp_path):
+    packed = pack_policy(run.path, tmp_path / "packed", bank)
+    with pytest.raises(UsageError, match="packed and has no steps; leave out @4"):
+        find_planner(f"{packed.path}@4", bank)
+    with pytest.raises(UsageError, match="exists already"):
+        pack_policy(run.path, packed.path, bank)
+    wider = {**TINY, "algorithm": {**TINY["algorithm"], "network": {"encoder": {"rows": [4], "hidden": [9]}}}}
+    (packed.path / "config.yaml").write_text(settings.dump(settings.load(TrainConfig, wider)))
+    with pytest.raises(DataError, match=r"parameters.* in the checkpoint, not"):
+        load_policy(packed.path, bank)
+    (packed.path / PACKED).write_bytes(b"PK")
+    with pytest.raises(DataError, match=r"policy.npz: is damaged"):
+        load_policy(packed.path, bank)
+
+
+def test_policies_load_when_what_drove_beside_them_is_gone(run, bank, tmp_path):
+    text = (run.path / "config.yaml").read_text()
+    moved = RunFolder.create(tmp_path / "moved", settings.load(TrainConfig, TINY), kind="training")
+    (moved.path / "config.yaml").write_text(text.replace("traffic: idm", "traffic: runs/gone"))
+    run.checkpoints.rename(moved.checkpoints)
+    try:
+        assert weights(load_policy(moved.path, bank)[0])
+    finally:
+        moved.checkpoints.rename(run.checkpoints)
+
+
+def test_traffic_is_found_by_name(run, tmp_path):
+    assert find_traffic("log") == LogTraffic() and find_traffic("idm") == IdmTraffic()
+    assert isinstance(find_traffic("drivax.simulator.reactive:IdmTraffic"), IdmTraffic)
+    path = str(run.path)
+    assert find_traffic(path) == policy_traffic(path) and find_traffic(path).name == "driven_by_bold"
+    mixed = find_traffic(f"{path}+idm")
+    assert mixed == policy_traffic(path, base=IdmTraffic()) and mixed.name == "driven_by_bold+idm"
+    assert isinstance(find_traffic("zoo:aggressive+idm"), PolicyTraffic)
+    for name, words in (
+        ("runs/none", "there is no traffic 'runs/none'; use log, idm,.* zoo:aggressive"),
+        ("runs/none+idm", "there is no traffic"),
+        ("zoo:agressive+idm", "no policy 'zoo:agressive' in the zoo; use zoo:aggressive"),
+        ("zoo:aggressive+idn", "no policy 'zoo:aggressive.idn' in the zoo"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            find_traffic(name)
+    with pytest.raises(DataError, match="is no run folder"):
+        find_traffic(str(tmp_path))
+
+
+def test_names_of_the_zoo():
+    assert "zoo:aggressive" in zoo() and all(is_policy(name) for name in zoo())
+    assert policy_folder("runs/a") == Path("runs/a") and not is_policy("idm")
+    for name in ("zoo:", "zoo:../zoo/aggressive", "zoo:agressive"):
+        with pytest.raises(UsageError, match="in the zoo; use zoo:aggressive"):
+            policy_folder(name)
+
+
+def test_a_misspelt_policy_is_one_line_that_lists_the_names(bank, capsys, tmp_path):
+    command = [
+        "evaluate",
+        "--planner",
+        "idm",
+        "--traffic",
+        "zoo:bold",
+        "--data",
+        str(tmp_path),
+        "--out",
+        "out",
+    ]
+    assert main(command) == 2
+    told = "there is no policy 'zoo:bold' in the zoo; use zoo:aggressive"
+    assert capsys.readouterr().err == f"drivax: {told}\n"
+    with pytest.raises(UsageError, match=told):
+        find_planner("zoo:bold", bank)
+
+
+@pytest.mark.parametrize("name", zoo())
+def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
+    folder = policy_folder(name)
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 5e6
+    info = json.loads((folder / "run.json").read_text())
+    assert info["kind"] == "policy" and info["command"].startswith("drivax train ")
+    assert {"jax", "flax", "numpy", "drivax"} <= set(info["versions"])
+    assert all(re.fullmatch(r"[0-9a-f]{64}", data["hash"]) for data in info["data"]) and info["data"]
+    assert info["measured"]["ego"] and not re.search(r'"/|/(tmp|home|root)/', json.dumps(info))
+    planner, task = find_planner(name, bank)
+    assert planner.name == name.removeprefix("zoo:") and all(
+        np.isfinite(leaf).all() for leaf in weights(planner)
+    )
+    with pytest.raises(UsageError, match="has no steps"):
+        find_planner(f"{name}@5", bank)
+    among = find_traffic(name)
+    assert among.task == task and prepared(among, bank).driver.name == planner.name
+
+
+@pytest.mark.slow
+def test_the_aggressive_driver_drives_and_drives_others(data, tmp_path):
+    loaded = drivax.load(data.path)
+    alone = drivax.evaluate("zoo:aggressive", loaded)
+    pushed = drivax.evaluate("zoo:aggressive", loaded, traffic="zoo:aggressive+idm")
+    assert pushed.traffic == "driven_by_aggressive+idm"
+    assert np.isfinite(alone.metrics["distance"]).all()
+    assert (alone.metrics["average_ttc"] != pushed.metrics["average_ttc"]).any()
+    command = [
+        "evaluate",
+        "--planner",
+        "zoo:aggressive",
+        "--traffic",
+        "zoo:aggressive+idm",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    assert main([*command, "--data", str(data.path)]) == 0
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["planner"], summary["traffic"]) == ("aggressive", "driven_by_aggressive+idm")
+    assert summary["metrics"]["distance"]["mean"] == pytest.approx(
+        pushed.metrics["distance"].mean(), rel=1e-5
+    )

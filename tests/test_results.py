@@ -1,0 +1,112 @@
+"""Pages of results show what is stored, and nothing else."""
+
+import importlib
+import json
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def script(repository):
+    """A script of ``benchmarks``, by its name."""
+
+    def load(name):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.syspath_prepend(repository / "benchmarks")
+            return importlib.import_module(name)
+
+    return load
+
+
+@pytest.fixture(scope="module")
+def stored(repository):
+    """A stored result, by its name."""
+    folder = repository / "benchmarks" / "results"
+    return lambda name: json.loads((folder / f"{name}.json").read_text())
+
+
+def test_pages_show_what_was_learned(script, stored):
+    tables = script("learning_tables")
+    learning, training = stored("learning"), stored("training")
+    pages = list(tables.pages())
+    assert {page.stem for page in pages} >= {"learning", "bc", "ppo", "sac", "warm-start"}
+    for page in pages:
+        text = page.read_text()
+        shown = tables.filled(page, learning, training) == text
+        assert shown, "run python benchmarks/learning.py table, and read what the pages say about it"
+        assert text.count("<!-- learning.py: end -->") * 2 == text.count("<!-- learning.py: ")
+    for name in learning.get("curves", {}):
+        assert tables.picture(name).is_file()
+
+
+def test_the_page_of_speed_shows_what_was_measured(script, stored):
+    simulator = script("simulator")
+    table = simulator.table(stored("simulator"), stored("simulator_runs"))
+    shown = f"{simulator.BEGIN}\n\n{table}\n\n{simulator.END}" in simulator.PAGE.read_text()
+    assert shown, "run python benchmarks/simulator.py --table, and read what the page says about it"
+
+
+def of(mean, half=0.01):
+    return {"mean": mean, "low": mean - half, "high": mean + half, "n": 9, "by_seed": [mean, mean]}
+
+
+@pytest.fixture
+def learning():
+    columns = (
+        "success", "accuracy", "accuracy_at_fault", "vmax_score", "collision", "offroad", "progress_ratio",
+    )  # fmt: skip
+    planners = {
+        name: dict.fromkeys(columns, of(mean)) for name, mean in (("idm", 0.7), ("bc", 0.6), ("ppo", 0.85))
+    }
+    nowhere = {"mean": None, "low": None, "high": None, "n": 0}
+    return {
+        "planners": planners | {"idm": planners["idm"] | {"offroad": nowhere}},
+        "training": {"bc": {"seconds": 300, "seeds": 2}, "ppo": {"seconds": 1500, "seeds": 2}},
+        "differences": {
+            "ppo - idm": {"success": of(0.15), "vmax_score": of(0.005)},
+            "ppo - bc": {"success": of(0.25), "vmax_score": of(-0.25)},
+        },
+        "curves": {
+            "ppo": {"success": {"seed-0": [[100, 0.2], [200, 0.8]], "seed-1": [[100, 0.3], [200, 0.7]]}}
+        },
+    }
+
+
+def test_tables_of_what_was_learned(script, learning):
+    tables = script("learning_tables")
+    training = {
+        "training": {"ppo": {"steps_per_second": 9000, "share": {"simulation": 0.25, "update": 0.75}}}
+    }
+
+    def lines(what, *names, page=tables.FOLDER / "ppo.md"):
+        return tables.written(what, list(names), learning, training, page).splitlines()
+
+    rows = [line.split(" | ") for line in lines("reached")]
+    assert [row[0] for row in rows[2:]] == ["| ppo", "| idm", "| bc"]
+    assert rows[2][1] == "0.850 [0.840, 0.860]" and rows[3][6] == "-"
+    assert lines("differences")[2] == "| ppo - idm | +0.150 [+0.140, +0.160] | +0.005 [-0.005, +0.015] |"
+    # Of the best preset by success: an interval that holds 0 is no difference.
+    said = {line.split(" | ")[0]: line.split(" | ")[-1].rstrip(" |") for line in lines("aims")[2:]}
+    assert said == {
+        "| `success` of `ppo`": "yes", "| `accuracy_at_fault` of `ppo`": "**no**",
+        "| `success`: `ppo` over `idm`": "yes",
+        "| `vmax_score`: `ppo` over `idm`": "**no**", "| `success`: `ppo` over `bc`": "yes",
+        "| `vmax_score`: `ppo` over `bc`": "**no**", "| steps per second of training, `ppo`": "yes",
+    }  # fmt: skip
+    assert lines("training")[3] == "| `ppo` | 2 | 1,500 |"
+    assert lines("speed")[2] == "| ppo | 9,000 | 25% | 75% |"
+    shown = lines("curves", "ppo", "bc")
+    assert shown[0] == "![Learning curves of ppo](curve-ppo.png)" and "2 seeds" in shown[2]
+    assert shown[-1] == "No curves of preset `bc` are stored yet."
+    there = lines("curves", page=tables.DOCS / "results" / "learning.md")
+    assert there[0] == "![Learning curves of ppo](../algorithms/curve-ppo.png)" and len(there) == 3
+
+
+def test_curves_show_every_seed(script, learning):
+    curves = learning["curves"]["ppo"]
+    (axes,) = script("learning_tables").drawn("ppo", curves).axes
+    assert axes.get_ylabel() == "validation success"
+    for line, (seed, points) in zip(axes.lines, curves["success"].items(), strict=True):
+        assert line.get_label() == seed
+        np.testing.assert_array_equal(line.get_xydata(), points)

@@ -1,0 +1,84 @@
+"""The free check of planners: ours pass it, and each rule has a planner that breaks it and is told so."""
+
+from __future__ import annotations
+
+import itertools
+import re
+
+import jax.numpy as jnp
+import pytest
+
+from drivax.planners.planner import Memoryless
+from drivax.planners.simple import ConstantVelocity, expert_action
+from drivax.scenario.record import record, static
+from drivax.tasks.actions import PHYSICAL
+from drivax.testing import BrokenContract, check_planner
+
+count = itertools.count()
+
+
+@record
+class Wrong(Memoryless):
+    """Breaks one rule."""
+
+    fault: str = static(default="")
+    name: str = static(default="wrong")
+    replays: bool = static(default=False)
+
+    def init(self, bank, state, key):
+        return jnp.zeros(2)
+
+    def act(self, carry, bank, state, situation, observation, key):
+        frame, scene = situation.surroundings.frame, state.scene
+        carry = jnp.zeros(3) if self.fault == "form" else carry
+        if self.fault == "python" and situation.facts.speed_mps > 3:
+            return jnp.zeros(2), carry
+        here = {
+            "size": jnp.zeros(3),
+            "finite": jnp.stack([1.0 / jnp.maximum(frame.valid.sum() - 1.0, 0.0), 0.0]),
+            "random": jnp.full(2, 0.1) * next(count),
+            "litter": jnp.stack([jnp.max(jnp.abs(frame.velocity)) / 1e3, 0.0]),
+            "order": jnp.stack([frame.valid[5] * jnp.sum(frame.velocity[5] ** 2) / 1e3, 0.0]),
+            "padding": jnp.stack([frame.valid.mean(dtype=jnp.float32), 0.0]),
+            "turn": jnp.stack([jnp.zeros(()), jnp.cos(scene.history[-1, 2])]),
+            "future": expert_action(bank, scene, PHYSICAL),
+        }
+        return here.get(self.fault, jnp.zeros(2)), carry
+
+
+def refused(planner, words):
+    with pytest.raises(BrokenContract) as error:
+        check_planner(planner)
+    assert re.search(words, str(error.value)), str(error.value)
+    assert "\n" not in str(error.value) and "; " in str(error.value)
+
+
+def test_forms_are_checked_before_anything_runs():
+    refused(ConstantVelocity, "is no planner")
+    refused(Wrong(fault="size"), r"gives float32\[3\] as an action; give float32\[2\]")
+    refused(Wrong(fault="form"), "changes the form of what it carries")
+    refused(Wrong(fault="python"), "cannot be compiled")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["constant_velocity", "idm", "pdm", "search"])
+def test_ours_pass(name):
+    check_planner(name)
+
+
+@pytest.mark.slow
+def test_experts_pass_as_privileged_ones():
+    check_planner("expert_actions", privileged=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    {
+        "finite": "is not finite", "random": "or every time", "litter": "rows hold something else",
+        "order": "in another order", "padding": "more empty slots", "turn": "turned and shifted",
+        "future": "the log goes on in another way",
+    }.items(),
+)  # fmt: skip
+def test_wrong_planners(fault, words):
+    refused(Wrong(fault=fault), words)
