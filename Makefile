@@ -14,9 +14,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed$(ACCELERATOR)
 JAX := $(shell sed -n 's/^jax==//p' requirements.lock)
 
-# Tests run in several processes: each gets one thread for linear algebra and one for XLA. Each takes a row of files
-# that lie side by side, so that the tests of a file share what it compiles.
-ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false
+# Tests run in several processes. Each takes a row of files that lie side by side, so that the tests of a file share
+# what it compiles.
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: help demo test test-all lint bench setup clean
 .DEFAULT_GOAL := help
@@ -45,10 +45,10 @@ bench: $(STAMP)
 	$(BIN)/drivax bench $(ARGS)
 
 test: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow" $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
 
 test-all: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+	DRIVAX_OPTIMISED=1 $(PYTEST) $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

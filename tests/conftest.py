@@ -2,6 +2,9 @@
 
 Run time checks: jaxtyping's import hook puts beartype on every annotated function of drivax, so a wrong shape
 or type fails the test that caused it. ``DRIVAX_UNCHECKED=1`` leaves the hook out (for timing).
+
+Most programs here run once on tiny arrays, so that compiling them is what takes the time: they are compiled with little
+optimisation, in half of it. ``DRIVAX_OPTIMISED=1`` compiles as users do; ``make test-all`` sets it.
 """
 
 from __future__ import annotations
@@ -20,7 +23,14 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 # programs are kept between runs. Subprocesses that tests start inherit both.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+_FLAGS = ["--xla_cpu_multi_thread_eigen=false"]
+if not os.environ.get("DRIVAX_OPTIMISED"):
+    _FLAGS += [
+        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_backend_optimization_level=0",
+        "--xla_llvm_disable_expensive_passes=true",
+    ]
+os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")

@@ -1,21 +1,14 @@
-"""Programs that run once: compiled with little optimisation, which is most of the time that they take."""
+"""Programs that run once, and modules whose parameters are drawn without one."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-_OPTIONS = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-
-
-def quickly(function):
-    """The function under ``jit``, compiled that way."""
-    return jax.jit(function, compiler_options=_OPTIONS)
-
 
 def quick(function, *arguments):
     """The function's result, compiled, as NumPy arrays."""
-    return jax.device_get(quickly(function)(*arguments))
+    return jax.device_get(jax.jit(function)(*arguments))
 
 
 def drawn(make):

@@ -47,6 +47,14 @@ def test_the_page_of_speed_shows_what_was_measured(script, stored):
     assert shown, "run python benchmarks/simulator.py --table, and read what the page says about it"
 
 
+def test_the_page_of_speed_shows_how_long_evaluations_take(script, stored):
+    timing = script("evaluation")
+    shown = (
+        f"{timing.BEGIN}\n\n{timing.table(stored('evaluation'))}\n\n{timing.END}" in timing.PAGE.read_text()
+    )
+    assert shown, "run python benchmarks/evaluation.py --table, and read what the page says about it"
+
+
 def of(mean, half=0.01):
     return {"mean": mean, "low": mean - half, "high": mean + half, "n": 9, "by_seed": [mean, mean]}
 

@@ -1,5 +1,6 @@
 """PPO on the pendulum: what it bootstraps, heads, several devices, seeds side by side; its optimiser."""
 
+import os
 import subprocess
 import sys
 
@@ -122,9 +123,7 @@ print("same")
 
 @pytest.mark.parametrize("extent", ["two", pytest.param("four_and_seeds", marks=pytest.mark.slow)])
 def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(extent, repository, monkeypatch):
-    monkeypatch.setenv(
-        "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_force_host_platform_device_count=4"
-    )
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
     monkeypatch.setenv(
         "PYTHONPATH", f"{repository / 'src'}:{repository / 'tests'}:{repository / 'tests/learning'}"
     )

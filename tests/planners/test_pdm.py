@@ -27,7 +27,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from drivax.testing.worlds import forgotten, littered
-from quick import quick, quickly
+from quick import quick
 from scenes import RED, SMALL, bank_of, car, moved, straight_road
 
 TASK = Task(observation=ObservationConfig(agents=2, steps=1, road=0, lights=1, route=2), metrics="none")
@@ -45,7 +45,7 @@ class Watched(PdmPlanner):
         return THOUGHT[-1]
 
 
-@quickly
+@jax.jit
 def considered(bank, touched):
     """The first action, what is carried on, and what was thought of all proposals."""
     planner, key = Watched(), jax.random.key(0)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, SIN, gap, overlap
-from drivax.geometry.vectors import first_smallest, norm
+from drivax.geometry.smallest import first_smallest
+from drivax.geometry.vectors import norm
 from drivax.planners.forecast import Forecast
 from drivax.planners.tracking import Reference
 from drivax.scenario.bank import (

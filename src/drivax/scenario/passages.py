@@ -11,7 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.vectors import first_smallest, norm, root
+from drivax.geometry.smallest import first_smallest
+from drivax.geometry.vectors import norm, root
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.lane_codes import STRAND, STRAND_END_X, STRAND_LEFT, STRAND_ONTO, STRAND_RIGHT
 from drivax.scenario.queries import LANE_CUTOFF_M, aligned_lanes

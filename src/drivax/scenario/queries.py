@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.vectors import first_smallest, root
+from drivax.geometry.smallest import first_smallest
+from drivax.geometry.vectors import root
 from drivax.scenario.bank import (
     LIGHT_COS,
     LIGHT_HALF,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.vectors import first_smallest
+from drivax.geometry.smallest import first_smallest
 from drivax.scenario.bank import LIGHT_ARC, ScenarioBank
 from drivax.scenario.queries import LEVEL_M, route_ahead
 from drivax.scenario.record import record
 from drivax.scenario.schema import LightState
-from drivax.simulator.corridor import FREE_M, closest, reaching
+from drivax.simulator.corridor import FREE_M, LEAST_GAP_M, closest, reaching
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.types import Frame, Scene
 
@@ -73,7 +73,7 @@ def ahead(bank: ScenarioBank, scene: Scene, frame: Frame, min_gap_m: float) -> A
     blocks = real[0] & (jnp.abs(lateral) < half_width + me[5] / 2 + _SIDE_M) & (along > 0.0)
     gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
-    nearest = first_smallest(gaps)
+    nearest = first_smallest(gaps, least=LEAST_GAP_M)
     stop = stop_line_m(bank, scene, me[4]) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
     return Ahead(

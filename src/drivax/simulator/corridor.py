@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
-from drivax.geometry.vectors import first_smallest
+from drivax.geometry.smallest import first_smallest, number_of, numbered
 from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, AgentPaths
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
@@ -36,6 +36,8 @@ BEHIND_M = 1.0
 _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 #: Gap of a free road, m; a number, so that gradients stay finite.
 FREE_M = 1e4
+#: No gap between things that overlap is below this, m.
+LEAST_GAP_M = -50.0
 #: So many low bits of a squared distance hold the thing or piece; what is left is exact to 0.03 % (of 1 m2 at least).
 _SLOT_BITS, _PIECE_BITS = 10, 4
 
@@ -121,8 +123,8 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     keys = []
     for number in range(PIECES):
         ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
-        keys.append(_numbered(_from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
-    best = _number(reduce(jnp.minimum, keys), _PIECE_BITS)
+        keys.append(numbered(1.0 + _from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
+    best = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
     # Written out once: XLA would compute it anew for each of the columns that are read.
     best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
     x0, y0, *before, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, best), -1, 0)
@@ -142,7 +144,7 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
     inside = real & (distance < room * room) & (along > 0.0) & ~beyond
     gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
-    nearest = first_smallest(gap)[:, None] == jnp.arange(CLOSEST)
+    nearest = first_smallest(gap, least=LEAST_GAP_M)[:, None] == jnp.arange(CLOSEST)
     speed = jnp.sum(jnp.where(nearest, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
     return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
 
@@ -226,7 +228,7 @@ def closest(
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
     """Of the boxes (their :func:`columns`) that are near the C whose centres are the closest; and which are real."""
     dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
-    key = jnp.where(near, _numbered(dx * dx + dy * dy, jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
+    key = jnp.where(near, numbered(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
     # Computed once: without the barrier XLA computes it anew for each of the minima.
     key = jax.lax.optimization_barrier(key)
     found = [jnp.min(key, axis=1, keepdims=True)]
@@ -234,23 +236,7 @@ def closest(
         found.append(jnp.min(jnp.where(key > found[-1], key, jnp.inf), axis=1, keepdims=True))
     chosen = jnp.concatenate(found, axis=1)
     real = jnp.isfinite(chosen)
-    return jnp.where(real, _number(chosen, _SLOT_BITS), 0), real
-
-
-def _numbered(square: Float[Array, "..."], number: Any, bits: int) -> Float[Array, "..."]:
-    """Squared distances with a number in place of the low bits, so that the smallest one says which it is.
-
-    They stay floats, whose minima vectorise, of at least one, since what is below the smallest normal float may count
-    as zero.
-    """
-    key = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(1.0 + square).astype(jnp.float32), jnp.int32)
-    return jax.lax.bitcast_convert_type(
-        (key & ~((1 << bits) - 1)) | jnp.asarray(number, jnp.int32), jnp.float32
-    )
-
-
-def _number(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
-    return jax.lax.bitcast_convert_type(key, jnp.int32) & ((1 << bits) - 1)
+    return jnp.where(real, number_of(chosen, _SLOT_BITS), 0), real
 
 
 def reaching(
