@@ -112,7 +112,8 @@ def make_scenario(number: int) -> Scenario:
     record["route_xy"][0, :100], record["route_points"][0] = route, 100
     record["goal_xy"] = on_arc(SPEED_MPS * 8.0, -1.8)[0]
     source = SourceCounts(91, 7, 6, {"lane": 2}, 400, 1)
-    return Scenario(record, SMALL, source, tags={"dataset": "hand"})
+    tags = {"dataset": "hand", "difficulty": "hard" if number % 2 else "easy"}
+    return Scenario(record, SMALL, source, tags=tags)
 
 
 def drive_off(scenario: Scenario, sideways_m: float) -> np.ndarray:
@@ -138,6 +139,7 @@ def episode(planner: str, scenario: Scenario, number: int) -> dict[str, object]:
     row |= {"segment": f"road-{number // 2}", "seed": 0, "traffic": "log"}
     for name in ("collision", "offroad", "red_light"):
         row[name] = int(name == failed)
+    row["collision_type"] = {1: 1, 5: 5}.get(number, 0) if failed == "collision" else 0
     row["accuracy"] = int(failed is None)
     row["success"] = int(failed is None and not (planner == "policy" and number == 6))
     row["reached_goal"] = int(not (planner == "policy" and number == 6))

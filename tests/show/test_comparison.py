@@ -7,8 +7,9 @@ import pytest
 
 from drivax.evaluation.statistics import NOTHING, Interval, bootstrap_mean, rate
 from drivax.evaluation.stored import comparable
+from drivax.evaluation.tables import summarise
 from drivax.metrics.catalogue import METRICS
-from drivax.show.comparison import difference, summarise
+from drivax.show.comparison import difference
 from drivax.show.glossary import HEADLINE, headline, note, ordered
 from drivax.show.runs import read_runs
 from drivax.show.selection import choose, outcome

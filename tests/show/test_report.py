@@ -4,13 +4,12 @@ import csv
 import json
 import math
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
+from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.statistics import wilson
@@ -148,7 +147,8 @@ def test_differences_are_what_the_csv_files_say(page, runs):
 def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
     html, parsed = page
     data = [json.loads(text) for attrs, text in parsed.scripts if attrs.get("type") == "application/json"]
-    themes, *episodes = data
+    themes, signals, *episodes, listed = data
+    assert set(signals) == {"signals", "colours"} and len(listed["runs"]) == 3
     assert set(themes) == {"light", "dark"} and len(episodes) == 8
     assert [d["planner"] for d in episodes[0]["drives"]] == ["expert", "constant", "policy"]
     assert episodes[0]["title"].endswith(": collision") and episodes[0]["drives"][2]["events"] == {
@@ -211,7 +211,7 @@ def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch
     def fails(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("drivax.show.report.os.fsync", fails)
+    monkeypatch.setattr("drivax.show.page.os.fsync", fails)
     with pytest.raises(OSError, match="disk full"):
         write_report(runs, out, overwrite=True)
     assert out.read_bytes() == before and [path.name for path in out.parent.iterdir()] == ["report.html"]
@@ -248,31 +248,16 @@ def test_the_command(runs, tmp_path, capsys):
     assert len(lines) == 3 and all(line.startswith("drivax: ") for line in lines)
 
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-
-def browse(html, tmp_path, *options):
-    """Open a page in a headless browser; returns its standard output."""
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-quic",
-        "--no-first-run", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
-        f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000", *options, html.as_uri(),
-    ]  # fmt: skip
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@needs_browser
 def test_the_player_plays_in_a_browser(runs, tmp_path, scenarios):
     """No errors, one canvas per planner, and what the page reads out at a step is what was stored."""
     html = write_report(runs, tmp_path / "report.html")
-    act = """<script>setTimeout(() => {
+    act = """
       const key = (name) => document.body.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
       document.getElementById("stage").scrollIntoView();
       const scrub = document.querySelector("[data-control=scrub]");
-      scrub.value = 44; scrub.dispatchEvent(new Event("input")); key("ArrowRight");
-    }, 300)</script></body>"""
-    html.write_text(html.read_text().replace("</body>", act))
-    dom = browse(html, tmp_path, "--dump-dom", "--window-size=1280,1000")
+      scrub.value = 44; scrub.dispatchEvent(new Event("input")); key("ArrowRight");"""
+    dom = browse(acted(html, act), tmp_path, "--dump-dom", "--window-size=1280,1000")
     tag = re.search(r"<html[^>]*>", dom)[0]
     assert 'data-panes="3"' in tag and "data-error" not in tag
     speeds = re.findall(r'class="speed">([\d.]+) m/s', dom)
@@ -282,13 +267,13 @@ def test_the_player_plays_in_a_browser(runs, tmp_path, scenarios):
     assert dom.count("✕ collision at 4.0 s") == 1, "only the policy collided, and that was half a second ago"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@needs_browser
 @pytest.mark.parametrize("width", [1280, 520])
 def test_canvases_are_not_empty(runs, tmp_path, width):
     imread = pytest.importorskip("matplotlib.image").imread
     html = write_report(runs[:3], tmp_path / "report.html")
     # Only the canvases are left to show these colours.
-    hidden = "table, .legend, .ticks, .charts { display: none !important; }</style>"
+    hidden = "table, #plots, .legend, .ticks, .charts { display: none !important; }</style>"
     html.write_text(html.read_text().replace("</style>", hidden))
     shot = tmp_path / "shot.png"
     browse(

@@ -115,3 +115,12 @@ def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": False}
     file.write_text("two")
     assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": True}
+
+
+def test_where_a_planner_was_trained(tmp_path):
+    data = [{"path": "sets/a", "hash": "abc", "scenarios": 3}]
+    for name, kind in (("policy", "training"), ("judged", "evaluation")):
+        RunFolder.create(tmp_path / name, Config(), kind=kind).note(data=data)
+    trained = str(tmp_path / "policy")
+    assert runs.training_data(trained) == runs.training_data(f"{trained}@1000") == data
+    assert runs.training_data(str(tmp_path / "judged")) == runs.training_data("idm") == []

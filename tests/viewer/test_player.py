@@ -3,13 +3,12 @@
 import base64
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.errors import UsageError
 from drivax.scenario.assemble import assemble
@@ -18,7 +17,6 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.viewer.player import findings, select, write_player
 from scenes import RED, car, straight_road
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 CLEAN = {"log_collides": False, "log_offroad_fraction": 0.0, "first_offroad_step": -1, "log_runs_red": None}
 FOUL = {"log_collides": True, "log_offroad_fraction": 0.25, "first_offroad_step": 30, "log_runs_red": True}
 
@@ -114,20 +112,10 @@ def test_the_command(data, tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 1
 
 
-def browse(html, profile, *options, fragment=""):
-    """Open a page in a headless browser; returns its standard output."""
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-quic",
-        "--no-first-run", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
-        f"--user-data-dir={profile}", "--virtual-time-budget=2000", *options, html.as_uri() + fragment,
-    ]  # fmt: skip
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@needs_browser
 def test_browsing_in_a_browser(page, tmp_path):
     """Opened at the second scenario, then the next one by key, then a filter that only the first one passes."""
-    act = """<script>setTimeout(() => {
+    act = """
       const opened = document.querySelector("[data-control=title]").textContent;
       document.body.dispatchEvent(new KeyboardEvent("keydown", {key: "n", bubbles: true}));
       const filter = document.getElementById("filter");
@@ -138,10 +126,8 @@ def test_browsing_in_a_browser(page, tmp_path):
         const speed = document.querySelector(".speed").textContent;
         const title = document.querySelector("[data-control=title]").textContent;
         document.title = JSON.stringify({ opened, title, seen, facts, speed, at: location.hash });
-      }, 100);
-    }, 300)</script></body>"""
-    page.write_text(page.read_text().replace("</body>", act))
-    dom = browse(page, tmp_path / "profile", "--dump-dom", "--window-size=1300,900", fragment="#2")
+      }, 100);"""
+    dom = browse(acted(page, act), tmp_path, "--dump-dom", "--window-size=1300,900", fragment="#2")
     assert "data-error" not in re.search(r"<html[^>]*>", dom)[0]
     assert json.loads(re.search(r"<title>(.*?)</title>", dom)[1]) == {
         "opened": "bad",

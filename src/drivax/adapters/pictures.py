@@ -32,7 +32,7 @@ def picture(scenario: Scenario, path: Any) -> np.ndarray[Any, Any]:
     Raises:
         UsageError: matplotlib is not installed.
     """
-    figure = draw_scenario(scenario, len(path) - 1, ego=path)
+    figure = draw_scenario(scenario, len(path) - 1, ego=path, legend=False)
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
     except ModuleNotFoundError as error:

@@ -56,7 +56,7 @@ def run(args: Compare) -> int:
     from drivax.evaluation.stored import open_driven_set, read_seeds
     from drivax.show.comparison_page import write_comparison
     from drivax.show.comparison_words import comparison_text
-    from drivax.show.report import refuse_page
+    from drivax.show.page import refuse_page
     from drivax.tracking.runs import write_text
 
     if len(args.runs) not in (0, 2):

@@ -1,43 +1,81 @@
-"""``drivax report``: one HTML page from run folders."""
+"""``drivax report``: one HTML page from run folders; or their drives as videos, or their tables as files."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
 
 @dataclass(frozen=True)
 class Report:
-    """Write one self-contained HTML page from evaluation and training runs.
+    """Write one self-contained HTML page from evaluation and training runs; or videos, or tables.
 
-    The page holds tables with intervals, paired differences, drives side by side and learning curves; it needs no
-    network. The last evaluation named is the policy that the others are compared with.
+    The page holds tables with intervals, paired differences, kinds of collision, distributions, all episodes, drives
+    side by side and learning curves; it needs no network. The last evaluation named is the policy that the others are
+    compared with. With --video, --side-by-side or --tables, files are written into the folder --out instead.
 
     Example: drivax report runs/constant runs/idm runs/policy runs/training --out report.html
+
+    Example: drivax report runs/policy --video worst:20 --out videos
+
+    Example: drivax report runs/idm runs/policy --side-by-side w2-grid-s0-000012 --out videos
+
+    Example: drivax report runs/idm runs/policy --tables --out tables
     """
 
     runs: Positional[tuple[Path, ...]]
     """Run folders written by drivax evaluate and drivax train."""
     out: Path | None = None
-    """HTML file to write; report.html in the last run folder where it is left out."""
+    """HTML file to write; report.html in the last run folder where it is left out. Of videos and tables the folder;
+    videos or tables in the last run folder."""
     data: Path | None = None
     """Scenario set that was driven, where it has moved since."""
     episodes: int = 12
-    """How many episodes to show; 0 leaves them out."""
+    """How many drives the page plays; 0 leaves out drives and tags."""
+    video: str | None = None
+    """Write mp4 files of the policy's drives: worst:N, all, or the id of a scenario."""
+    side_by_side: str | None = None
+    """Write mp4 files with all runs in one picture: worst:N, all, or the id of a scenario."""
+    theme: Literal["light", "dark"] = "light"
+    """Colours of videos; the page follows the reader's system."""
+    tables: bool = False
+    """Write the tables as CSV (all digits), Markdown and LaTeX."""
     overwrite: bool = False
-    """Replace an existing file."""
+    """Replace existing files."""
 
 
 def run(args: Report) -> int:
-    """Write the report and say where it is."""
+    """Write what was asked for and say where it is."""
     from drivax.errors import UsageError
+    from drivax.show.exports import write_tables
     from drivax.show.report import write_report
+    from drivax.show.video import write_videos
+    from drivax.tracking.progress import Progress
 
     if not args.runs:
         raise UsageError("no run was given", cure="drivax report RUN [RUN ...]")
-    out = args.out or args.runs[-1] / "report.html"
-    path = write_report(args.runs, out, args.data, args.episodes, args.overwrite)
+    if sum((args.video is not None, args.side_by_side is not None, args.tables)) > 1:
+        raise UsageError("--video, --side-by-side and --tables are one at a time", cure="run it twice")
+    which = args.video or args.side_by_side
+    if which is not None:
+        out = args.out or args.runs[-1] / "videos"
+        with Progress("drawing", "videos") as bar:
+            files = write_videos(
+                args.runs, out, which, args.side_by_side is not None, args.data, args.theme, args.overwrite,
+                progress=lambda done, _: bar.update(done),
+            )  # fmt: skip
+        print(f"{out} ({len(files)} videos)")
+        return 0
+    if args.tables:
+        out = args.out or args.runs[-1] / "tables"
+        files = write_tables(args.runs, out, args.data, args.overwrite)
+        print(f"{out} ({', '.join(file.name for file in files)})")
+        return 0
+    path = write_report(
+        args.runs, args.out or args.runs[-1] / "report.html", args.data, args.episodes, args.overwrite
+    )
     print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

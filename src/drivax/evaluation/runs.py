@@ -22,7 +22,7 @@ from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
-from drivax.tracking.runs import RunFolder, refuse_existing
+from drivax.tracking.runs import RunFolder, refuse_existing, training_data
 
 #: Columns of the headline, with their short names.
 HEADLINE = {
@@ -88,7 +88,9 @@ def run_evaluation(
     # Everything is written beside the final name, so that a folder of that name is always a whole run.
     out = Path(out)
     partial = out.parent / f".{out.name}.partial-{os.getpid()}"
-    notes = {"kind": "evaluation", "planner": results.planner, "traffic": results.traffic}
+    notes: dict[str, Any] = {"kind": "evaluation", "planner": results.planner, "traffic": results.traffic}
+    if trained := training_data(config.planner):
+        notes["trained_on"] = trained
     try:
         RunFolder.create(partial, config, data=[data], overwrite=True, **notes, **results.notes())
         results.write(partial)

@@ -1,20 +1,14 @@
-"""The numbers of a report: intervals per planner and metric, and paired differences between planners."""
+"""What paired differences between planners say, and which metrics runs have."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from drivax.evaluation.results import interval_of
-from drivax.evaluation.statistics import NOTHING, Interval, paired_bootstrap
-from drivax.evaluation.stored import Pairs
+from drivax.evaluation.statistics import Interval
+from drivax.evaluation.tables import paired_difference
 from drivax.show.glossary import note
 from drivax.show.runs import Evaluation
-
-CONFIDENCE = 0.95
-SEED = 0
 
 
 @dataclass(frozen=True)
@@ -35,21 +29,9 @@ class Difference:
     verdict: str
 
 
-def summarise(run: Evaluation, metric: str) -> Interval:
-    """Mean of a metric over the episodes of a run, with the interval that ``summary.json`` gives.
-
-    Episodes of one segment form a cluster. A run without the metric gives an empty interval.
-    """
-    if metric not in run.metrics:
-        return NOTHING
-    return interval_of(metric, run.metrics[metric], np.array(run.clusters))
-
-
 def difference(run: Evaluation, other: Evaluation, metric: str) -> Difference:
-    """Paired difference ``run - other`` of a metric; repeated episodes of a scenario are averaged first."""
-    pairs = Pairs.of(run, other)
-    mine, theirs = pairs.values(run, metric), pairs.values(other, metric)
-    interval = paired_bootstrap(mine, theirs, pairs.clusters, CONFIDENCE, seed=SEED)
+    """Paired difference ``run - other`` of a metric, and what it says."""
+    interval = paired_difference(run, other, metric)
     return Difference(metric, other.name, interval, _verdict(interval, note(metric, [run]).better))
 
 

@@ -6,7 +6,6 @@ import json
 from html import escape
 from importlib import metadata
 from pathlib import Path
-from string import Template
 
 from drivax import settings
 from drivax.evaluation.comparison import Comparison
@@ -25,7 +24,7 @@ from drivax.show.comparison_words import (
     title,
 )
 from drivax.show.glossary import Note
-from drivax.show.report import asset, colours, publish, refuse_page
+from drivax.show.page import page, publish, refuse_page
 from drivax.show.tables import bounds, number, percent
 
 _WIDTH, _HEIGHT = 180, 34
@@ -54,16 +53,7 @@ def write_comparison(found: Comparison, out: Path, overwrite: bool = False) -> P
     names = f"{found.names[0]} against {found.names[1]}"
     label = f"{found.plan.name}: " if found.plan.name else ""
     sections = [_metrics(found), _plan(found), _made(found)]
-    page = Template(asset("report.html.template")).substitute(
-        title=escape(f"{label}{names}"),
-        version=escape(metadata.version("drivax")),
-        style=colours() + asset("player.css") + _STYLE,
-        lead=_lead(found),
-        sections="\n".join(sections),
-        data="",
-        script="",
-    )
-    publish(out, page)
+    publish(out, page(f"{label}{names}", _lead(found), sections, _STYLE))
     return out
 
 

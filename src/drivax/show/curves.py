@@ -41,16 +41,17 @@ def curve_sections(runs: Sequence[Training]) -> str:
     more = (
         f"<details><summary>{len(rest)} more curves</summary>{_charts(rest, runs)}</details>" if rest else ""
     )
-    return _series(runs) + _charts(first, runs) + more
+    return series_legend([run.name for run in runs]) + _charts(first, runs) + more
 
 
-def chart(title: str, lines: Mapping[str, tuple[str, Points]], share: bool = False) -> str:
+def chart(title: str, lines: Mapping[str, tuple[str, Points]], share: bool = False, across: str = "") -> str:
     """One chart as HTML.
 
     Args:
         title: Words above it.
-        lines: Name of a run -> its colour and points (environment steps, value), sorted by step.
+        lines: Name of a run -> its colour and points (horizontal, vertical), sorted by the former.
         share: Draw the vertical axis from 0 to 1 where all values fit.
+        across: Words below it.
     """
     drawn = {name: (colour, _thinned(points)) for name, (colour, points) in lines.items() if len(points)}
     everything = np.concatenate([points for _, points in drawn.values()])
@@ -65,7 +66,7 @@ def chart(title: str, lines: Mapping[str, tuple[str, Points]], share: bool = Fal
             f'<polyline stroke="{colour}" points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
         )
     middle = (_LEFT + _WIDTH - _RIGHT) / 2
-    shapes.append(f'<text x="{middle:.0f}" y="{_HEIGHT - 4}" text-anchor="middle">environment steps</text>')
+    shapes.append(f'<text x="{middle:.0f}" y="{_HEIGHT - 4}" text-anchor="middle">{escape(across)}</text>')
     return (
         f"<figure class=chart><figcaption>{escape(title)}</figcaption>"
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}">'
@@ -137,13 +138,15 @@ def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
             for place, run in enumerate(runs)
             if name in run.curves
         }
-        drawn.append(chart(name, lines, share=name.split("/")[-1] in _SHARES))
+        share = name.split("/")[-1] in _SHARES
+        drawn.append(chart(name, lines, share, across="environment steps"))
     return f"<div class=charts>{''.join(drawn)}</div>"
 
 
-def _series(runs: Sequence[Training]) -> str:
+def series_legend(names: Sequence[str]) -> str:
+    """The legend of charts: names in the order of their colours."""
     items = "".join(
-        f'<li><i style="background:{SERIES[place % len(SERIES)]}"></i>{escape(run.name)}</li>'
-        for place, run in enumerate(runs)
+        f'<li><i style="background:{SERIES[place % len(SERIES)]}"></i>{escape(name)}</li>'
+        for place, name in enumerate(names)
     )
     return f"<ul class=series>{items}</ul>"

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from drivax.metrics.catalogue import EVENTS
 from drivax.scenario.schema import Scenario
+from drivax.show.motion import SIGNALS, signals
 from drivax.show.palette import agent_colour, light_colour
 from drivax.show.roads import LAYERS, Box, light_rows, road_lines, route, stop_signs
 
@@ -84,7 +85,8 @@ def pack_episode(scenario: Scenario, drives: Sequence[Drive], title: str) -> dic
     Arrays are little-endian int16 in base64, in C order. ``map`` holds per layer the number of points of each line
     and the points of all lines; ``agents.pose`` is ``[agent, step, 3]``; ``parked.seen`` the first and last step at
     which a parked agent was seen; ``lights.state`` ``[step, light]`` indexes (unknown, red, amber, green) and is -1
-    where nobody observed the light; ``drives[].pose`` is ``[step, 3]`` and ``speed`` is in cm/s.
+    where nobody observed the light; ``drives[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are those
+    of ``motion.SIGNALS`` in order, in units of their steps, ABSENT where there are none.
     """
     box = _box(scenario, drives)
     scale = Scale.of(box)
@@ -195,7 +197,17 @@ def _drive(drive: Drive, scale: Scale, steps: int) -> dict[str, Any]:
         "planner": drive.planner,
         "pose": _text(scale.poses(ego[:, :2], ego[:, 2], valid)),
         "speed": _text(speed.astype(np.int16)),
+        "signals": _signals(ego),
         "start": drive.start,
         "events": {name: drive.events[name] for name in EVENTS if drive.events.get(name, -1) >= 0},
         "outcome": drive.outcome,
     }
+
+
+def _signals(ego: Float[Array, "step 4"]) -> list[str]:
+    found = signals(ego)
+    packed = []
+    for one in SIGNALS:
+        values = np.clip(found[one.name] / one.step, -32_000, 32_000)
+        packed.append(_text(np.where(np.isnan(values), ABSENT, np.round(values)).astype(np.int16)))
+    return packed

@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib import metadata
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from drivax.scenario.selection import FINDINGS
-from drivax.show.curves import compact, ticks
+from drivax.show.curves import compact, series_legend, ticks
 from drivax.show.inspection import QUANTITIES, Inspection, speeds
 from drivax.show.inspection_tables import content_rows, short
+from drivax.show.page import page, publish, refuse_page
 from drivax.show.palette import SERIES
-from drivax.show.report import asset, colours, publish, refuse_page
 
 Values = Float[np.ndarray[Any, Any], "_"]
 _WIDTH, _HEIGHT = 380, 210
@@ -42,16 +40,8 @@ def write_histograms(inspections: Sequence[Inspection], out: Path, overwrite: bo
     refuse_page(out, overwrite)
     names = ", ".join(one.name for one in inspections)
     sections = [_overview(inspections), _quantities(inspections), _shares(inspections), _meaning(inspections)]
-    page = Template(asset("report.html.template")).substitute(
-        title=escape(f"Scenario sets: {names}" if len(inspections) > 1 else f"Scenario set: {names}"),
-        version=escape(metadata.version("drivax")),
-        style=colours() + asset("player.css") + _STYLE,
-        lead=f"<p class=lead>{_lead(inspections)}</p>",
-        sections="\n".join(filter(None, sections)),
-        data="",
-        script="",
-    )
-    publish(out, page)
+    title = f"Scenario sets: {names}" if len(inspections) > 1 else f"Scenario set: {names}"
+    publish(out, page(title, f"<p class=lead>{_lead(inspections)}</p>", sections, _STYLE))
     return out
 
 
@@ -224,13 +214,7 @@ def _quantities(inspections: Sequence[Inspection]) -> str:
 
 
 def _legend(inspections: Sequence[Inspection]) -> str:
-    if len(inspections) < 2:
-        return ""
-    items = "".join(
-        f'<li><i style="background:{SERIES[place % len(SERIES)]}"></i>{escape(one.name)}</li>'
-        for place, one in enumerate(inspections)
-    )
-    return f"<ul class=series>{items}</ul>"
+    return series_legend([one.name for one in inspections]) if len(inspections) > 1 else ""
 
 
 def _shares(inspections: Sequence[Inspection]) -> str:

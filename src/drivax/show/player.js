@@ -245,6 +245,7 @@
       note.textContent = happened.map(([name, at]) => `✕ ${EVENTS[name]} at ${seconds(at)}`).join(", ");
     }
     control.scrub.value = String(step);
+    stage.dispatchEvent(new CustomEvent("moment", { detail: step }));
     control.clock.textContent = `${seconds(state.time)} / ${seconds(state.episode.steps - 1)}`;
   }
 
@@ -315,8 +316,9 @@
     makeTicks(episode);
     choices.forEach((choice, i) => choice.setAttribute("aria-pressed", String(i === state.index)));
     state.time = Math.min(...episode.drives.map((drive) => drive.start));
-    setView(state.follow);
     page.dataset.panes = String(state.panes.length);
+    stage.dispatchEvent(new CustomEvent("drive", { detail: episode }));
+    setView(state.follow);
   }
 
   function setView(follow) {

@@ -1,37 +1,34 @@
-"""One self-contained HTML page from run folders: tables with intervals, drives side by side, learning curves."""
+"""One self-contained HTML page from run folders: tables with intervals, all episodes, drives side by side, curves."""
 
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
-from string import Template
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from drivax.errors import DataError, UsageError
-from drivax.evaluation.stored import comparable, open_driven_set
-from drivax.scenario.schema import Scenario
-from drivax.show.comparison import CONFIDENCE, metric_names, summarise
+from drivax.errors import UsageError
+from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.tables import CONFIDENCE, summarise
+from drivax.show.breakdowns import Tags, collision_section, strata_section, transfer_section
+from drivax.show.comparison import metric_names
 from drivax.show.curves import curve_sections
-from drivax.show.episode import Drive, pack_episode
+from drivax.show.distributions import distribution_charts
+from drivax.show.drives import DrivenSet, drives_of
+from drivax.show.episode import pack_episode
+from drivax.show.episode_table import EPISODE_LIST, episode_data
 from drivax.show.glossary import headline, ordered
-from drivax.show.palette import LEGEND, THEMES
+from drivax.show.page import asset, page, publish, refuse_page
+from drivax.show.player import player_data, player_html, player_scripts
 from drivax.show.runs import Evaluation, Training, read_runs
-from drivax.show.selection import Choice, choose, outcome
+from drivax.show.selection import Choice, choose
 from drivax.show.tables import bounds, difference_table, explanations, number, percent, planner_table
 
 EPISODES = 12
-KEYS = (
-    ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
-    ("+ −", "zoom"), ("f", "follow or whole drive"), ("n p", "next and previous episode"),
-)  # fmt: skip
+#: A chosen episode and its data for the player.
+Packed = Sequence[tuple[Choice, Mapping[str, Any]]]
 
 
 def write_report(
@@ -47,7 +44,7 @@ def write_report(
         runs: Run folders of ``drivax evaluate`` and ``drivax train``, in the order of the tables.
         out: The HTML file to write; it appears when it is complete.
         data: The scenario set that was driven, where it is not at the place that the policy's run names.
-        episodes: How many episodes to show; 0 leaves them out and needs no scenario set.
+        episodes: How many drives to show; 0 leaves out drives and tags and needs no scenario set.
         overwrite: Replace an existing file.
 
     Returns:
@@ -61,82 +58,43 @@ def write_report(
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
-    packed = _packed_episodes(evaluations, data, episodes) if evaluations and episodes else []
-    publish(out, _page(evaluations, trainings, packed))
+    packed: Packed = ()
+    tags: Tags = {}
+    if evaluations and episodes:
+        packed, tags = _from_the_set(evaluations, data, episodes)
+    publish(out, _page(evaluations, trainings, packed, tags))
     return out
 
 
-def _packed_episodes(
-    runs: Sequence[Evaluation], data: Path | None, count: int
-) -> list[tuple[Choice, dict[str, Any]]]:
-    """The chosen episodes with their data for the player."""
-    choices = choose(runs, count)
-    if not choices:
-        return []
-    scenarios = open_driven_set(runs[-1], data)
-    rows = {(entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(scenarios.entries)}
+def _from_the_set(runs: Sequence[Evaluation], data: Path | None, count: int) -> tuple[Packed, Tags]:
+    """The chosen episodes with their data for the player, and the tags of all scenarios of the policy's set."""
+    driven = DrivenSet(runs[-1], data)
     packed = []
-    for choice in choices:
-        row = rows.get((choice.dataset, choice.scenario_id))
-        if row is None:
-            raise DataError(
-                "is not in the scenario set",
-                file=scenarios.path,
-                record=choice.scenario_id,
-                cure="pass the set that was evaluated with --data SET",
-            )
-        scenario = scenarios[row]
-        drives = [
-            _drive(run, place, scenario)
-            for run, place in zip(runs, choice.rows, strict=True)
-            if place is not None
-        ]
-        packed.append((choice, pack_episode(scenario, drives, f"{choice.scenario_id}: {choice.outcome}")))
-    return packed
+    for choice in choose(runs, count):
+        scenario = driven.scenario((choice.dataset, choice.scenario_id))
+        title = f"{choice.scenario_id}: {choice.outcome}"
+        packed.append((choice, pack_episode(scenario, drives_of(runs, choice, scenario), title)))
+    return packed, driven.tags()
 
 
-def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
-    stored = run.trajectories
-    place = stored.rows[run.occurrences[row]]
-    steps, start = int(scenario.steps), int(stored.start[place])
-    ego = np.full((steps, 4), np.nan)
-    ego[:start] = logged_drive(scenario)[:start]
-    driven = stored.ego[place, : steps - start]
-    ego[start : start + len(driven)] = driven
-    events = {name: int(at[place]) for name, at in stored.events.items()}
-    return Drive(run.name, ego, start, events, outcome(run, row))
-
-
-def logged_drive(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
-    """The logged ego: position, heading, speed; NaN where it was not valid."""
-    steps = int(scenario.steps)
-    speed = np.linalg.norm(scenario.agent_velocity[:steps, 0], axis=-1)
-    pose = np.column_stack((scenario.agent_xy[:steps, 0], scenario.agent_heading[:steps, 0], speed))
-    return np.where(scenario.agent_valid[:steps, 0, None], pose, np.nan).astype(np.float64)
-
-
-def _page(
-    runs: Sequence[Evaluation],
-    trainings: Sequence[Training],
-    packed: Sequence[tuple[Choice, Mapping[str, Any]]],
-) -> str:
-    sections = []
+def _page(runs: Sequence[Evaluation], trainings: Sequence[Training], packed: Packed, tags: Tags) -> str:
+    sections, data, scripts = [], [], []
     if runs:
-        sections += [_results(runs), _differences(runs), _player(runs, packed)]
+        sections += [_results(runs), _differences(runs), transfer_section(runs), collision_section(runs)]
+        sections += [strata_section(runs, tags), _distributions(runs), _episodes(runs, packed)]
+        played: dict[ScenarioKey, int] = {
+            (choice.dataset, choice.scenario_id): place for place, (choice, _) in enumerate(packed)
+        }
+        data += player_data([episode for _, episode in packed]) if packed else []
+        data.append(episode_data(runs, tags, played))
+        scripts += [*(player_scripts() if packed else ()), asset("episode_table.js")]
     if trainings:
         sections.append(f"<section><h2>Learning curves</h2>{curve_sections(trainings)}</section>")
     if runs:
         sections.append(_meaning(runs))
     sections.append(_origin([*runs, *trainings]))
-    return Template(asset("report.html.template")).substitute(
-        title=escape(f"{runs[-1].name}: evaluation report" if runs else "training report"),
-        version=escape(metadata.version("drivax")),
-        style=colours() + asset("player.css"),
-        lead=_lead(runs),
-        sections="\n".join(filter(None, sections)),
-        data="\n".join(_data(packed)),
-        script=asset("player.js") if packed else "",
-    )
+    title = f"{runs[-1].name}: evaluation report" if runs else "training report"
+    return page(title, _lead(runs), sections, data=data, scripts=scripts)
 
 
 def _lead(runs: Sequence[Evaluation]) -> str:
@@ -176,9 +134,9 @@ def _results(runs: Sequence[Evaluation]) -> str:
     return (
         f"<section><h2>Results</h2>{warning}{planner_table(runs, first) if first else ''}{more}<p><small>"
         f"Mean, {CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; undefined "
-        "episodes are left out. The best mean is underlined, whether or not it is clearly best. Intervals: Wilson's "
-        "for rates (with the effective number of episodes where some share a recording), a bootstrap over recordings "
-        "otherwise.</small></p></section>"
+        "episodes are left out. The best mean is underlined, whether or not it is clearly best. A mean "
+        "leads to the episodes behind it. Intervals: Wilson's for rates (with the effective number of episodes "
+        "where some share a recording), a bootstrap over recordings otherwise.</small></p></section>"
     )
 
 
@@ -196,7 +154,26 @@ def _differences(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def _player(runs: Sequence[Evaluation], packed: Sequence[tuple[Choice, Mapping[str, Any]]]) -> str:
+def _distributions(runs: Sequence[Evaluation]) -> str:
+    charts = distribution_charts(runs)
+    return (
+        f"<section><h2>Distributions</h2>{charts}<p><small>The height of a line at a value is the share of episodes "
+        "that lie at or below it; undefined ones are left out.</small></p></section>"
+        if charts
+        else ""
+    )
+
+
+def _episodes(runs: Sequence[Evaluation], packed: Packed) -> str:
+    told = "▶ marks those that play below." if packed else "Drives and tags were left out of this page."
+    return (
+        f"<section id=episodes><h2>Episodes</h2><p>All episodes, worst first: the gravest kind of failure, then the "
+        f"lowest score. A number in the tables above leads to the episodes behind it. {told}</p>{EPISODE_LIST}"
+        f"{_player(runs, packed)}</section>"
+    )
+
+
+def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
     if not packed:
         return ""
     buttons = "".join(
@@ -205,8 +182,6 @@ def _player(runs: Sequence[Evaluation], packed: Sequence[tuple[Choice, Mapping[s
         f"<small>{escape(choice.scenario_id)}</small></button>"
         for choice, _ in packed
     )
-    legend = "".join(legend_item(name, words) for name, words in LEGEND)
-    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     reactive = any(run.traffic != "log" for run in runs if comparable(run, runs[-1]))
     caution = (
         "<p><b>Other agents are drawn as recorded;</b> in this traffic they reacted and moved otherwise.</p>"
@@ -214,36 +189,10 @@ def _player(runs: Sequence[Evaluation], packed: Sequence[tuple[Choice, Mapping[s
         else ""
     )
     return (
-        f"<section id=episodes><h2>Episodes</h2><p>Chosen by rule: failures of {escape(runs[-1].name)} first, "
-        f"each kind in turn, then successes. All planners start from the same scene at the same time.</p>{caution}"
-        f"<div class=picker role=group aria-label=Episodes>{buttons}</div><h3 data-control=title></h3>"
-        f"<div id=stage></div>{CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
-        "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript></section>"
+        f"<h3>Drives</h3><p>Chosen by rule: failures of {escape(runs[-1].name)} first, each kind in turn, then "
+        f"successes. All planners start from the same scene at the same time.</p>{caution}"
+        f"<div class=picker role=group aria-label=Drives>{buttons}</div><h3 data-control=title></h3>{player_html()}"
     )
-
-
-CONTROLS = """<div class=controls>
-<button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
-<button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
-<button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
-<div class=track><div class=ticks data-control=ticks></div>
-<input type=range min=0 max=90 value=0 step=1 data-control=scrub aria-label="time"></div>
-<span class=clock data-control=clock></span>
-<select data-control=speed aria-label="speed" title="speed ([ and ])">
-<option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
-<option value=2>2×</option><option value=4>4×</option></select>
-<button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
-<button type=button data-control=fit aria-pressed=false title="show the whole drive (f)">whole</button>
-<button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
-<button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
-</div>"""
-
-
-def legend_item(name: str, words: str) -> str:
-    """One entry of the legend."""
-    sign = "✕" if name == "mark" else ""
-    fill = "" if name in ("log", "route", "mark") else f' style="background:var(--{name})"'
-    return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'
 
 
 def _meaning(runs: Sequence[Evaluation]) -> str:
@@ -283,58 +232,3 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
 
 def _words(command: Any) -> str:
     return " ".join(map(str, command)) if isinstance(command, list) else str(command or "")
-
-
-def _data(packed: Sequence[tuple[Choice, Mapping[str, Any]]]) -> list[str]:
-    if not packed:
-        return []
-    themes = {name: dict(theme) for name, theme in THEMES.items()}
-    scripts = [f'<script type="application/json" id="palette">{embedded_json(themes)}</script>']
-    return scripts + [
-        f'<script type="application/json" class="episode">{embedded_json(data)}</script>'
-        for _, data in packed
-    ]
-
-
-def embedded_json(value: Any) -> str:
-    """JSON that cannot end the script element that holds it."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-def colours() -> str:
-    """The palette as CSS variables, light and dark."""
-    light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
-                   for name in ("light", "dark"))  # fmt: skip
-    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
-
-
-def asset(name: str) -> str:
-    """Text of a file of this package."""
-    return resources.files("drivax.show").joinpath(name).read_text(encoding="utf-8")
-
-
-def refuse_page(out: Path, overwrite: bool) -> None:
-    """Refuses a page that may not be written, before any work is done.
-
-    Raises:
-        UsageError: ``out`` is a folder, or exists and ``overwrite`` is not given.
-    """
-    if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
-        raise UsageError("exists already", file=out, cure=cure)
-
-
-def publish(out: Path, page: str) -> None:
-    """Write beside the target, make it durable, then rename: never half a report under its name."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(page)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-        Path(name).replace(out)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from drivax.evaluation.stored import comparable
+from drivax.evaluation.stored import ScenarioKey, comparable
 from drivax.show.runs import Evaluation
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).
 FAILURES = (
+    ("planner crashed", "crashed", 1.0),
     ("at-fault collision", "at_fault_collision", 1.0),
     ("collision", "collision", 1.0),
     ("off-road", "offroad", 1.0),
@@ -48,6 +50,27 @@ def outcome(run: Evaluation, row: int) -> str:
         if value == bad:
             return words
     return "success" if judged else "unjudged"
+
+
+def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]:
+    """Rows of a run, worst episode first: by how grave the failure is, then by score.
+
+    Among equals those come first that more of the others drove without failure, then by scenario id.
+    """
+    order = [words for words, _, _ in FAILURES]
+    rank = {words: place for place, words in enumerate([*order, "unjudged", "success"])}
+    done: Counter[ScenarioKey] = Counter()
+    for other in others:
+        if comparable(run, other):
+            done.update({key for row, key in enumerate(other.scenarios) if outcome(other, row) == "success"})
+    scenarios = run.scenarios
+
+    def key(row: int) -> tuple[int, float, int, str, int]:
+        score = _value(run, "vmax_score", row)
+        known = 1.0 if np.isnan(score) else score
+        return rank[outcome(run, row)], known, -done[scenarios[row]], scenarios[row][1], row
+
+    return sorted(range(run.episodes), key=key)
 
 
 def choose(runs: Sequence[Evaluation], count: int) -> list[Choice]:
@@ -88,6 +111,12 @@ def _rank(runs: Sequence[Evaluation], choice: Choice) -> tuple[float, int, str]:
         if row is not None
     ]
     return (1.0 if np.isnan(score) else score), sum(good == succeeded for good in others), choice.scenario_id
+
+
+def ranked(runs: Sequence[Evaluation]) -> list[Choice]:
+    """All scenarios of the last run whose drive is stored, worst first."""
+    choices = {places[-1]: _choice(runs, places) for places in _places(runs)}
+    return [choices[row] for row in worst_first(runs[-1], runs[:-1]) if row in choices]
 
 
 def _choice(runs: Sequence[Evaluation], rows: tuple[int | None, ...]) -> Choice:

@@ -1,13 +1,16 @@
-"""Tables of a report as HTML."""
+"""Tables of a report as HTML. A cell that knows which episodes are behind it says so to the page's programs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from typing import Any
 
 from drivax.evaluation.statistics import Interval
 from drivax.evaluation.stored import comparable
-from drivax.show.comparison import Difference, difference, summarise
+from drivax.evaluation.tables import Row, Table, summarise
+from drivax.show.comparison import Difference, difference
 from drivax.show.glossary import ARROWS, Note, note
 from drivax.show.runs import Evaluation
 
@@ -29,7 +32,9 @@ def planner_table(runs: Sequence[Evaluation], metrics: Sequence[str]) -> str:
     head = "".join(_heading(metric, notes[metric]) for metric in metrics)
     rows = []
     for run in runs:
-        row = "".join(_cell(cells[run.name, m], notes[m], best[m]) for m in metrics)
+        row = "".join(
+            _cell(cells[run.name, m], notes[m], best[m], {"run": run.name, "metric": m}) for m in metrics
+        )
         rows.append(f"<tr>{_planner(run)}{row}</tr>")
     return _scrolling(f"<thead><tr><th scope=col>planner</th>{head}</tr></thead>", "".join(rows), "planners")
 
@@ -44,6 +49,35 @@ def difference_table(policy: Evaluation, others: Sequence[Evaluation], metrics: 
     return _scrolling(
         f"<thead><tr><th scope=col>metric</th>{head}</tr></thead>", "".join(rows), "differences"
     )
+
+
+def table_html(
+    table: Table, runs: Sequence[Evaluation], behind: Callable[[Row, int], Mapping[str, Any] | None]
+) -> str:
+    """A table of ``evaluation.tables``.
+
+    Args:
+        table: The table; metrics, where it has any, stand in its columns.
+        runs: Evaluations, which say what metrics of the user's own are.
+        behind: From a row and the number of a column to what the page's list of episodes is asked for; None: nothing.
+    """
+    keys = "".join(f"<th scope=col>{escape(key)}</th>" for key in table.keys)
+    named = table.across == "metric"
+    head = "".join(
+        _heading(name, note(name, runs)) if named else f"<th scope=col>{escape(name)}</th>"
+        for name in table.columns
+    )
+    rows = []
+    for row in table.rows:
+        labels = "".join(f"<th scope=row>{escape(label)}</th>" for label in row.labels)
+        cells = "".join(
+            "<td class=undefined>–</td>"
+            if cell is None
+            else _cell(cell.interval, note(cell.metric, runs), None, behind(row, place))
+            for place, cell in enumerate(row.cells)
+        )
+        rows.append(f"<tr>{labels}{cells}</tr>")
+    return _scrolling(f"<thead><tr>{keys}{head}</tr></thead>", "".join(rows), table.name)
 
 
 def explanations(metrics: Sequence[str], runs: Sequence[Evaluation]) -> str:
@@ -104,10 +138,13 @@ def _heading(metric: str, entry: Note, scope: str = "col") -> str:
     return f'<th scope={scope} title="{title}">{escape(entry.label)} {mark}</th>'
 
 
-def _cell(interval: Interval, entry: Note, best: float | None) -> str:
+def _cell(
+    interval: Interval, entry: Note, best: float | None, behind: Mapping[str, Any] | None = None
+) -> str:
     if interval.mean is None:
         return '<td class=undefined title="undefined in every episode">–<small>n 0</small></td>'
     mark = " class=best" if best is not None and interval.mean == best else ""
+    mark += f' data-behind="{escape(json.dumps(behind))}"' if behind else ""
     mean = number(interval.mean, entry.unit) + percent(entry.unit)
     return f"<td{mark}><b>{mean}</b><small>{bounds(interval, entry.unit)}</small><small>n {interval.n}</small></td>"
 

@@ -140,6 +140,13 @@ def seed_folders(path: str | Path) -> list[Path]:
     return sorted((file.parent for file in found), key=lambda folder: int(folder.name.removeprefix("seed-")))
 
 
+def training_data(planner: str) -> list[dict[str, Any]]:
+    """The data sets of the training run that a planner is (``RUN`` or ``RUN@STEP``); none of any other planner."""
+    path = Path(planner.partition("@")[0])
+    info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
+    return list(info.get("data", ())) if info.get("kind") == "training" else []
+
+
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
     """Facts about this process, its program, its data and its machine, as plain JSON values."""
     return {

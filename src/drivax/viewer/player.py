@@ -8,25 +8,16 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from importlib import metadata, resources
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from drivax.errors import UsageError
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
+from drivax.show.drives import logged_drive
 from drivax.show.episode import Drive, pack_episode
-from drivax.show.palette import LEGEND, THEMES
-from drivax.show.report import CONTROLS as CONTROLS
-from drivax.show.report import KEYS as KEYS
-from drivax.show.report import asset as show_asset
-from drivax.show.report import colours as colours
-from drivax.show.report import embedded_json as json_text
-from drivax.show.report import legend_item as legend_item
-from drivax.show.report import logged_drive as logged_drive
-from drivax.show.report import publish as publish
-from drivax.show.report import refuse_page as refuse_page
+from drivax.show.page import asset, page, publish, refuse_page
+from drivax.show.player import player_data, player_html, player_scripts
 
 #: Findings of the audit that make a log unclean, and how the list says so.
 _FINDINGS = {"log_collides": "collides", "log_runs_red": "runs red"}
@@ -86,20 +77,16 @@ def findings(scenario: Scenario) -> str:
 
 def _page(scenarios: Sequence[Scenario], title: str) -> str:
     packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
-    themes = {name: dict(theme) for name, theme in THEMES.items()}
-    data = [f'<script type="application/json" id="palette">{json_text(themes)}</script>']
-    data += [f'<script type="application/json" class="episode">{json_text(one)}</script>' for one in packed]
     unclean = sum(bool(findings(scenario)) for scenario in scenarios)
     audited = sum(bool(scenario.audit) for scenario in scenarios)
     judged = f"the audit finds fault with {unclean} of {audited}" if audited else "not audited"
-    return Template(show_asset("report.html.template")).substitute(
-        title=escape(title),
-        version=escape(metadata.version("drivax")),
-        style=colours() + show_asset("player.css") + _asset("browser.css"),
-        lead=f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
-        sections=_browser(scenarios),
-        data="\n".join(data),
-        script=show_asset("player.js") + _asset("browser.js"),
+    return page(
+        title,
+        f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
+        [_browser(scenarios)],
+        asset("browser.css", "drivax.viewer"),
+        player_data(packed),
+        [*player_scripts(), asset("browser.js", "drivax.viewer")],
     )
 
 
@@ -113,15 +100,11 @@ def _log(scenario: Scenario) -> Drive:
 def _browser(scenarios: Sequence[Scenario]) -> str:
     buttons = "".join(map(_button, scenarios))
     details = "".join(map(_details, scenarios))
-    legend = "".join(legend_item(name, words) for name, words in LEGEND)
-    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     return (
         "<section class=browse><div class=choose><input type=search id=filter placeholder='id, tag or flag' "
         "aria-label='show scenarios with these words'><small id=shown></small>"
         f"<div class=picker role=group aria-label=Scenarios>{buttons}</div></div>"
-        f"<div class=watch><h2 data-control=title></h2><div id=stage></div>{CONTROLS}"
-        f"<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
-        "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript></div>"
+        f"<div class=watch><h2 data-control=title></h2>{player_html()}</div>"
         f"<aside id=details aria-label='about the scenario'>{details}</aside></section>"
     )
 
@@ -186,7 +169,3 @@ def _cell(value: Any) -> str:
 def _flags(scenario: Scenario) -> list[str]:
     named: Iterable[Any] = scenario.has
     return [_words(str(flag.name)).lower() for flag in named]
-
-
-def _asset(name: str) -> str:
-    return resources.files("drivax.viewer").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,197 @@
+// The list of all episodes: sorting, sieving, and the way from a cell of a table to the episodes behind it.
+(() => {
+  "use strict";
+  const source = document.getElementById("list");
+  if (!source) return;
+  const data = JSON.parse(source.textContent), form = document.getElementById("sieve").elements;
+  const rows = document.getElementById("rows"), heads = document.getElementById("heads");
+  const more = document.getElementById("more"), found = document.getElementById("found");
+  const players = [...document.querySelectorAll("[data-episode]")];
+  const FIRST = 50, MORE = 200;
+  const state = { matches: [], drawn: 0, sort: -1, turned: false };
+  const kind = data.metrics.findIndex((metric) => metric.name === "collision_type");
+
+  function make(tag, parent, text, name) {
+    const node = parent.appendChild(document.createElement(tag));
+    if (text !== undefined) node.textContent = text;
+    if (name) node.className = name;
+    return node;
+  }
+
+  // --- What is asked for ------------------------------------------------------------------------------------------
+  function choice(menu, first, words) {
+    menu.replaceChildren();
+    if (first) make("option", menu, first).value = "";
+    words.forEach(([value, text]) => { make("option", menu, text).value = String(value); });
+  }
+
+  const run = () => data.runs[Number(form.run.value)];
+  const metrics = data.metrics.map((metric, i) => [i, metric.label]);
+  choice(form.run, null, data.runs.map((one, i) => [i, one.name]));
+  choice(form.failed, "any", metrics.filter(([i]) => data.metrics[i].bad !== null));
+  choice(form.metric, "none", metrics);
+  const tags = data.tags.map((tag) => {
+    const label = make("label", document.getElementById("tags"), `${tag.name} `);
+    const menu = make("select", label);
+    choice(menu, "any", tag.words.map((word, i) => [i, word]));
+    return menu;
+  });
+
+  function outcomes() {
+    choice(form.outcome, "any", run().outcomes.map((word, i) => [i, word]));
+  }
+
+  function wanted() {
+    const { values, scenario, outcome } = run();
+    const tests = [];
+    const asked = (menu, test) => { if (menu.value !== "") tests.push(test(Number(menu.value))); };
+    asked(form.outcome, (code) => (row) => outcome[row] === code);
+    asked(form.failed, (i) => (row) => values[i][row] === data.metrics[i].bad);
+    tags.forEach((menu, i) => asked(menu, (code) => (row) => data.tags[i].of[scenario[row]] === code));
+    const bound = parseFloat(form.bound.value), compare = {
+      ge: (value) => value >= bound, le: (value) => value <= bound, eq: (value) => value === bound,
+    }[form.sign.value];
+    asked(form.metric, (i) => (row) => {
+      const value = values[i][row];
+      return value !== null && (Number.isNaN(bound) || compare(value));
+    });
+    const words = form.words.value.trim().toLowerCase();
+    if (words) tests.push((row) => data.scenarios[scenario[row]].toLowerCase().includes(words));
+    return scenario.map((_, row) => row).filter((row) => tests.every((test) => test(row)));
+  }
+
+  // Undefined values come last whichever way the list is sorted; without a column it stays as it came, worst first.
+  const rises = () => (data.metrics[state.sort].better === "down") === state.turned;
+
+  function sorted(matches) {
+    if (state.sort < 0) return matches;
+    const column = run().values[state.sort], sign = rises() ? 1 : -1;
+    return matches.sort((a, b) => {
+      if (column[a] === null || column[b] === null) return (column[a] === null) - (column[b] === null) || a - b;
+      return sign * (column[a] - column[b]) || a - b;
+    });
+  }
+
+  // --- Drawing ----------------------------------------------------------------------------------------------------
+  function columns() {
+    const extra = [form.metric, form.failed].map((menu) => menu.value).filter((value) => value !== "").map(Number);
+    if (state.sort >= 0) extra.push(state.sort);
+    return [...data.shown, ...new Set(extra.filter((i) => !data.shown.includes(i)))];
+  }
+
+  function drawHeads() {
+    heads.replaceChildren();
+    for (const text of ["scenario", "outcome"]) make("th", heads, text).scope = "col";
+    for (const i of columns()) {
+      const head = make("th", heads), here = state.sort === i, sign = !here ? "" : rises() ? " ▲" : " ▼";
+      head.scope = "col";
+      head.setAttribute("aria-sort", !here ? "none" : rises() ? "ascending" : "descending");
+      const button = make("button", head, data.metrics[i].label + sign, "plain");
+      button.type = "button";
+      button.title = "sort, worst first; again: best first";
+      button.addEventListener("click", () => sort(i));
+    }
+  }
+
+  function text(value, metric) {
+    if (value === null) return "–";
+    if (metric.unit === "rate") return value ? "yes" : "no";
+    return String(Number.isInteger(value) ? value : value.toPrecision(3)).replace("-", "−");
+  }
+
+  function drawRow(row) {
+    const { scenario, outcome, outcomes: words, values, playable } = run();
+    const line = make("tr", rows), head = make("th", line), number = scenario[row];
+    head.scope = "row";
+    const player = playable ? players[data.played[number]] : undefined;
+    if (player) {
+      const button = make("button", head, `▶ ${data.scenarios[number]}`, "plain");
+      button.type = "button";
+      button.title = "play this drive";
+      button.addEventListener("click", () => play(player));
+    } else make("span", head, data.scenarios[number]);
+    make("small", head, data.tags.map((tag) => tag.words[tag.of[number]]).filter(Boolean).slice(0, 4).join(" · "));
+    make("td", line, words[outcome[row]], words[outcome[row]] === "success" ? "good" : "bad");
+    for (const i of columns()) {
+      const metric = data.metrics[i], value = values[i][row];
+      make("td", line, text(value, metric), metric.bad !== null && value === metric.bad ? "bad" : "");
+    }
+  }
+
+  function draw(count) {
+    state.matches.slice(state.drawn, state.drawn + count).forEach(drawRow);
+    state.drawn = Math.min(state.drawn + count, state.matches.length);
+    const left = state.matches.length - state.drawn;
+    more.hidden = !left;
+    more.textContent = `${Math.min(left, MORE)} more of ${left}`;
+  }
+
+  function list() {
+    state.matches = sorted(wanted());
+    state.drawn = 0;
+    rows.replaceChildren();
+    drawHeads();
+    draw(FIRST);
+    found.textContent = `${state.matches.length} of ${run().scenario.length} episodes of ${run().name}`;
+    document.documentElement.dataset.found = String(state.matches.length);
+  }
+
+  function sort(i) {
+    if (state.sort !== i) Object.assign(state, { sort: i, turned: false });
+    else if (!state.turned) state.turned = true;
+    else Object.assign(state, { sort: -1, turned: false });
+    const place = [...heads.children].findIndex((head) => head.contains(document.activeElement));
+    list();
+    heads.children[place]?.querySelector("button")?.focus();
+  }
+
+  function play(player) {
+    player.click();
+    document.getElementById("stage").scrollIntoView({ block: "center" });
+  }
+
+  // --- From a table to the list -----------------------------------------------------------------------------------
+  function clear(place) {
+    form.run.form.reset();
+    form.run.value = String(place);
+    outcomes();
+    Object.assign(state, { sort: -1, turned: false });
+  }
+
+  function show(behind) {
+    clear(data.runs.findIndex((one) => one.name === behind.run));
+    for (const [name, word] of Object.entries(behind.tags || {})) {
+      const i = data.tags.findIndex((tag) => tag.name === name);
+      if (i >= 0) tags[i].value = String(data.tags[i].words.indexOf(word));
+    }
+    if (behind.kind !== undefined) {
+      form.metric.value = String(kind); form.sign.value = "eq"; form.bound.value = String(behind.kind);
+    }
+    const i = data.metrics.findIndex((metric) => metric.name === behind.metric);
+    if (i >= 0 && data.metrics[i].bad !== null) form.failed.value = String(i);
+    else if (i >= 0) state.sort = i;
+    list();
+    const first = state.matches.find((row) => run().playable && players[data.played[run().scenario[row]]]);
+    if (first !== undefined) players[data.played[run().scenario[first]]].click();
+    document.getElementById("episodes").scrollIntoView();
+    form.failed.focus({ preventScroll: true });
+  }
+
+  document.querySelectorAll("[data-behind]").forEach((node) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.className = "plain";
+    button.title = "the episodes behind this number";
+    const number = node.querySelector("b");
+    number.replaceWith(button);
+    button.append(number);
+    button.addEventListener("click", () => show(JSON.parse(node.dataset.behind)));
+  });
+
+  form.run.addEventListener("change", outcomes);
+  form.run.form.addEventListener("input", list);
+  form.all.addEventListener("click", () => { clear(form.run.value); list(); });
+  more.addEventListener("click", () => draw(MORE));
+  clear(data.runs.length - 1);
+  list();
+})();

@@ -1,0 +1,91 @@
+"""What a driven path says about driving: speed, accelerations, jerk, yaw rate, curvature, for plots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.geometry.angles import wrap
+from drivax.metrics.comfort import (
+    JERK_MPS3,
+    LATERAL_MPS2,
+    LONGITUDINAL_MPS2,
+    WINDOW,
+    YAW_RATE_RPS,
+    filter_operator,
+)
+from drivax.scenario.schema import DT_S
+
+Array = np.ndarray[Any, Any]
+#: Below this speed a path has no curvature to speak of: headings jitter more than the car moves.
+_CURVED_MPS = 0.5
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One plot.
+
+    Attributes:
+        name: Of the signal.
+        title: Words above the plot.
+        unit: Of its values.
+        step: Resolution with which it is packed.
+        limits: Comfort limits, low and high; empty without.
+    """
+
+    name: str
+    title: str
+    unit: str
+    step: float
+    limits: tuple[float, ...] = ()
+
+
+SIGNALS = (
+    Signal("speed", "speed", "m/s", 0.01),
+    Signal("acceleration", "acceleration along the road", "m/s²", 0.01, LONGITUDINAL_MPS2),
+    Signal("jerk", "jerk along the road", "m/s³", 0.01, (-JERK_MPS3, JERK_MPS3)),
+    Signal("curvature", "curvature", "1/m", 0.0001),
+    Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-YAW_RATE_RPS, YAW_RATE_RPS)),
+    Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-LATERAL_MPS2, LATERAL_MPS2)),
+)
+
+
+def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
+    """The signals of a path, differentiated and filtered as the comfort metrics do.
+
+    Savitzky-Golay windows of nuPlan: accelerations 8/2, jerk and yaw rate 15/2 (``metrics.comfort``). Curvature is yaw
+    rate over speed. At most 7 steps from either end of the path a value is that of the first or last window's
+    polynomial.
+
+    Args:
+        ego: Position [m], heading [rad], speed [m/s] at every step; NaN where the car is not there.
+
+    Returns:
+        Values by the name of the signal, NaN where there are none: outside of the last unbroken part of the path, at
+        the first step of it (nothing to differ from), and throughout where it has fewer than 16 steps, speed aside.
+    """
+    there = np.asarray(np.isfinite(ego).all(axis=1))
+    found = {one.name: np.full(len(ego), np.nan) for one in SIGNALS}
+    found["speed"][there] = ego[there, 3]
+    if not there.any():
+        return found
+    end = int(np.flatnonzero(there)[-1]) + 1
+    gaps = np.flatnonzero(~there[:end])
+    first = int(gaps[-1]) + 1 if gaps.size else 0
+    if end - first <= WINDOW:
+        return found
+    path, at = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
+    turned = np.asarray(wrap(np.diff(path[:, 2])))
+    along, middle = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
+    samples = end - first - 1
+    smooth, slope = filter_operator(samples, 8, 2, 0), filter_operator(samples, WINDOW, 2, 1) / DT_S
+    rate = slope @ np.cumsum(turned)
+    found["acceleration"][at] = smooth @ along
+    found["lateral"][at] = smooth @ (middle * turned / DT_S)
+    found["jerk"][at] = slope @ along
+    found["yaw_rate"][at] = rate
+    found["curvature"][at] = np.where(middle >= _CURVED_MPS, rate / np.maximum(middle, _CURVED_MPS), np.nan)
+    return found

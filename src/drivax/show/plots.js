@@ -1,0 +1,112 @@
+// Plots below the player: one small chart per signal, one line per planner, and a bar at the time that is shown.
+(() => {
+  "use strict";
+  const ABSENT = -32768, WIDTH = 380, HEIGHT = 150, LEFT = 44, RIGHT = 8, TOP = 8, BOTTOM = 22;
+  const source = document.getElementById("signals"), stage = document.getElementById("stage");
+  const room = document.getElementById("plots");
+  if (!source || !stage || !room) return;
+  const { signals, colours } = JSON.parse(source.textContent);
+  const SVG = new DOMParser().parseFromString("<svg></svg>", "text/html").body.firstChild.namespaceURI;
+  let plots = [], episode = null;
+
+  function values(text, step) {
+    const view = new DataView(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
+    return Array.from({ length: view.byteLength / 2 }, (_, i) => {
+      const value = view.getInt16(2 * i, true);
+      return value === ABSENT ? null : value * step;
+    });
+  }
+
+  function draw(tag, parent, attributes, text) {
+    const node = document.createElementNS(SVG, tag);
+    for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, String(value));
+    if (text !== undefined) node.textContent = text;
+    return parent.appendChild(node);
+  }
+
+  const short = (value) => String(Number(value.toPrecision(2))).replace("-", "−");
+  const digits = (step) => Math.round(-Math.log10(step));
+
+  // A round distance between grid lines: 1, 2 or 5 times a power of ten, at most four of them.
+  function grid(low, high) {
+    const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
+    const apart = [1, 2, 5, 10].map((factor) => factor * power).find((width) => width >= rough);
+    const first = Math.ceil(low / apart - 1e-9), last = Math.floor(high / apart + 1e-9);
+    return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * apart);
+  }
+
+  // Limits are drawn where values come near them; otherwise they would flatten every line.
+  function bounds(lines, limits) {
+    const known = lines.flat().filter((value) => value !== null);
+    let low = Math.min(0, ...known), high = Math.max(0, ...known);
+    for (const limit of limits) {
+      if (limit < 0 && low < 0.4 * limit) low = Math.min(low, 1.08 * limit);
+      if (limit > 0 && high > 0.4 * limit) high = Math.max(high, 1.08 * limit);
+    }
+    return high - low < 1e-9 ? [low - 0.5, high + 0.5] : [low, high];
+  }
+
+  function plot(signal, lines) {
+    const figure = room.appendChild(document.createElement("figure"));
+    figure.className = "chart";
+    const caption = figure.appendChild(document.createElement("figcaption"));
+    const svg = draw("svg", figure, { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": signal.words });
+    const [low, high] = bounds(lines, signal.limits), last = episode.steps - 1;
+    const x = (step) => LEFT + (step / last) * (WIDTH - LEFT - RIGHT);
+    const y = (value) => HEIGHT - BOTTOM - ((value - low) / (high - low)) * (HEIGHT - BOTTOM - TOP);
+    for (const value of grid(low, high)) {
+      draw("line", svg, { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: y(value), y2: y(value) });
+      draw("text", svg, { x: LEFT - 6, y: y(value) + 4, "text-anchor": "end" }, short(value));
+    }
+    for (const value of signal.limits.filter((limit) => limit >= low && limit <= high)) {
+      draw("line", svg, { class: "limit", x1: LEFT, x2: WIDTH - RIGHT, y1: y(value), y2: y(value) });
+    }
+    for (const time of grid(0, last * episode.dt)) {
+      draw("text", svg, { x: x(time / episode.dt), y: HEIGHT - 6, "text-anchor": "middle" }, `${short(time)} s`);
+    }
+    lines.forEach((line, i) => {
+      let path = "", down = false;
+      line.forEach((value, step) => {
+        if (value !== null) path += `${down ? "L" : "M"}${x(step).toFixed(1)} ${y(value).toFixed(1)}`;
+        down = value !== null;
+      });
+      draw("path", svg, { d: path, stroke: colours[i % colours.length] });
+      for (const step of Object.values(episode.drives[i].events)) {
+        const value = line[step];
+        if (value === null || value === undefined) continue;
+        draw("text", svg, { class: "mark", x: x(step), y: y(value) + 4, "text-anchor": "middle" }, "✕");
+      }
+    });
+    const bar = draw("line", svg, { class: "now", y1: TOP, y2: HEIGHT - BOTTOM, x1: LEFT, x2: LEFT });
+    svg.addEventListener("click", (event) => {
+      const { left, width } = svg.getBoundingClientRect();
+      const part = (((event.clientX - left) / width) * WIDTH - LEFT) / (WIDTH - LEFT - RIGHT);
+      const scrub = document.querySelector("[data-control=scrub]");
+      scrub.value = String(Math.round(part * last));
+      scrub.dispatchEvent(new Event("input"));
+    });
+    return { signal, lines, caption, bar, x };
+  }
+
+  stage.addEventListener("drive", (event) => {
+    episode = event.detail;
+    room.replaceChildren();
+    const read = (drive, i) => values(drive.signals[i], signals[i].step);
+    plots = signals.map((signal, i) => plot(signal, episode.drives.map((drive) => read(drive, i))));
+  });
+
+  stage.addEventListener("moment", (event) => {
+    for (const { signal, lines, caption, bar, x } of plots) {
+      bar.setAttribute("x1", x(event.detail));
+      bar.setAttribute("x2", x(event.detail));
+      caption.replaceChildren(`${signal.words} [${signal.unit}]`);
+      lines.forEach((line, i) => {
+        const note = caption.appendChild(document.createElement("small")), value = line[event.detail];
+        const key = note.appendChild(document.createElement("i"));
+        key.style.background = colours[i % colours.length];
+        const text = value === null ? "–" : value.toFixed(digits(signal.step)).replace("-", "−");
+        note.append(`${episode.drives[i].planner} ${text}`);
+      });
+    }
+  });
+})();

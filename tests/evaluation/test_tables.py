@@ -1,0 +1,117 @@
+"""Tables of evaluations against counts by hand and the formulas they name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivax.evaluation.statistics import wilson
+from drivax.evaluation.stored import EpisodeTable
+from drivax.evaluation.tables import (
+    READINGS,
+    collisions_table,
+    differences_table,
+    results_table,
+    set_names,
+    strata_table,
+    transfer_table,
+)
+from drivax.simulator.contact import CollisionType
+
+N = 12
+
+
+def run(name, metrics, *, data="h1", path="sets/test", trained=None, traffic="log", planner=None):
+    """An evaluation of twelve scenarios, each a recording of its own."""
+    about = {"planner": planner or name, "traffic": traffic, "data": [{"path": path, "hash": data}]}
+    if trained:
+        about["trained_on"] = [{"path": where, "hash": key} for where, key in trained]
+    ids = tuple(f"s{number}" for number in range(N))
+    keys = {"scenario_id": ids, "segment": ids, "dataset": ("d",) * N}
+    return EpisodeTable(
+        Path(name), name, about, keys, {n: np.array(v, np.float64) for n, v in metrics.items()}
+    )
+
+
+def means(table):
+    return [[None if cell is None else cell.interval.mean for cell in row.cells] for row in table.rows]
+
+
+def test_results_and_differences():
+    ours = run("ours", {"success": [1] * 9 + [0] * 3, "progress_ratio": np.linspace(0.5, 1, N)})
+    theirs = run("theirs", {"success": [1] * 6 + [0] * 6, "progress_ratio": np.linspace(0.4, 0.9, N)})
+    table = results_table([theirs, ours], ["success", "progress_ratio"])
+    assert table.columns == ("theirs", "ours") and [row.labels for row in table.rows] == [
+        ("success",),
+        ("progress_ratio",),
+    ]
+    assert means(table) == [[0.5, 0.75], [pytest.approx(0.65), pytest.approx(0.75)]]
+    assert table.rows[0].cells[1].interval.as_dict() == pytest.approx(wilson(9, N).as_dict())
+    other_set = run("elsewhere", {"success": [0] * N}, data="h2")
+    table = differences_table(ours, [theirs, other_set], ["success", "progress_ratio"])
+    assert table.columns == ("theirs",) and table.signed, "runs on other scenarios make no pairs"
+    assert means(table) == [[pytest.approx(0.25)], [pytest.approx(0.1)]]
+    low, high = table.rows[1].cells[0].interval.low, table.rows[1].cells[0].interval.high
+    assert low == pytest.approx(0.1) == high, "every pair differs by as much"
+
+
+def test_kinds_of_collision_are_shares_of_all_episodes():
+    kinds = [1, 1, 3, 6, 0, 0, 0, 0, 0, 0, np.nan, np.nan]
+    table = collisions_table([run("a", {"collision_type": kinds}), run("old", {"success": [1] * N})])
+    assert table.columns == ("a",), "a run that does not know kinds has no column"
+    assert set(READINGS) == set(CollisionType) - {CollisionType.NONE}
+    found = dict(zip((row.labels[0] for row in table.rows), means(table), strict=True))
+    assert found["rear end"] == [0.2] and found["side"] == [0.1] and found["standing object"] == [0.1]
+    assert found["head-on"] == [0.0]
+    found = table.rows[0].cells[0].interval.as_dict()
+    assert found == pytest.approx(wilson(2, 10).as_dict()), "undefined episodes do not count"
+
+
+def test_strata_in_the_order_of_their_words():
+    tags = {("d", f"s{i}"): {"difficulty": "hard" if i < 3 else "easy"} for i in range(N - 1)}
+    success = [1, 0, 0] + [1] * 9
+    table = strata_table(
+        [run("a", {"success": success}), run("b", {"success": [0] * N})], tags, "difficulty", ["success"]
+    )
+    assert [row.labels for row in table.rows] == [
+        ("easy", "a"), ("easy", "b"), ("hard", "a"), ("hard", "b"), ("unknown", "a"), ("unknown", "b"),
+    ]  # fmt: skip
+    assert means(table) == [[1.0], [0.0], [pytest.approx(1 / 3)], [0.0], [1.0], [0.0]]
+    assert [row.cells[0].interval.n for row in table.rows] == [8, 8, 3, 3, 1, 1]
+
+
+def test_transfer_is_training_by_evaluation():
+    runs = [
+        run(
+            "p (1)", {"success": [1] * 6 + [0] * 6}, data="A", path="x/a", trained=[("x/a", "A")], planner="p"
+        ),
+        run(
+            "p (2)", {"success": [1] * 3 + [0] * 9}, data="B", path="x/b", trained=[("x/a", "A")], planner="p"
+        ),
+        run("q", {"success": [1] * N}, data="B", path="x/b", trained=[("x/b", "B"), ("x/a", "A")]),
+        run("idm", {"success": [0] * N}, data="A", path="x/a"),
+    ]
+    table = transfer_table(runs, "success")
+    assert table.columns == ("a", "b")
+    assert [row.labels for row in table.rows] == [
+        ("p", "a", "log"),
+        ("q", "b, a", "log"),
+        ("idm", "–", "log"),
+    ]
+    assert means(table) == [[0.5, 0.25], [None, 1.0], [0.0, None]]
+    twice = [
+        runs[0],
+        run("p (noisy)", {"success": [1] * N}, data="A", path="x/a", trained=[("x/a", "A")], planner="p"),
+    ]
+    assert [row.labels[0] for row in transfer_table(twice, "success").rows] == ["p", "p (noisy)"]
+
+
+def test_sets_of_one_name_are_told_apart():
+    runs = [
+        run("a", {}, data="0123456789", path="old/test"),
+        run("b", {}, data="abcdefghij", path="new/test"),
+    ]
+    assert set_names(runs) == {"0123456789": "test 012345", "abcdefghij": "test abcdef"}
+    assert set_names([run("a", {}, data=None, path="old/test")]) == {"old/test": "test"}
