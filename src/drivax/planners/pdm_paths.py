@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, SIN, gap, overlap
-from drivax.geometry.smallest import first_smallest
 from drivax.geometry.vectors import norm
 from drivax.planners.forecast import Forecast
 from drivax.planners.tracking import Reference
@@ -25,6 +24,7 @@ from drivax.scenario.bank import (
 from drivax.scenario.queries import route_ahead
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
+from drivax.scenario.smallest import first_smallest
 from drivax.simulator.ahead import project
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 

@@ -11,12 +11,12 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.smallest import first_smallest
 from drivax.geometry.vectors import norm, root
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.lane_codes import STRAND, STRAND_END_X, STRAND_LEFT, STRAND_ONTO, STRAND_RIGHT
 from drivax.scenario.queries import LANE_CUTOFF_M, aligned_lanes
 from drivax.scenario.record import record
+from drivax.scenario.smallest import first_smallest
 
 #: A passage counts once the centre is so far beyond the line between two lanes, m.
 BEYOND_M = 0.3

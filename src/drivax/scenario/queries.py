@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.smallest import first_smallest
 from drivax.geometry.vectors import root
 from drivax.scenario.bank import (
     LIGHT_COS,
@@ -27,6 +26,7 @@ from drivax.scenario.bank import (
 )
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
+from drivax.scenario.smallest import first_smallest
 
 EDGE_CUTOFF_M = 3.0
 LANE_CUTOFF_M = 4.0

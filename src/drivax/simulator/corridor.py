@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
-from drivax.geometry.smallest import first_smallest, number_of, numbered
 from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, AgentPaths
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.record import record
+from drivax.scenario.smallest import first_smallest, number_of, numbered
 from drivax.simulator.types import Frame
 
 #: How many things C are measured against a path. Six would do (docs/log), but eight fill a vector.
