@@ -55,6 +55,12 @@ def test_the_page_of_speed_shows_how_long_evaluations_take(script, stored):
     assert shown, "run python benchmarks/evaluation.py --table, and read what the page says about it"
 
 
+def test_the_page_of_real_files_shows_every_planner(script, stored):
+    real = script("real_files")
+    shown = f"{real.BEGIN}\n\n{real.tables(stored('real_files'))}\n\n{real.END}" in real.PAGE.read_text()
+    assert shown, "run python benchmarks/real_files.py --table, and read what the page says about it"
+
+
 def of(mean, half=0.01):
     return {"mean": mean, "low": mean - half, "high": mean + half, "n": 9, "by_seed": [mean, mean]}
 
