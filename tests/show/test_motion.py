@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.signal import savgol_filter
 
@@ -39,7 +40,7 @@ def test_signals_are_scipys_filter_of_the_motion():
 
 def test_lateral_acceleration_is_that_of_the_comfort_metric():
     path = wavy().astype(np.float32)
-    judged = np.asarray(judge_trip(path).lateral_mps2)
+    judged = np.asarray(judge_trip(jnp.asarray(path)).lateral_mps2)
     np.testing.assert_allclose(np.abs(signals(path)["lateral"][9:]), judged[1:], atol=2e-3)
 
 

@@ -68,5 +68,5 @@ def test_lines_of_charts_differ(vision):
 
 def test_the_legend_names_every_class_and_light():
     named = {name for name, _ in LEGEND}
-    assert {*CLASSES, "red", "amber", "green", "route", "log", "stop", "goal", "mark"} == named
+    assert {*CLASSES, *LIGHTS, "route", "log", "stop", "goal", "mark"} == named
     assert set(THEMES["light"]) == set(THEMES["dark"])

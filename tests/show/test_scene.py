@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.show.palette import LIGHT
+from drivax.show.palette import DARK, LIGHT
 
 from .conftest import drive_off, make_scenario
 
@@ -23,8 +23,8 @@ def pixels(figure):
     return np.round(imread(stream)[..., :3] * 255).astype(int)
 
 
-def share(image, name, near=2):
-    wanted = [int(LIGHT[name][i : i + 2], 16) for i in (1, 3, 5)]
+def share(image, name, near=2, theme=LIGHT):
+    wanted = [int(theme[name][i : i + 2], 16) for i in (1, 3, 5)]
     return int((np.abs(image - wanted).max(axis=-1) <= near).sum())
 
 
@@ -32,12 +32,39 @@ def test_what_is_there_is_drawn_and_only_that():
     from drivax.show.scene import draw_scenario
 
     scenario = make_scenario(0)
-    early, late = pixels(draw_scenario(scenario, 10)), pixels(draw_scenario(scenario, 70))
+    early, late = (pixels(draw_scenario(scenario, step, legend=False)) for step in (10, 70))
     for name in ("ego", "vehicle", "cyclist", "parked", "edge", "lane", "crosswalk", "ground"):
         assert share(early, name) > 20, name
     assert share(early, "red") > 20 and share(early, "green") == 0, "a red light at step 10"
     assert share(late, "green") > 20, "green at step 70"
-    assert share(pixels(draw_scenario(scenario, 30)), "pedestrian") > 5 > share(late, "pedestrian")
+    assert (
+        share(pixels(draw_scenario(scenario, 30, legend=False)), "pedestrian") > 5 > share(late, "pedestrian")
+    )
+
+
+def test_the_legend_and_the_dark():
+    from drivax.show.scene import draw_scenario
+
+    scenario = make_scenario(0)
+    plain = pixels(draw_scenario(scenario, 10, theme="dark", legend=False))
+    image = pixels(draw_scenario(scenario, 10, theme="dark"))
+    assert share(image, "ground", theme=DARK) > 0.5 * plain[..., 0].size and share(image, "ground") == 0
+    below = image[len(plain) :]
+    for name in (
+        "ego",
+        "vehicle",
+        "parked",
+        "pedestrian",
+        "cyclist",
+        "other",
+        "red",
+        "amber",
+        "green",
+        "route",
+    ):
+        assert share(below, name, theme=DARK) > 15, name
+    edges = np.abs(below - below[0, 0]).max(axis=-1) > 8
+    assert not edges[:, :4].any() and not edges[:, -4:].any(), "the legend fits"
 
 
 def test_a_driven_path_moves_the_ego_and_leaves_the_log_dashed():

@@ -50,6 +50,5 @@ def distribution_charts(runs: Sequence[Evaluation]) -> str:
         if values.size and values.min() < values.max():
             entry = note(name, runs)
             drawn = {run: (colour[run], line) for run, line in lines.items()}
-            unit = "" if entry.unit in ("rate", "share") else entry.unit
-            charts.append(chart(entry.label, drawn, share=True, across=unit))
+            charts.append(chart(entry.label, drawn, share=True))
     return f"{series_legend(list(colour))}<div class=charts>{''.join(charts)}</div>" if charts else ""

@@ -88,7 +88,7 @@ def pack_episode(scenario: Scenario, drives: Sequence[Drive], title: str) -> dic
     where nobody observed the light; ``drives[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are those
     of ``motion.SIGNALS`` in order, in units of their steps, ABSENT where there are none.
     """
-    box = _box(scenario, drives)
+    box = surroundings(scenario, drives)
     scale = Scale.of(box)
     steps = int(scenario.steps)
     return {
@@ -117,8 +117,8 @@ def _text(array: Array) -> str:
     return base64.b64encode(np.ascontiguousarray(array, dtype=kind).tobytes()).decode("ascii")
 
 
-def _box(scenario: Scenario, drives: Sequence[Drive]) -> Box:
-    """What is near any ego path: their bounding box and a margin."""
+def surroundings(scenario: Scenario, drives: Sequence[Drive]) -> Box:
+    """What is near any ego path, in metres: their bounding box and a margin."""
     paths = [scenario.agent_xy[:, 0][scenario.agent_valid[:, 0]]]
     paths += [drive.ego[np.isfinite(drive.ego).all(axis=1), :2] for drive in drives]
     points = np.concatenate(paths).astype(np.float64)

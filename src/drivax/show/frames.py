@@ -7,7 +7,6 @@ takes ten times as long per frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from jaxtyping import Float, UInt8
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.scenario.schema import Scenario
-from drivax.show.episode import Drive
+from drivax.show.episode import Drive, surroundings
 from drivax.show.palette import LEGEND, THEMES, agent_colour, light_colour
 from drivax.show.roads import light_rows, road_lines, route, stop_signs
 
@@ -25,7 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Affine2D
 
 Array = np.ndarray[Any, Any]
-Picture = UInt8[Array, "_ _ 3"]
+#: Red, green, blue and an alpha that says nothing: copied whole it is copied fast.
+Picture = UInt8[Array, "_ _ 4"]
 _EVENTS = {"collision": "collision", "offroad": "off-road", "red_light": "red light"}
 _ROAD_WIDTHS = {"lane": 1.0, "bike": 1.0, "line": 1.0, "edge": 1.8}
 _LIGHT_WIDTHS = {"red": 5.0, "amber": 4.0, "green": 2.5, "unknown": 2.0}
@@ -62,8 +62,8 @@ class Canvas:
 
     def clear(self, colour: str = "ground") -> None:
         """Paints everything over."""
-        red, green, blue = (int(self.colours[colour][at : at + 2], 16) for at in (1, 3, 5))
-        np.asarray(self._agg.buffer_rgba())[:] = (red, green, blue, 255)
+        pixel = np.array([*(int(self.colours[colour][at : at + 2], 16) for at in (1, 3, 5)), 255], np.uint8)
+        np.asarray(self._agg.buffer_rgba()).view(np.uint32).fill(pixel.view(np.uint32)[0])
 
     def look(self, x: float, y: float, scale: float) -> None:
         """Puts a point (metres) into the middle, at so many pixels per metre."""
@@ -125,20 +125,11 @@ class Canvas:
 
     def pixels(self) -> Picture:
         """A copy of what was drawn."""
-        return np.asarray(self._agg.buffer_rgba())[..., :3].copy()
+        return np.asarray(self._agg.buffer_rgba()).copy()
 
     def _rgb(self, name: str) -> tuple[float, float, float]:
         red, green, blue = (int(self.colours[name][at : at + 2], 16) / 255 for at in (1, 3, 5))
         return red, green, blue
-
-
-@dataclass(frozen=True)
-class _Agents:
-    xy: Array
-    heading: Array
-    size: Array
-    kind: list[str]
-    valid: Array
 
 
 class Scenery:
@@ -147,19 +138,21 @@ class Scenery:
     Args:
         canvas: Where it will be drawn.
         scenario: The scenario.
+        drives: What will be looked at; the map far from all of them is left out.
     """
 
-    def __init__(self, canvas: Canvas, scenario: Scenario) -> None:
+    def __init__(self, canvas: Canvas, scenario: Scenario, drives: Sequence[Drive]) -> None:
         self.canvas, self.scenario = canvas, scenario
-        self._layers = {name: canvas.compound(lines) for name, lines in road_lines(scenario).items()}
+        layers = road_lines(scenario, surroundings(scenario, drives))
+        self._layers = {name: canvas.compound(lines) for name, lines in layers.items()}
         self._route, self._stops = route(scenario), stop_signs(scenario)
         self._lights = light_rows(scenario)
         kinds = [agent_colour(int(kind)) for kind in scenario.agent_kind]
         parked = [agent_colour(int(kind)) for kind in scenario.parked_kind]
         self._kinds = kinds, ["parked" if kind == "vehicle" else kind for kind in parked]
 
-    def draw(self, step: int) -> None:
-        """Draws map, route, lights and everybody but ego at a step."""
+    def draw(self, step: int, middle: tuple[float, float]) -> None:
+        """Draws map, route, lights and everybody but ego at a step, as far as seen around the middle."""
         canvas, scenario = self.canvas, self.scenario
         canvas.draw(self._layers["crosswalk"], None, fill="crosswalk")
         for name, width in _ROAD_WIDTHS.items():
@@ -168,7 +161,7 @@ class Scenery:
             canvas.draw(_ring(sign, 0.9), None, fill="stop")
         canvas.draw(self._route, "route", 2.0, dash=(7.0, 5.0))
         if len(self._route):
-            canvas.draw(_ring(np.asarray(scenario.goal_xy), 2.0), "route", 2.0)
+            canvas.draw(_ring(np.asarray(scenario.goal_xy), 2.0), "goal", 2.0)
         for row in self._lights:
             if (state := int(scenario.light_state[step, row])) >= 0:
                 name = light_colour(state)
@@ -176,15 +169,20 @@ class Scenery:
         moving = scenario.agent_valid[step].copy()
         moving[0] = False
         kinds, still = self._kinds
-        self._boxes(_Agents(scenario.parked_xy, scenario.parked_heading, scenario.parked_size, still,
-                            scenario.parked_valid[step]))  # fmt: skip
-        self._boxes(_Agents(scenario.agent_xy[step], scenario.agent_heading[step], scenario.agent_size, kinds,
-                            moving))  # fmt: skip
-
-    def _boxes(self, agents: _Agents) -> None:
-        for row in np.flatnonzero(agents.valid):
-            shape = _box(agents.xy[row], agents.heading[row], agents.size[row])
-            self.canvas.draw(shape, "outline", 0.8, fill=agents.kind[row])
+        groups = (
+            (
+                scenario.parked_xy,
+                scenario.parked_heading,
+                scenario.parked_size,
+                still,
+                scenario.parked_valid[step],
+            ),
+            (scenario.agent_xy[step], scenario.agent_heading[step], scenario.agent_size, kinds, moving),
+        )
+        for xy, heading, size, names, valid in groups:
+            near = valid & (np.abs(xy - middle).max(axis=-1) < VIEW_M)
+            for row in np.flatnonzero(near):
+                canvas.draw(_box(xy[row], heading[row], size[row]), "outline", 0.8, fill=names[row])
 
 
 def draw_frame(scenery: Scenery, drive: Drive, step: int, dt_s: float) -> Picture:
@@ -194,7 +192,7 @@ def draw_frame(scenery: Scenery, drive: Drive, step: int, dt_s: float) -> Pictur
     scale = (min(canvas.width, canvas.height) - _BAR) / VIEW_M
     x, y = _middle(scenario, drive, step)
     canvas.look(x, y + _BAR / 2 / scale, scale)
-    scenery.draw(step)
+    scenery.draw(step, (x, y))
     _draw_ego(canvas, scenario, drive, step, scale)
     happened = [name for name, at in drive.events.items() if 0 <= at <= step and name in _EVENTS]
     canvas.bar(0, 0, canvas.width, _BAR, "crosswalk")
@@ -231,7 +229,7 @@ def legend_strip(width: int, theme: str) -> Picture:
         elif name == "stop":
             canvas.ring(x + 8, middle, 5, None, fill=name)
         elif name == "goal":
-            canvas.ring(x + 8, middle, 6, "route")
+            canvas.ring(x + 8, middle, 6, name)
         elif name in _LIGHT_WIDTHS:
             canvas.bar(x + 5, middle - 7, 5, 14, name)
         else:

@@ -19,7 +19,7 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 LIGHT = MappingProxyType(
     {
         "ground": "#f4f5f7", "ink": "#1b1f24", "edge": "#3b424b", "lane": "#b9c2cd", "line": "#9aa5b1",
-        "bike": "#8fc7b5", "crosswalk": "#dfe4ea", "outline": "#1b1f24", "ego": PURPLE, "route": PURPLE,
+        "bike": "#8fc7b5", "crosswalk": "#dfe4ea", "outline": "#1b1f24", "ego": PURPLE, "route": PURPLE, "goal": PURPLE,
         "log": "#5b6570", "vehicle": SKY, "pedestrian": YELLOW, "cyclist": ORANGE, "other": BLUE,
         "parked": "#c6ccd3", "red": VERMILLION, "amber": ORANGE, "green": GREEN, "unknown": "#8b949e",
         "stop": VERMILLION, "mark": VERMILLION,
@@ -28,7 +28,7 @@ LIGHT = MappingProxyType(
 DARK = MappingProxyType(
     {
         "ground": "#15191e", "ink": "#e8ecf0", "edge": "#aab4bf", "lane": "#3d4651", "line": "#56616d",
-        "bike": "#2c5c4e", "crosswalk": "#262d35", "outline": "#0b0d10", "ego": PURPLE, "route": PURPLE,
+        "bike": "#2c5c4e", "crosswalk": "#262d35", "outline": "#0b0d10", "ego": PURPLE, "route": PURPLE, "goal": PURPLE,
         "log": "#9aa5b1", "vehicle": SKY, "pedestrian": YELLOW, "cyclist": ORANGE, "other": BLUE,
         "parked": "#4a535d", "red": VERMILLION, "amber": ORANGE, "green": GREEN, "unknown": "#8b949e",
         "stop": VERMILLION, "mark": VERMILLION,
@@ -40,7 +40,7 @@ THEMES = MappingProxyType({"light": LIGHT, "dark": DARK})
 LEGEND = (
     ("ego", "ego"), ("log", "ego as logged"), ("route", "route"), ("goal", "goal"), ("vehicle", "vehicle"),
     ("parked", "standing still"), ("pedestrian", "pedestrian"), ("cyclist", "cyclist"), ("other", "other"),
-    ("red", "red light"), ("amber", "amber"), ("green", "green"), ("stop", "stop sign"),
+    ("red", "red light"), ("amber", "amber"), ("green", "green"), ("unknown", "light not known"), ("stop", "stop sign"),
     ("mark", "first collision, off-road or red light"),
 )  # fmt: skip
 

@@ -112,7 +112,7 @@ def _lead(runs: Sequence[Evaluation]) -> str:
     share = number(interval.mean, "rate") + percent("rate")
     return (
         f"<p class=lead><b>{escape(policy.name)}</b> {words[name]} <b>{share}</b> ({bounds(interval, 'rate')}) of "
-        f"{interval.n} episodes of {where}, {escape(policy.traffic)} traffic.</p>"
+        f"{interval.n} {'episode' if interval.n == 1 else 'episodes'} of {where}, {escape(policy.traffic)} traffic.</p>"
     )
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Colours = Mapping[str, str]
 #: Height of the legend.
-_LEGEND_INCHES = 0.75
+_LEGEND_INCHES = 0.85
 _WIDTHS = {"lane": 0.8, "bike": 0.8, "line": 0.8, "edge": 1.6}
 
 
@@ -195,12 +195,13 @@ def _draw_legend(figure: Figure, colours: Colours) -> None:
     def sign(name: str) -> Any:
         if name in ("route", "log"):
             return Line2D([], [], color=colours[name], linestyle="--")
-        if name in ("red", "amber", "green"):
+        if name in ("red", "amber", "green", "unknown"):
             return Line2D([], [], color=colours[name], linewidth=4)
         if name == "stop":
             return Line2D([], [], color=colours[name], marker="8", linestyle="none")
         return Patch(facecolor=colours[name], edgecolor=colours["outline"])
 
     shown = [(name, words) for name, words in LEGEND if name not in ("mark", "goal")]
-    figure.legend([sign(name) for name, _ in shown], [words for _, words in shown], loc="lower center", ncol=6,
-                  frameon=False, fontsize=9, labelcolor=colours["ink"])  # fmt: skip
+    signs, words = [sign(name) for name, _ in shown], [words for _, words in shown]
+    figure.legend(signs, words, loc="lower center", ncol=5, frameon=False, fontsize=9, labelcolor=colours["ink"],
+                  columnspacing=1.2, handlelength=1.6)  # fmt: skip

@@ -120,20 +120,20 @@ def frames(scenario: Scenario, drives: Sequence[Drive], theme: str = "light") ->
         theme: ``light`` or ``dark``.
     """
     side = ALONE if len(drives) == 1 else BESIDE
-    scenery = Scenery(Canvas(side, side, theme), scenario)
+    scenery = Scenery(Canvas(side, side, theme), scenario, drives)
     across = len(drives) if len(drives) <= _ACROSS else -(-len(drives) // (-(-len(drives) // _ACROSS)))
     legend = legend_strip(across * side, theme)
     for step in range(min(drive.start for drive in drives), int(scenario.steps)):
         panes = [draw_frame(scenery, drive, step, float(scenario.dt_s)) for drive in drives]
         for pane in panes if across > 1 else ():
-            pane[:, -1] = np.array([int(THEMES[theme]["lane"][at : at + 2], 16) for at in (1, 3, 5)])
+            pane[:, -1, :3] = np.array([int(THEMES[theme]["lane"][at : at + 2], 16) for at in (1, 3, 5)])
         yield np.concatenate((_tiled(panes, across), legend))
 
 
 def _tiled(panes: Sequence[Picture], across: int) -> Picture:
     """Pictures of one size in rows, the last one filled up with empty ones."""
     missing = -len(panes) % across
-    filled = [*panes, *[np.full_like(panes[0], panes[0][-1, -1])] * missing]
+    filled = [*panes, *(np.full_like(panes[0], panes[0][-1, -1]) for _ in range(missing))]
     rows = [np.concatenate(filled[at : at + across], axis=1) for at in range(0, len(filled), across)]
     return np.concatenate(rows)
 
@@ -159,13 +159,13 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
             stream: Any = None
             for picture in pictures:
                 if stream is None:
-                    rate = Fraction(1 / dt_s).limit_denominator(1000)
+                    rate = Fraction(1 / dt_s).limit_denominator(20)
                     stream = container.add_stream(
                         "libx264", rate=rate, options={"preset": "veryfast", "crf": "23"}
                     )
                     stream.height, stream.width = picture.shape[:2]
                     stream.pix_fmt = "yuv420p"
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgba")))
             container.mux(stream.encode(None))
         partial.replace(file)
     finally:
