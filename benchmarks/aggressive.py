@@ -32,7 +32,7 @@ import numpy as np
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results, interval_of, paired_differences
 from drivax.evaluation.rollout import drive, judging
-from drivax.evaluation.runner import BATCH, evaluate
+from drivax.evaluation.runner import evaluate
 from drivax.learning.policies import load_policy, pack_policy
 from drivax.learning.policy_traffic import find_traffic, policy_traffic
 from drivax.planners.catalogue import make_planner
@@ -54,8 +54,8 @@ OWN = tuple(
 )
 BOLD = tuple(name.partition(":")[2] for name in OWN)
 FAILURES = ("collision", "at_fault_collision", "offroad", "red_light")
-#: Vehicles per scenario in whose place the policies are measured.
-OTHERS = 2
+#: Vehicles per scenario in whose place the policies are measured, and how many are driven side by side.
+OTHERS, BATCH = 2, 64
 
 Table = dict[str, dict[str, Any]]
 

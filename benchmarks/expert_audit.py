@@ -27,8 +27,7 @@ import numpy as np
 
 from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
-from drivax.evaluation.audit import replay
-from drivax.evaluation.runner import BATCH
+from drivax.evaluation.audit import BATCH, replay
 from drivax.geometry.boxes import corners
 from drivax.scenario.assemble import assemble, windows, with_ego
 from drivax.scenario.bank import ScenarioBank

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from drivax.api import evaluate, load, make_simulator
     from drivax.learning.loop import train
+    from drivax.planners.functions import jax_planner, python_planner
     from drivax.scenario.bank import ScenarioBank
     from drivax.scenario.store import ScenarioSet
     from drivax.tasks.task import Task
@@ -23,6 +24,8 @@ _HOMES = {
     "make_simulator": "drivax.api",
     "evaluate": "drivax.api",
     "train": "drivax.learning.loop",
+    "jax_planner": "drivax.planners.functions",
+    "python_planner": "drivax.planners.functions",
     "ScenarioBank": "drivax.scenario.bank",
     "ScenarioSet": "drivax.scenario.store",
     "Task": "drivax.tasks.task",
@@ -48,7 +51,10 @@ def _avoid_the_hang() -> None:
 
 _avoid_the_hang()
 
-__all__ = ["ScenarioBank", "ScenarioSet", "Task", "evaluate", "load", "make_simulator", "train"]
+__all__ = [
+    "ScenarioBank", "ScenarioSet", "Task", "evaluate", "jax_planner", "load", "make_simulator", "python_planner",
+    "train",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,15 +10,17 @@ from typing import Any
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
-from drivax.evaluation.runner import evaluate_in
+from drivax.evaluation.runner import evaluate_scenarios
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
 from drivax.learning.zoo import is_policy, zoo
 from drivax.named import is_dotted
-from drivax.planners.catalogue import PLANNERS, make_planner
+from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.choice import chosen
 from drivax.scenario.schema import Scenario
+from drivax.scenario.sizes import Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
@@ -34,26 +36,47 @@ class Loaded:
         scenarios: The stored scenarios.
         bank: The same, stacked on the device; an argument of everything that simulates.
         names: ``dataset``, ``scenario_id`` and ``segment`` of each.
+        sizes: Of banks in which they are evaluated: those of the whole set, so that a part of it is driven alike.
     """
 
     scenarios: Sequence[Scenario]
     bank: ScenarioBank
     names: Sequence[Mapping[str, str]]
+    sizes: Sizes
 
     def __len__(self) -> int:
         return len(self.names)
 
 
-def load(data: str | Path | Sequence[Scenario], limit: int | None = None) -> Loaded:
+def load(
+    data: str | Path | Sequence[Scenario],
+    limit: int | None = None,
+    *,
+    filters: Sequence[str] = (),
+    scenarios: Sequence[str | Path] = (),
+) -> Loaded:
     """Scenarios of a set, or of your own making, ready to simulate.
 
     Args:
         data: Folder of a scenario set, or scenarios.
-        limit: Only the first so many.
+        limit: Only the first so many of those that the others leave.
+        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.choice``).
+        scenarios: Only those of a set that are named by their ids, or in files with one id per line.
+
+    Raises:
+        DataError: The set is damaged, a name is not in it, or nothing is left.
+        UsageError: A filter or the limit cannot be meant.
     """
-    stored = ScenarioSet.open(data) if isinstance(data, str | Path) else data
-    scenarios = [stored[row] for row in range(len(stored) if limit is None else min(limit, len(stored)))]
-    return Loaded(scenarios, ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
+    if isinstance(data, str | Path):
+        stored = ScenarioSet.open(data)
+        kept = [stored[row] for row in chosen(stored, filters, scenarios, limit)]
+        # Checksums are tested where a scenario is loaded; this only looks at what each record uses.
+        sizes = Sizes.used(ScenarioSet.open(data, verify=False))
+    elif filters or scenarios:
+        raise UsageError("only a scenario set can be filtered", cure="leave out what is not wanted")
+    else:
+        kept, sizes = list(data[:limit]), Sizes.used(data)
+    return Loaded(kept, ScenarioBank.from_scenarios(kept), scenario_names(kept), sizes)
 
 
 def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
@@ -73,26 +96,28 @@ def _traffic(given: str | Traffic) -> Traffic:
 
 
 def evaluate(
-    planner: str | Path | Planner, data: str | Path | Loaded, *, task: Task | None = None,
+    planner: str | Path | Planner | Callable[..., Any], data: str | Path | Loaded, *, task: Task | None = None,
     traffic: str | Traffic = "log", start: Start | None = None, **options: Any,
 ) -> Results:  # fmt: skip
     """Drives every scenario to the end of its log and measures it; writes nothing.
 
     Args:
-        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner.
-        data: Folder of a scenario set, or what :func:`load` returned.
+        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
+        data: Folder of a scenario set, or what :func:`load` returned (a part of a set, scenarios of your own).
         task: Action space and observation of a planner of your own.
         traffic: As of :func:`make_simulator`; it is prepared here.
         start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
-        options: ``start_step``, ``seed``, ``progress`` of ``evaluation.runner.evaluate``.
+        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of ``evaluation.runner.evaluate_scenarios``.
     """
-    loaded = data if isinstance(data, Loaded) else load(data)
+    loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
         if task is not None:
             raise UsageError("a planner by name brings its own task", cure="leave out task=")
         planner, task = find_planner(str(planner), loaded.bank)
+    driver = as_planner(planner, getattr(planner, "__name__", "planner"))
     simulator = Simulator(task or Task(), _traffic(traffic), start or LogStart())
-    return evaluate_in(simulator, planner, loaded.bank, loaded.names, **options)
+    scenarios = data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data)
+    return evaluate_scenarios(simulator, driver, scenarios, sizes=loaded.sizes, **options)
 
 
 def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:

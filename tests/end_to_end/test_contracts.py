@@ -83,7 +83,7 @@ def evaluation(data):
 def test_episodes(evaluation, data):
     with (evaluation / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == [*KEYS, *METRICS]
+    assert list(rows[0]) == [*KEYS, *METRICS, "crashed"]
     assert len(ScenarioSet.open(data)) == 6 and len(rows) == 5
     assert [row["scenario_id"] for row in rows] == [one.id for one in ScenarioSet.open(data)][:5]
     assert {(row["planner"], row["traffic"], row["dataset"]) for row in rows} == {
@@ -164,6 +164,41 @@ def test_bench_by_metric_set(data, capsys, monkeypatch):
     assert next(row["relative"] for row in rows if (row["metrics"], row["batch"]) == ("full", 2)) == 1.0
 
 
+def test_a_part_of_a_set_and_a_python_function_that_raises(data, tmp_path, capsys):
+    """It raises where ego begins faster than 8 m/s."""
+    scenarios = ScenarioSet.open(data)
+    speed = {one.id: float(np.hypot(*one.agent_velocity[10, 0])) for one in scenarios}
+    names = list(speed)
+    (tmp_path / "some.txt").write_text("\n".join(names[2:]))
+    call = [
+        "evaluate",
+        "--planner",
+        "own_drivers:no_haste",
+        "--data",
+        str(data),
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    more = ["--filter", "agents>0", "--scenarios", names[0], str(tmp_path / "some.txt"), "--limit", "4"]
+    assert main([*call, *more, "--metrics", "comfort", "min_ttc"]) == 0
+    kept = [names[row] for row in (0, 2, 3, 4)]
+    with (tmp_path / "run" / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["scenario_id"] for row in rows] == kept
+    fast = [name for name in kept if speed[name] > 8.0]
+    assert [row["scenario_id"] for row in rows if row["crashed"] == "1"] == fast and 0 < len(fast) < 4
+    assert {(row["success"], row["collision"]) for row in rows if row["crashed"] == "1"} == {("0", "")}
+    crashes = json.loads((tmp_path / "run" / "crashes.json").read_text())
+    assert [(crash["scenario_id"], crash["step"]) for crash in crashes] == [(name, 10) for name in fast]
+    out = capsys.readouterr().out
+    assert f"no_haste crashed in {len(fast)} of 4 episodes, which count as failed:" in out
+    assert f"{fast[0]}, step 10: ValueError: too fast (own_drivers.py:" in out
+    assert [line.split()[0] for line in out.splitlines() if line.startswith(("comfort", "min_ttc"))] == [
+        "comfort", "min_ttc",
+    ]  # fmt: skip
+    jsonschema.validate(json.loads((tmp_path / "run" / "summary.json").read_text()), SUMMARY)
+
+
 def test_report(evaluation, data):
     out = data.parent / "report.html"
     assert main(["report", str(evaluation), "--out", str(out)]) == 0
@@ -180,6 +215,19 @@ def test_report(evaluation, data):
         (["--planner", "idm", "--data", "SET", "--out", "NEW", "--start-step", "90"], ["90"], 2),
         (["--planner", "idm", "--data", "SET", "--out", "NEW", "--limit", "0"], ["--limit 0"], 2),
         (["--planner", "SET", "--data", "SET", "--out", "NEW"], ["no run folder"], 1),
+        (
+            ["--planner", "idm", "--data", "SET", "--out", "NEW", "--filter", "type=juncton"],
+            ["'junction'"],
+            2,
+        ),
+        (
+            ["--planner", "idm", "--data", "SET", "--out", "NEW", "--scenarios", "w1"],
+            ["'w1'", "not in the set"],
+            1,
+        ),
+        (["--planner", "own_drivers:plain", "--data", "SET", "--out", "NEW"], ["@drivax.python_planner"], 2),
+        (["--planner", "idm", "--data", "SET", "--out", "NEW", "--metrics", "min_tcc"], ["'min_ttc'"], 2),
+        (["--planner", "idm", "--data", "SET", "--out", "NEW", "--batch", "0"], ["a batch of 0"], 2),
     ],
 )
 def test_wrong_calls_get_one_line(arguments, words, status, evaluation, data, capsys, tmp_path):

@@ -8,8 +8,8 @@ import pytest
 from drivax.api import load
 from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
-from drivax.evaluation.audit import audit
-from drivax.evaluation.runner import BATCH, evaluate
+from drivax.evaluation.audit import BATCH, audit
+from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.assemble import assemble, windows
 from drivax.scenario.recording import Light

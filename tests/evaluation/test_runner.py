@@ -1,44 +1,184 @@
-"""Evaluation: batching never changes a result, the audit finds what was put in, runs appear whole or not at all."""
+"""Evaluation: an episode follows from its scenario alone, a planner that crashes has failed, the audit finds faults."""
+
+import csv
+import json
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+import drivax
 from drivax.api import load
-from drivax.errors import UsageError
-from drivax.evaluation import runner
+from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit
-from drivax.evaluation.results import paired_differences
-from drivax.evaluation.runner import evaluate
-from drivax.planners.simple import ConstantVelocity, Expert
+from drivax.evaluation.results import FAILED, KEYS, paired_differences, with_crashes
+from drivax.evaluation.runner import evaluate, evaluate_scenarios
+from drivax.evaluation.runs import format_crashes
+from drivax.evaluation.stored import read_episodes
+from drivax.metrics.catalogue import METRICS
+from drivax.planners.simple import Expert
 from drivax.scenario.assemble import assemble
+from drivax.scenario.schema import Flag
+from drivax.scenario.store import ScenarioWriter
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.actions import PUBLISHED
 from drivax.tasks.task import Task
-from scenes import bank_of, car, straight_road
+from own_drivers import fragile, plain
+from scenes import SMALL, bank_of, car, straight_road
+
+COUNT = 9
+#: Every chance there is: the starts, and what the planner draws.
+NOISY = Simulator(Task(), start=NoisyStart())
 
 
 @pytest.fixture(scope="module")
-def data():
-    return load([assemble(generate_recording(9, i)) for i in range(5)])
+def scenarios():
+    return [assemble(generate_recording(9, i)) for i in range(COUNT)]
 
 
-def test_batches_change_nothing_and_none_is_dropped(data, monkeypatch):
-    whole = evaluate(ConstantVelocity(), data.bank, data.names)
-    monkeypatch.setattr(runner, "BATCH", 2)
-    parts = evaluate(ConstantVelocity(), data.bank, data.names)
-    assert len(parts) == 5
-    np.testing.assert_array_equal(whole.motion, parts.motion)
-    for name, values in whole.metrics.items():
-        np.testing.assert_allclose(values, parts.metrics[name], rtol=1e-6, err_msg=name)
-    same = paired_differences(whole, parts, "success")
-    assert (same.mean, same.n) == (0.0, 5)
+@pytest.fixture(scope="module")
+def data(scenarios):
+    return load(scenarios)
+
+
+@pytest.fixture(scope="module")
+def driven(data):
+    """Drives some of the scenarios, all of them in one program."""
+
+    def drive(some, planner=None, batch=4, seed=0):
+        return evaluate_scenarios(NOISY, planner or fragile(), some, batch=batch, seed=seed, sizes=data.sizes)
+
+    return drive
+
+
+@pytest.fixture(scope="module")
+def whole(scenarios, driven):
+    return driven(scenarios)
+
+
+def by_scenario(results):
+    rows = results.rows()
+    names = [row["scenario_id"] for row in rows]
+    assert len(set(names)) == len(rows)
+    return {
+        name: (row, motion.tobytes()) for name, row, motion in zip(names, rows, results.motion, strict=True)
+    }
+
+
+def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whole, driven):
+    expected = by_scenario(whole)
+    assert len(expected) == COUNT
+    for batch in (1, 7, 64):
+        assert by_scenario(driven(scenarios, batch=batch)) == expected, batch
+    shuffled = [scenarios[i] for i in np.random.default_rng(2).permutation(COUNT)]
+    assert by_scenario(driven(shuffled)) == expected
+    some = by_scenario(driven(scenarios[5:2:-1], batch=2))
+    assert some == {name: expected[name] for name in some} and len(some) == 3
+    assert by_scenario(driven(scenarios, seed=1)) != expected
+    copies = driven([scenarios[0], scenarios[0]], batch=1)
+    assert copies.motion[0].tobytes() == expected[scenarios[0].id][1] != copies.motion[1].tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("planner", ["idm", "random", "pdm", "search", "zoo:aggressive"])
+def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
+    with ScenarioWriter(tmp_path / "set", scenarios[0].capacity) as writer:
+        for scenario in scenarios:
+            writer.add(scenario)
+    expected = by_scenario(drivax.evaluate(planner, tmp_path / "set", traffic="idm"))
+    ids = [scenario.id for scenario in scenarios[:3:-1]]
+    for data, options in ((tmp_path / "set", {"batch": 2}), (load(tmp_path / "set", scenarios=ids), {})):
+        found = by_scenario(drivax.evaluate(planner, data, traffic="idm", **options))
+        assert found == {name: expected[name] for name in found} and len(found) in (COUNT, len(ids))
+
+
+def test_every_planner_has_the_same_noisy_starts(scenarios, whole, driven):
+    other = driven(scenarios[2:6], fragile(share=0.0))
+    np.testing.assert_array_equal(other.motion[:, 0], whole.motion[2:6, 0])
+    assert (other.motion[:, -1] != whole.motion[2:6, -1]).any(axis=1).all()
+    again = driven(scenarios[2:6], fragile(share=0.0), seed=1)
+    assert (other.motion[:, 0] != again.motion[:, 0]).any()
+
+
+@pytest.fixture(scope="module")
+def crashed(scenarios, data, driven):
+    return driven(scenarios, fragile(breaks=data.bank.identity[3], step=40))
+
+
+def test_a_crash_is_a_failed_episode_and_no_other_changes(scenarios, whole, crashed):
+    assert [(crash.row, crash.step, crash.error) for crash in crashed.crashes] == [
+        (3, 40, "action is not finite")
+    ]
+    before, after = by_scenario(whole), by_scenario(crashed)
+    assert {name for name in before if before[name] != after[name]} == {scenarios[3].id}
+    np.testing.assert_array_equal(crashed.motion[3, :31], whole.motion[3, :31])
+    assert np.isfinite(crashed.motion).all()
+    row, sound = after[scenarios[3].id][0], before[scenarios[3].id][0]
+    assert row["crashed"] == "1" and sound["crashed"] == "0"
+    for name in METRICS:
+        defined = name in FAILED and sound[name] != ""
+        assert row[name] == ("0" if defined else ""), name
+    assert row["vmax_score"] == "0" and row["success"] == "0"
+    for name in ("accuracy", "success", "vmax_score"):
+        one, other = (results.summary()["metrics"][name] for results in (whole, crashed))
+        assert one["n"] == other["n"] == COUNT, "it stays in the denominator"
+        assert other["mean"] * COUNT == pytest.approx(one["mean"] * COUNT - float(sound[name]))
+    assert crashed.summary()["metrics"]["crashed"]["mean"] == pytest.approx(1 / COUNT)
+
+
+def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
+    crashed.write(tmp_path)
+    found = json.loads((tmp_path / "crashes.json").read_text())
+    assert found == [
+        {"dataset": "drivax", "scenario_id": scenarios[3].id, "step": 40, "error": "action is not finite"}
+    ]
+    with (tmp_path / "episodes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [*KEYS, *METRICS, "crashed"]
+    keys, metrics = read_episodes(tmp_path)
+    assert keys["scenario_id"][3] == scenarios[3].id
+    assert metrics["crashed"].tolist() == [float(row == 3) for row in range(COUNT)]
+    said = format_crashes(crashed).splitlines()
+    assert said == [
+        "fragile crashed in 1 of 9 episodes, which count as failed:",
+        f"  {scenarios[3].id}, step 40: action is not finite",
+    ]
+    assert format_crashes(whole) == ""
+    same = paired_differences(crashed, whole, "success")
+    assert same.n == COUNT and same.mean <= 0
     with pytest.raises(UsageError, match="different scenarios"):
-        paired_differences(whole, evaluate(ConstantVelocity(), data.bank, data.names[::-1]), "success")
+        paired_differences(crashed, replace(whole, scenarios=whole.scenarios[::-1]), "success")
+
+
+def test_crashes_by_hand():
+    nan = np.nan
+    found = with_crashes(
+        {
+            "success": np.array([1.0, 1.0, nan]), "vmax_score": np.array([0.5, nan, 0.7]),
+            "vmax_score_partial": np.array([nan, 0.9, nan]), "collision": np.array([0.0, 0.0, 1.0]),
+            "own": np.array([3.0, 4.0, 5.0]),
+        },
+        np.array([False, True, True]),
+    )  # fmt: skip
+    assert list(found) == ["success", "vmax_score", "vmax_score_partial", "collision", "crashed", "own"]
+    expected = {
+        "success": [1.0, 0.0, nan], "vmax_score": [0.5, nan, 0.0], "vmax_score_partial": [nan, 0.0, nan],
+        "collision": [0.0, nan, nan], "crashed": [0.0, 1.0, 1.0], "own": [3.0, nan, nan],
+    }  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
 def test_a_planner_of_another_action_space_is_refused(data):
     with pytest.raises(UsageError, match="another action space"):
         evaluate(Expert(), data.bank, data.names, task=Task(actions=PUBLISHED))
+
+
+def test_a_function_that_nobody_made_a_planner_of_is_refused(data):
+    with pytest.raises(UsageError, match=r"'plain' takes \(situation, observation\).*@drivax.python_planner"):
+        drivax.evaluate(plain, data)
 
 
 def test_the_audit_finds_what_the_log_does_wrong():
@@ -61,3 +201,29 @@ def test_a_start_step_without_an_action_is_refused():
     names = [{"dataset": "test", "scenario_id": "a", "segment": "a"}]
     with pytest.raises(UsageError, match="leaves no action"):
         evaluate(Expert(), bank, names, start_step=90)
+
+
+def named(recording, name):
+    return assemble(replace(recording, scenario_id=name), SMALL)
+
+
+def test_logs_in_which_nobody_could_be_judged_are_named_with_the_filter_that_leaves_them_out():
+    late = straight_road([car(steps=range(5, 91)), car(30)])
+    gap = straight_road([car(steps=[*range(40), *range(50, 91)])])
+    logs = [named(straight_road([car()]), "good"), named(late, "late"), named(gap, "gap")]
+    for step, told in ((45, "1 of 3 .*'scenario_id!=gap'"), (2, "1 of 3 .*'scenario_id!=late'")):
+        with pytest.raises(UsageError, match=rf"not in the log at step {step} in {told}"):
+            evaluate_scenarios(NOISY, fragile(), logs, start_step=step)
+    long = straight_road([car()])
+    tracks = {
+        field.name: value[:, :11] if value.ndim > 1 else value
+        for field in fields(long.tracks)
+        for value in [getattr(long.tracks, field.name)]
+    }
+    cut = replace(long, tracks=replace(long.tracks, **tracks), timestamps_s=long.timestamps_s[:11])
+    short = named(cut, "short")
+    assert Flag.NO_FUTURE in short.has
+    with pytest.raises(DataError, match=r"record short: has no logged future.*1 of 4.*flag!=NO_FUTURE"):
+        evaluate_scenarios(NOISY, fragile(), [*logs, short])
+    with pytest.raises(UsageError, match="a batch of 0"):
+        evaluate_scenarios(NOISY, fragile(), logs, batch=0)

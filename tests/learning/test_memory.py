@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import pytest
 
 from drivax.errors import UsageError
+from drivax.evaluation.memory import memory_of
 from drivax.learning.environment import Environments
-from drivax.learning.memory import MemoryAccount, account, memory_of
+from drivax.learning.memory import MemoryAccount, account
 from drivax.scenario.record import record
 
 

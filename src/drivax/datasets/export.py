@@ -13,9 +13,9 @@ from typing import Any, Literal
 from drivax.datasets import export_gpudrive, export_tfrecord
 from drivax.datasets.export_gpudrive import gpudrive_scene
 from drivax.datasets.export_tfexample import PATHS, tf_example
-from drivax.errors import DataError, UsageError
+from drivax.errors import UsageError
+from drivax.scenario.choice import chosen
 from drivax.scenario.partial import PartialFolder, sync_and_close, write_json
-from drivax.scenario.selection import Selection
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 #: What an export in another format says about itself.
@@ -97,7 +97,8 @@ def export(
     options, out = options or Export(), Path(out)
     options.check()
     opened = ScenarioSet.open(set_path)
-    rows = chosen(opened, options)
+    names = () if options.ids is None else (options.ids,)
+    rows = chosen(opened, options.filters, names, options.limit)
     if options.format == "set":
         return _write_set(opened, rows, out, options, progress)
     write = {"tfexample": _write_examples, "gpudrive": _write_scenes}[options.format]
@@ -112,50 +113,6 @@ def export(
     finally:
         partial.close()
     return Exported(out, len(rows), len(set(files)), +lost)
-
-
-def chosen(opened: ScenarioSet, options: Export) -> list[int]:
-    """Rows of the scenarios that the options select, in order of the set.
-
-    Raises:
-        DataError: An id is not in the set, or no scenario is selected.
-        UsageError: A filter cannot be meant.
-    """
-    selection = Selection.parse(options.filters)
-    wanted = None if options.ids is None else _listed(options.ids, opened)
-    rows = [
-        row
-        for row in selection.rows(opened.entries)
-        if wanted is None or row in wanted
-    ][: options.limit]  # fmt: skip
-    if not rows:
-        raise DataError("no scenario is selected", file=opened.path, cure="loosen --filter or --ids")
-    return rows
-
-
-def _listed(file: Path, opened: ScenarioSet) -> set[int]:
-    """Rows that a file of ids names; an id without a data set names it in all of them."""
-    rows: dict[tuple[str | None, str], set[int]] = {}
-    for row, entry in enumerate(opened.entries):
-        for dataset in (None, entry["dataset"]):
-            rows.setdefault((dataset, entry["scenario_id"]), set()).add(row)
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise DataError(error.strerror or "cannot be read", file=file, cure="check the path") from error
-    except UnicodeDecodeError as error:
-        raise DataError("is no text", file=file, cure="give one scenario id per line") from error
-    wanted: set[int] = set()
-    for number, line in enumerate(lines, start=1):
-        dataset, tab, scenario_id = line.strip().rpartition("\t")
-        if not scenario_id:
-            continue
-        found = rows.get((dataset if tab else None, scenario_id))
-        if found is None:
-            problem = f"line {number} names {scenario_id!r}, which is not in the set {opened.path}"
-            raise DataError(problem, file=file, cure="use ids that drivax inspect --json lists")
-        wanted |= found
-    return wanted
 
 
 def _write_set(

@@ -35,8 +35,8 @@ def restore(scenario: Scenario) -> Recording:
     marks = scenario.agent_flags
     return Recording(
         scenario_id=scenario.id,
-        dataset=_text(scenario.dataset),
-        segment=_text(scenario.segment),
+        dataset=scenario.text("dataset"),
+        segment=scenario.text("segment"),
         timestamps_s=np.arange(int(scenario.steps)) * round(float(scenario.dt_s), 6),
         current_step=int(scenario.current_step),
         ego=0,
@@ -49,10 +49,6 @@ def restore(scenario: Scenario) -> Recording:
         tags=scenario.tags,
         flags=Flag(scenario.has & _READERS_FLAGS),
     )
-
-
-def _text(value: Any) -> str:
-    return bytes(value[()]).rstrip(b"\0").decode()
 
 
 class _Fresh:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from drivax.evaluation.runner import BATCH
 from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, Flag, Scenario
@@ -24,6 +23,9 @@ from drivax.simulator.types import Facts, Frame, Scene, SimState, Situation, Sur
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
 
 Finding = dict[str, float | int | bool | str | None]
+
+#: Logs that are replayed side by side.
+BATCH = 64
 
 #: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
 GOAL_M = 3.0
@@ -37,14 +39,7 @@ _SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
     """``dataset``, ``scenario_id`` and ``segment`` of scenarios, as tables carry them."""
-    return [
-        {"dataset": _text(s, "dataset"), "scenario_id": s.id, "segment": _text(s, "segment")}
-        for s in scenarios
-    ]
-
-
-def _text(scenario: Scenario, name: str) -> str:
-    return bytes(scenario.record[name][()]).rstrip(b"\0").decode()
+    return [{name: s.text(name) for name in ("dataset", "scenario_id", "segment")} for s in scenarios]
 
 
 def audit(scenarios: Sequence[Scenario]) -> list[Finding]:

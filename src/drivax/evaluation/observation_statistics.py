@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.evaluation.rollout import advanced, judging
+from drivax.evaluation.rollout import advanced, episode_keys, judging
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
@@ -186,14 +186,13 @@ def described(
 
 def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0) -> Looks:
     """Moments of one episode per scenario; the episodes are those of an evaluation with this seed."""
-    root, parts = jax.random.key(seed), []
+    parts = []
     for first in range(0, len(bank), BATCH):
         rows = np.arange(first, min(first + BATCH, len(bank)))
         size = min(BATCH, len(bank))
         # A short last batch repeats its last scenario, so that one compilation serves all.
         index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
-        keys = jax.vmap(lambda row: jax.random.fold_in(root, row))(index)
-        found = _looks(simulator, planner, bank, index, keys, every)
+        found = _looks(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
         kept = len(rows)
         parts.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], found))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
@@ -222,7 +221,7 @@ def _episode(
 
     def step(now: Any, key: Array) -> tuple[Any, None]:
         state, carry, hit = now
-        state, carry = advanced(simulator, planner, bank, state, carry, key)
+        state, carry, _ = advanced(simulator, planner, bank, state, carry, key)
         return (state, carry, hit | state.facts.collision), None
 
     def look(now: Any, keys: Array) -> tuple[Any, Any]:

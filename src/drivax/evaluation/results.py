@@ -20,10 +20,45 @@ KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
 #: Metrics that are shares of episodes: their interval is Wilson's.
 RATES = (
     "accuracy", "accuracy_at_fault", "success", "success_moving", "collision", "at_fault_collision", "offroad",
-    "left_map", "off_route", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal",
+    "left_map", "off_route", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal", "crashed",
 )  # fmt: skip
 #: Codes and counts that no mean makes sense of.
 NOT_SUMMARISED = ("collision_type", "steps")
+#: What an episode is, by these metrics, whose planner crashed: failed. What else it would have been nobody knows.
+FAILED = (
+    "accuracy", "accuracy_at_fault", "success", "success_moving", "vmax_score", "nuplan_score", "vmax_score_partial",
+    "nuplan_score_partial",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class About:
+    """What tables say of a column outside the catalogue: unit, direction (``high``, ``low``, ``-``), a line of text."""
+
+    unit: str
+    better: str
+    text: str
+
+
+#: The column that evaluation adds to the metrics.
+ADDED = {
+    "crashed": About("-", "low", "the planner raised an error, or its action was no number: a failed episode")
+}
+
+
+@dataclass(frozen=True)
+class Crash:
+    """An episode whose planner crashed.
+
+    Attributes:
+        row: Which one.
+        step: Step of the log at which it first did.
+        error: What it raised, or that its action was not finite; one line.
+    """
+
+    row: int
+    step: int
+    error: str
 
 
 @dataclass(frozen=True)
@@ -39,6 +74,7 @@ class Results:
         start: Step of the log at which the episodes began.
         offroad_steps: Steps off the road.
         own: Those of the metrics that are the user's own: unit, direction and text.
+        crashes: Episodes that failed because the planner crashed.
     """
 
     planner: str
@@ -51,6 +87,7 @@ class Results:
     start: int
     offroad_steps: np.ndarray[Any, Any]
     own: Mapping[str, Metric] = field(default_factory=dict)
+    crashes: Sequence[Crash] = ()
 
     def __len__(self) -> int:
         return len(self.scenarios)
@@ -62,11 +99,11 @@ class Results:
         metric that is defined nowhere has null mean and n 0.
         """
         clusters = np.array([row["segment"] for row in self.scenarios])
-        table = {}
-        for name in (*METRICS, *self.own):
-            if name in NOT_SUMMARISED:
-                continue
-            table[name] = interval_of(name, self.metrics[name], clusters).as_dict()
+        table = {
+            name: interval_of(name, values, clusters).as_dict()
+            for name, values in self.metrics.items()
+            if name not in NOT_SUMMARISED
+        }
         return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
 
     def rows(self) -> list[dict[str, str]]:
@@ -88,10 +125,26 @@ class Results:
         about = {n: {"unit": m.unit, "better": m.better, "text": m.text} for n, m in self.own.items()}
         return {"own_metrics": about} if about else {}
 
+    def crash_rows(self) -> list[dict[str, Any]]:
+        """What ``crashes.json`` holds: the scenario of each crash, the step and the error."""
+        return [
+            {
+                **{key: self.scenarios[crash.row][key] for key in ("dataset", "scenario_id")},
+                "step": crash.step,
+                "error": crash.error,
+            }
+            for crash in self.crashes
+        ]
+
     def write(self, folder: Path) -> None:
-        """Writes ``episodes.csv``, ``summary.json`` and ``trajectories.npz`` into an existing folder."""
+        """Writes ``episodes.csv``, ``summary.json`` and ``trajectories.npz`` into an existing folder.
+
+        And ``crashes.json``, where the planner crashed.
+        """
+        if self.crashes:
+            (folder / "crashes.json").write_text(json.dumps(self.crash_rows(), indent=1) + "\n")
         with (folder / "episodes.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, [*KEYS, *METRICS, *self.own], lineterminator="\n")
+            writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows())
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n")
@@ -104,6 +157,26 @@ class Results:
             start=np.full(len(self), self.start, np.int32),
             **arrays,
         )
+
+
+def with_crashes(metrics: Mapping[str, Any], crashed: Any) -> dict[str, np.ndarray[Any, Any]]:
+    """Metrics in which episodes whose planner crashed have failed, and the column that says which these are.
+
+    They have the value 0 in those of :data:`FAILED` that their scenario defines, so that a planner gains nothing by
+    crashing; all else is undefined.
+
+    Args:
+        metrics: Values by name, NaN where undefined; those of the user's own last.
+        crashed: Which episodes did.
+    """
+    found: dict[str, np.ndarray[Any, Any]] = {}
+    for name, values in metrics.items():
+        failed = np.where(np.isnan(values), np.nan, 0.0) if name in FAILED else np.nan
+        found[name] = np.where(crashed, failed, values)
+    ours = [name for name in found if name in METRICS]
+    own = [name for name in found if name not in METRICS]
+    column = {"crashed": np.asarray(crashed, np.float64)}
+    return {n: found[n] for n in ours} | column | {n: found[n] for n in own}
 
 
 def _cell(value: Any) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.episode import episode_metrics, first_steps
 from drivax.metrics.scores import Value
@@ -34,12 +34,19 @@ class Episodes:
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
         offroad_steps: Number of steps off the road.
+        crashed: First step whose action was no number, -1 for none. What follows it means nothing.
     """
 
     metrics: dict[str, Value]
     events: dict[str, Int[Array, "*batch"]]
     motion: Float[Array, "*batch steps 4"]
     offroad_steps: Int[Array, "*batch"]
+    crashed: Int[Array, "*batch"]
+
+
+def episode_keys(bank: ScenarioBank, index: Int[Array, " B"], seed: int) -> Array:
+    """A random key for each scenario, which follows from the seed and from who it is, not from where it stands."""
+    return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), bank.identity[index])
 
 
 def judging(task: Task) -> Task:
@@ -82,25 +89,34 @@ def _episode(
     carry = planner.init(bank, state, begin_key)
 
     def one(now: Any, key: Array) -> Any:
-        state, carry = now
-        state, carry = advanced(simulator, planner, bank, state, carry, key)
-        return (state, carry), (state.scene.history[-1], state.facts.offroad)
+        state, carry, sound = advanced(simulator, planner, bank, *now, key)
+        return (state, carry), (state.scene.history[-1], state.facts.offroad, sound)
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
-    (final, _), (motion, offroad) = jax.lax.scan(one, (state, carry), keys)
-    motion = jnp.concatenate([state.scene.history[-1][None], motion])
+    (final, _), (motion, offroad, sound) = jax.lax.scan(one, (state, carry), keys)
     return Episodes(
-        episode_metrics(bank, final), first_steps(final.episode), motion, offroad.sum().astype(jnp.int32)
+        metrics=episode_metrics(bank, final),
+        events=first_steps(final.episode),
+        motion=jnp.concatenate([state.scene.history[-1][None], motion]),
+        offroad_steps=offroad.sum().astype(jnp.int32),
+        crashed=jnp.where(sound.all(), -1, start_step + jnp.argmin(sound)),
     )
 
 
 def advanced(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any, key: Array
-) -> tuple[SimState, Any]:
-    """State and carry one step later, the planner driving or, where it replays, the log."""
+) -> tuple[SimState, Any, Bool[Array, ""]]:
+    """State and carry one step later, the planner driving or, where it replays, the log; and whether it gave numbers.
+
+    Where it did not, nothing is asked of the car (``Task.first_action``), so that its state stays one of a car.
+    """
     situation = simulator.situation(bank, state)
     observation = simulator.observe(bank, state.scene)
     action, carry = planner.act(carry, bank, state, situation, observation, key)
     if planner.replays:
-        return simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)[0], carry
-    return simulator.step(bank, state, action)[0], carry
+        logged = logged_motion(bank, state.scene, 1)
+        return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
+    scene, sound = state.scene, jnp.isfinite(action).all()
+    length_m = bank.agent_box[scene.index, scene.slot, 0]
+    nothing = simulator.task.first_action(scene.history, length_m)
+    return simulator.step(bank, state, jnp.where(sound, action, nothing))[0], carry, sound

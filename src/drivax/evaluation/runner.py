@@ -1,31 +1,53 @@
-"""Evaluation of a planner over all scenarios of a set, in batches, none dropped."""
+"""Evaluation of a planner over all scenarios of a set, none dropped.
+
+An episode follows from planner, task, traffic, start, seed and scenario alone. Chance follows from who a scenario is
+(``bank.identity``), and one program drives always as many scenarios side by side (a short batch is filled up), in banks
+of the same sizes; so neither order nor company nor how many are loaded at a time changes a bit of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
-from drivax.errors import DrivaxError, UsageError
-from drivax.evaluation.results import Results
-from drivax.evaluation.rollout import Episodes, drive, judging
-from drivax.metrics.catalogue import METRICS
+from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_out_of_memory
+from drivax.evaluation.results import Crash, Results, with_crashes
+from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
+from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import catalogue
+from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
-from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.identity import identities
+from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
+from drivax.scenario.sizes import Sizes
 from drivax.simulator.catalogue import prepared
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.starts import LogStart
 from drivax.simulator.traffic import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 
-#: Scenarios that run side by side; the last batch is filled up and the surplus thrown away.
-BATCH = 64
+#: Scenarios that a program drives side by side on a CPU, and on anything else. PDM-Closed takes 12 % longer for each of
+#: 16 than of 8, and 20 % less than of 64 (the caches); IDM 8 % longer than of 64.
+LANES, LANES_ELSEWHERE = 16, 256
+#: So many scenarios are named in an error.
+_TOLD = 5
+Progress = Callable[[int, int], None]
+
+
+def lanes() -> int:
+    """How many scenarios a program drives side by side on this platform."""
+    return LANES if jax.default_backend() == "cpu" else LANES_ELSEWHERE
 
 
 def evaluate(
@@ -37,7 +59,7 @@ def evaluate(
     traffic: Traffic | None = None,
     start_step: int = CURRENT_STEP,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Results:
     """Drives every scenario of a bank to the end of its log and measures it.
 
@@ -48,12 +70,12 @@ def evaluate(
         task: Action space and observation that the planner was made for; the default one otherwise.
         traffic: How the others move; they replay the log by default. What it needs is precomputed in the bank.
         start_step: Step of the log at which to begin.
-        seed: Every scenario's key is ``fold_in(key(seed), row)``, so batching never changes a result.
+        seed: Every scenario's key is this one's with the scenario's identity folded in.
         progress: Called with (done, total) after every batch.
 
     Raises:
-        UsageError: If the table and the bank disagree, or the start step leaves no action.
-        DrivaxError: If the planner produced numbers that are not finite.
+        UsageError: If the table and the bank disagree, or an episode cannot begin there.
+        DrivaxError: If the memory does not suffice.
     """
     simulator = Simulator(task or Task(), traffic or LogTraffic())
     return evaluate_in(
@@ -69,7 +91,7 @@ def evaluate_in(
     *,
     start_step: int = CURRENT_STEP,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Results:
     """:func:`evaluate` in a simulator of your own, whose starts may be noisy; its task is judged to the end of the log.
 
@@ -79,74 +101,202 @@ def evaluate_in(
         UsageError: As :func:`evaluate`; or a planner that replays the log is to begin elsewhere.
         DrivaxError: As :func:`evaluate`.
     """
-    if not isinstance(simulator.task, Task):
-        raise UsageError(f"{type(simulator.task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
-    task = judging(simulator.task)
-    simulator = replace(simulator, task=task)
-    bank = prepared(simulator.traffic, bank)
-    _refuse_misfits(planner, (task, simulator.start), bank, scenarios, start_step)
-    root = jax.random.key(seed)
-    parts: list[Episodes] = []
-    for first in range(0, len(bank), BATCH):
-        rows = np.arange(first, min(first + BATCH, len(bank)))
-        # A short last batch repeats its last scenario, so that one compilation serves all.
-        size = BATCH if len(bank) > BATCH else len(rows)
-        index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
-        keys = jax.vmap(lambda row: jax.random.fold_in(root, row))(index)
-        episodes = drive(simulator, planner, bank, index, keys, start_step)
-        kept = len(rows)
-        parts.append(jax.tree.map(lambda leaf, kept=kept: np.asarray(leaf)[:kept], episodes))
-        if progress is not None:
-            progress(int(rows[-1]) + 1, len(bank))
-    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    _refuse_nan(planner, whole, scenarios)
-    return Results(
-        planner=planner.name,
-        traffic=simulator.traffic.name,
-        seed=seed,
-        scenarios=scenarios,
-        metrics={name: np.where(v.defined, v.value, np.nan) for name, v in whole.metrics.items()},
-        events=whole.events,
-        motion=whole.motion,
-        start=start_step,
-        offroad_steps=whole.offroad_steps,
-        own={name: metric for name, metric in catalogue(task.metrics).items() if name not in METRICS},
-    )
-
-
-def _refuse_misfits(
-    planner: Planner,
-    driven: tuple[Task, Start],
-    bank: ScenarioBank,
-    scenarios: Sequence[Mapping[str, str]],
-    start_step: int,
-) -> None:
-    task, start = driven
     if len(scenarios) != len(bank):
         raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
-    if not 0 <= start_step < bank.steps - 1:
-        raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {bank.steps - 2}")
-    if getattr(planner, "actions", task.actions) != task.actions:
-        raise UsageError(
-            f"planner {planner.name} acts in another action space than the task", cure="use the task's"
-        )
-    if planner.replays and start != LogStart():
-        raise UsageError(
-            f"planner {planner.name} replays the log and cannot begin elsewhere", cure="use expert_actions"
-        )
-    absent = np.flatnonzero(np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) <= 0)
-    if absent.size:
-        name = scenarios[int(absent[0])]["scenario_id"]
-        raise UsageError(
-            f"ego is not in the log at step {start_step}", record=name, cure="begin at another step"
-        )
+    trial = _Trial.of(simulator, planner, start_step, seed, bank.steps)
+    trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) > 0)
+    with raised() as errors, telling_out_of_memory(len(bank)):
+        episodes = trial.drive_all(bank, progress)
+    return trial.results(episodes, scenarios, np.asarray(bank.identity), errors)
 
 
-def _refuse_nan(planner: Planner, episodes: Episodes, scenarios: Sequence[Mapping[str, str]]) -> None:
-    broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
-    if broken.size:
-        raise DrivaxError(
-            f"planner {planner.name} produced numbers that are not finite in {broken.size} scenarios",
-            record=scenarios[int(broken[0])]["scenario_id"],
-            cure="check its outputs there",
+def evaluate_scenarios(
+    simulator: Simulator,
+    planner: Planner,
+    scenarios: Sequence[Scenario],
+    *,
+    start_step: int = CURRENT_STEP,
+    seed: int = 0,
+    batch: int | None = None,
+    sizes: Sizes | None = None,
+    progress: Progress | None = None,
+) -> Results:
+    """:func:`evaluate_in` for stored scenarios, however many: as many are loaded at a time as memory allows.
+
+    Args:
+        simulator: Task, traffic and start.
+        planner: The driver.
+        scenarios: What is driven; all of one capacity.
+        start_step: Step of the log at which to begin.
+        seed: Of all chance.
+        batch: How many are loaded at a time; no result depends on it.
+        sizes: Of the banks; those that all of ``scenarios`` use by default. Parts of a set that are given the sizes of
+            the whole are driven by the same program.
+        progress: Called with (done, total).
+
+    Raises:
+        UsageError: As :func:`evaluate_in`, or ``batch`` is none.
+        DataError: A scenario has no logged future.
+        DrivaxError: As :func:`evaluate`.
+    """
+    if batch is not None and batch < 1:
+        raise UsageError(f"a batch of {batch} scenarios", cure="use 1 or more")
+    names = scenario_names(scenarios)
+    trial = _Trial.of(simulator, planner, start_step, seed, STEPS)
+    _refuse_without_future(names, scenarios)
+    trial.refuse_absent(names, np.array([scenario.agent_valid[start_step, 0] for scenario in scenarios]))
+    numbers = identities([(row["dataset"], row["scenario_id"]) for row in names])
+    total, sizes = len(scenarios), sizes or Sizes.used(scenarios)
+    one = ScenarioBank.from_scenarios(scenarios[:1], trim=sizes).nbytes
+    size = min(batch or scenarios_at_a_time(one, lanes(), free_memory(jax.devices()[0])), total)
+    parts: list[Episodes] = []
+    with raised() as errors, telling_out_of_memory(size):
+        for first in range(0, total, size):
+            rows = slice(first, first + size)
+            bank = ScenarioBank.from_scenarios(scenarios[rows], trim=sizes)
+            bank = replace(bank, identity=jnp.asarray(numbers[rows]))
+            parts.append(trial.drive_all(bank, _on(progress, first, total)))
+    return trial.results(_joined(parts), names, numbers, errors)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """What is evaluated, and how.
+
+    Attributes:
+        simulator: With a task that is judged.
+        planner: The driver.
+        start_step: Step of the log at which episodes begin.
+        seed: Of all chance.
+        metrics: What is measured.
+    """
+
+    simulator: Simulator
+    planner: Planner
+    start_step: int
+    seed: int
+    metrics: Mapping[str, Metric]
+
+    @classmethod
+    def of(cls, simulator: Simulator, planner: Planner, start_step: int, seed: int, steps: int) -> _Trial:
+        """Refuses what does not go together."""
+        task = simulator.task
+        if not isinstance(task, Task):
+            raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
+        if not 0 <= start_step < steps - 1:
+            raise UsageError(f"start step {start_step} leaves no action", cure=f"use 0 to {steps - 2}")
+        if getattr(planner, "actions", task.actions) != task.actions:
+            raise UsageError(
+                f"planner {planner.name} acts in another action space than the task", cure="use the task's"
+            )
+        if planner.replays and simulator.start != LogStart():
+            raise UsageError(
+                f"planner {planner.name} replays the log and cannot begin elsewhere",
+                cure="use expert_actions",
+            )
+        judged = judging(task)
+        return cls(replace(simulator, task=judged), planner, start_step, seed, catalogue(judged.metrics))
+
+    def refuse_absent(self, names: Sequence[Mapping[str, str]], there: Any) -> None:
+        """Refuses logs that do not have ego where an episode is to begin: nobody could be judged in them."""
+        absent = [names[row]["scenario_id"] for row in np.flatnonzero(~there)]
+        if absent:
+            ids = "|".join(absent[:_TOLD]) + ("|..." if len(absent) > _TOLD else "")
+            raise UsageError(
+                f"ego is not in the log at step {self.start_step} in {len(absent)} of {len(names)} scenarios",
+                record=absent[0],
+                cure=f"begin at another step, or leave them out: --filter 'scenario_id!={ids}'",
+            )
+
+    def drive_all(self, bank: ScenarioBank, progress: Progress | None = None) -> Episodes:
+        """The episodes of all scenarios of a bank, in its order."""
+        bank, width = prepared(self.simulator.traffic, bank), lanes()
+        parts: list[Episodes] = []
+        for first in range(0, len(bank), width):
+            kept = min(width, len(bank) - first)
+            rows = np.pad(np.arange(first, first + kept), (0, width - kept), mode="edge")
+            some, keys = _side_by_side(bank, jnp.asarray(rows, jnp.int32), self.seed)
+            place = jnp.arange(width, dtype=jnp.int32)
+            found = drive(self.simulator, self.planner, some, place, keys, self.start_step)
+            parts.append(jax.tree.map(lambda leaf, kept=kept: np.asarray(leaf)[:kept], found))
+            if progress is not None:
+                progress(first + kept, len(bank))
+        return _joined(parts)
+
+    def results(
+        self, episodes: Episodes, names: Sequence[Mapping[str, str]], numbers: Any, errors: Mapping[int, str]
+    ) -> Results:
+        """The episodes as results.
+
+        Args:
+            episodes: What was driven.
+            names: The scenarios.
+            numbers: Their identities.
+            errors: What the planner raised, by identity.
+        """
+        self._refuse_nan(episodes, names)
+        found = episodes.metrics
+        metrics = {name: np.where(found[name].defined, found[name].value, np.nan) for name in self.metrics}
+        crashes = tuple(
+            Crash(int(row), int(episodes.crashed[row]), errors.get(int(numbers[row]), "action is not finite"))
+            for row in np.flatnonzero(episodes.crashed >= 0)
+        )
+        # What a car runs into that nobody drives any more is no event of an episode.
+        real = (episodes.crashed < 0) | (np.stack([*episodes.events.values()]) <= episodes.crashed)
+        events = {
+            name: np.where(kept, steps, -1)
+            for (name, steps), kept in zip(episodes.events.items(), real, strict=True)
+        }
+        return Results(
+            planner=self.planner.name,
+            traffic=self.simulator.traffic.name,
+            seed=self.seed,
+            scenarios=names,
+            metrics=with_crashes(metrics, episodes.crashed >= 0),
+            events=events,
+            motion=episodes.motion,
+            start=self.start_step,
+            offroad_steps=episodes.offroad_steps,
+            own={name: metric for name, metric in self.metrics.items() if name not in METRICS},
+            crashes=crashes,
+        )
+
+    def _refuse_nan(self, episodes: Episodes, names: Sequence[Mapping[str, str]]) -> None:
+        """The planner gave numbers and yet ego is nowhere: no episode, but a defect."""
+        broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
+        if broken.size:
+            raise DrivaxError(
+                f"ego's motion is not finite in {broken.size} scenarios",
+                record=names[int(broken[0])]["scenario_id"],
+                cure="check the action space and the traffic",
+            )
+
+
+@partial(jax.jit, static_argnames="seed")
+def _side_by_side(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[ScenarioBank, Array]:
+    """These rows of a bank as a bank of their own, and their keys."""
+    some = bank.part(rows)
+    return some, episode_keys(some, jnp.arange(len(rows)), seed)
+
+
+def _joined(parts: Sequence[Episodes]) -> Episodes:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _on(progress: Progress | None, first: int, total: int) -> Progress | None:
+    """Progress over a part of all, as progress over all."""
+    return None if progress is None else lambda done, _: progress(first + done, total)
+
+
+def _refuse_without_future(names: Sequence[Mapping[str, str]], scenarios: Sequence[Scenario]) -> None:
+    short = [
+        row["scenario_id"]
+        for row, scenario in zip(names, scenarios, strict=True)
+        if Flag.NO_FUTURE in scenario.has
+    ]
+    if short:
+        raise DataError(
+            f"has no logged future (a short log or a test split), as {len(short)} of {len(names)} scenarios",
+            record=short[0],
+            cure="leave them out with --filter flag!=NO_FUTURE",
         )

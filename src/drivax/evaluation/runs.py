@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
-from drivax.evaluation.runner import evaluate_in
+from drivax.evaluation.runner import evaluate_scenarios
+from drivax.metrics.selection import selected
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.choice import chosen
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.sizes import Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.catalogue import make_traffic
 from drivax.simulator.simulator import Simulator
@@ -30,19 +31,35 @@ HEADLINE = {
     "offroad": "off-road", "red_light": "red light", "progress_ratio": "progress", "comfortable": "comfort",
     "vmax_score": "vmax",
 }  # fmt: skip
+#: So many crashes are told one by one.
+_TOLD = 5
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What was evaluated; written as ``config.yaml``."""
+    """What was evaluated; written as ``config.yaml``.
+
+    Attributes:
+        planner, traffic: What they are called.
+        noisy_start, start_step: How episodes begin, and at which step of the log.
+        filter, scenarios, limit: Which scenarios were driven (``scenario.choice``).
+        seed: Of all chance.
+        metrics: What was asked for beside the headline; metrics of the user's own are measured beside all of ours.
+        sample: Whether a trained policy drew its actions.
+        batch: How many scenarios were loaded at a time; None: as many as memory allowed.
+    """
 
     planner: str
     traffic: str = "log"
     noisy_start: bool = False
     start_step: int = CURRENT_STEP
+    filter: tuple[str, ...] = ()
+    scenarios: tuple[str, ...] = ()
     limit: int | None = None
     seed: int = 0
     metrics: tuple[str, ...] = ()
+    sample: bool = False
+    batch: int | None = None
 
 
 def run_evaluation(
@@ -51,7 +68,6 @@ def run_evaluation(
     data: ScenarioSet,
     out: str | Path,
     *,
-    bank: ScenarioBank | None = None,
     task: Task | None = None,
     traffic: Traffic | None = None,
     overwrite: bool = False,
@@ -59,30 +75,28 @@ def run_evaluation(
     """Evaluates a planner on a set and writes the run folder.
 
     Args:
-        config: Starts, start step, seed and limit; what planner and traffic are called.
+        config: Which scenarios, starts and seed; what planner and traffic are called.
         planner: The driver.
-        data: The scenarios; the first ``config.limit`` of them.
+        data: The scenarios, of which ``config`` chooses.
         out: Run folder; it appears after the drive.
-        bank: The bank of these scenarios, where it exists already.
         task: Action space and observation of the planner.
         traffic: How the others move; by default what ``config.traffic`` is called in the simulator's catalogue.
         overwrite: Replace an existing run folder.
     """
-    count = len(data) if config.limit is None else min(len(data), config.limit)
-    scenarios = [data[row] for row in range(count)]
-    bank = ScenarioBank.from_scenarios(scenarios) if bank is None else bank
+    scenarios = [data[row] for row in chosen(data, config.filter, config.scenarios, config.limit)]
     refuse_existing(Path(out), overwrite)
-    with Progress(f"driving {planner.name}", "scenarios", count) as bar:
-        start = NoisyStart() if config.noisy_start else LogStart()
-        results = evaluate_in(
-            Simulator(
-                _with_metrics(task or Task(), config.metrics), traffic or make_traffic(config.traffic), start
-            ),
+    start = NoisyStart() if config.noisy_start else LogStart()
+    judged = _with_metrics(task or Task(), config.metrics)
+    with Progress(f"driving {planner.name}", "scenarios", len(scenarios)) as bar:
+        results = evaluate_scenarios(
+            Simulator(judged, traffic or make_traffic(config.traffic), start),
             planner,
-            bank,
-            scenario_names(scenarios),
+            scenarios,
             start_step=config.start_step,
             seed=config.seed,
+            batch=config.batch,
+            # Checksums are tested where a scenario is driven; this only looks at what each record uses.
+            sizes=Sizes.used(ScenarioSet.open(data.path, verify=False)),
             progress=lambda done, total: bar.update(done),
         )
     # Everything is written beside the final name, so that a folder of that name is always a whole run.
@@ -117,4 +131,37 @@ def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
             mean = summary["metrics"][name]["mean"]
             cells.append(f"{'' if mean is None else f'{mean:.3f}':>9}")
         lines.append("  ".join(cells))
+    return "\n".join(lines)
+
+
+def format_metrics(summary: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
+    """Metrics of one planner as a table: mean, 95 % interval and n; codes and counts have none.
+
+    Args:
+        summary: Of an evaluation.
+        wanted: Sets, metrics, and those of the user's own (``metrics.selection``).
+    """
+    found = {name: summary["metrics"][name] for name in selected(wanted).names if name in summary["metrics"]}
+    width = max(map(len, ("metric", *found)))
+    lines = [f"{'metric':<{width}}  {'mean':>9}  {'95 % interval':>20}  {'n':>7}"]
+    for name, cells in found.items():
+        mean, low, high = (
+            "" if cells[part] is None else f"{cells[part]:.4g}" for part in ("mean", "low", "high")
+        )
+        between = f"{low} to {high}" if low else ""
+        lines.append(f"{name:<{width}}  {mean:>9}  {between:>20}  {cells['n']:>7,}")
+    return "\n".join(lines)
+
+
+def format_crashes(results: Results) -> str:
+    """The first crashes in words, a line each; empty where there were none."""
+    if not results.crashes:
+        return ""
+    count = len(results.crashes)
+    lines = [f"{results.planner} crashed in {count} of {len(results)} episodes, which count as failed:"]
+    lines += [
+        f"  {row['scenario_id']}, step {row['step']}: {row['error']}" for row in results.crash_rows()[:_TOLD]
+    ]
+    if count > _TOLD:
+        lines.append(f"  and {count - _TOLD} more, in crashes.json")
     return "\n".join(lines)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from drivax.errors import DataError
-from drivax.evaluation.results import KEYS
+from drivax.evaluation.results import ADDED, KEYS, About
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.scenario.store import ScenarioSet
 
@@ -24,15 +24,6 @@ AGAIN = "run drivax evaluate again"
 Array = np.ndarray[Any, Any]
 #: A scenario of a data set: ``(dataset, scenario_id)``.
 ScenarioKey = tuple[str, str]
-
-
-@dataclass(frozen=True)
-class OwnMetric:
-    """A metric that drivax does not know: unit, direction (``high``, ``low``, ``-``) and one line of text."""
-
-    unit: str
-    better: str
-    text: str
 
 
 @dataclass(frozen=True)
@@ -64,10 +55,10 @@ class EpisodeTable:
         return str(self.about.get("traffic", "log"))
 
     @property
-    def own_metrics(self) -> Mapping[str, OwnMetric]:
+    def own_metrics(self) -> Mapping[str, About]:
         """What the run says about metrics of the user's own."""
         told = self.about.get("own_metrics") or {}
-        return {name: OwnMetric(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in told.items()}
+        return {name: About(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in told.items()}
 
     @property
     def data(self) -> Mapping[str, Any]:
@@ -87,9 +78,9 @@ class EpisodeTable:
         rows = zip(keys["dataset"], keys["segment"], keys["scenario_id"], strict=True)
         return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
 
-    def metric(self, name: str) -> Metric | OwnMetric | None:
+    def metric(self, name: str) -> Metric | About | None:
         """Unit and direction of a metric; None where nobody told."""
-        return METRICS.get(name) or self.own_metrics.get(name)
+        return METRICS.get(name) or ADDED.get(name) or self.own_metrics.get(name)
 
     def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
         """Mean of a metric per scenario over its defined episodes; NaN where there is none."""

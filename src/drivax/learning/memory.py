@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 
 from drivax.errors import UsageError
+from drivax.evaluation.memory import memory_of
 
 _CURES = {
     "scenarios": "train on fewer scenarios",
@@ -24,7 +23,6 @@ _CURES = {
 #: Fields of a learner's state that have a line of their own.
 _FIELDS = ("replay", "environments")
 _REST = "networks and optimiser"
-_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 @dataclass(frozen=True)
@@ -83,20 +81,6 @@ def account(
     parts["program"] = _beside(compiled)
     device = devices[0]
     return MemoryAccount(parts, memory_of(device, len(devices)), f"{device.platform}:{device.id}")
-
-
-def memory_of(device: Any, share: int = 1) -> int | None:
-    """Bytes that a device has for us; of a CPU the machine's or the container's memory, divided by ``share``."""
-    told = device.memory_stats() or {}
-    if "bytes_limit" in told:
-        return int(told["bytes_limit"])
-    if device.platform != "cpu":
-        return None
-    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    for file in _LIMITS:
-        text = Path(file).read_text().strip() if Path(file).is_file() else ""
-        limits += [int(text)] if text.isdecimal() else []
-    return min(limits) // share
 
 
 def _bytes(tree: Any) -> int:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from drivax.errors import DrivaxError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.planner import Planner
@@ -42,8 +43,17 @@ class Validation:
 
 
 def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
-    """What to log of a planner on held-out scenarios: ``validation/<metric>``, means over those that define it."""
+    """What to log of a planner on held-out scenarios: ``validation/<metric>``, means over those that define it.
+
+    Raises:
+        DrivaxError: If its actions are not finite: learning has diverged.
+    """
     results = evaluate(planner, validation.bank, validation.names, task=task, traffic=traffic)
+    if results.crashes:
+        raise DrivaxError(
+            f"actions of the policy are not finite in {len(results.crashes)} of {len(results)} episodes",
+            cure="lower the learning rate, or resume from an earlier checkpoint",
+        )
     # Full scores where there are any; partial ones are never mixed with them.
     score = next(name for name in _SCORES if np.isfinite(results.metrics[name]).any())
     row = {}

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from drivax.errors import UsageError
-from drivax.named import find_named, is_dotted
+from drivax.named import find_named, is_dotted, refuse_arguments
 from drivax.planners.idm import IdmPlanner
 from drivax.planners.pdm import PdmPlanner
 from drivax.planners.planner import Planner
@@ -35,10 +36,28 @@ def make_planner(name: str) -> Planner:
     """
     if not is_dotted(name):
         return PLANNERS[name]()
-    found = find_named(name)
-    made = found if isinstance(found, Planner) and not isinstance(found, type) else None
-    if made is None and callable(found):
-        made = found()
-    if not isinstance(made, Planner):
+    return as_planner(find_named(name), name)
+
+
+def as_planner(thing: Any, name: str) -> Planner:
+    """The planner that something of the user's is, or makes when it is called without arguments.
+
+    Args:
+        thing: A planner, its class, or a function that makes one.
+        name: What messages call it.
+
+    Raises:
+        UsageError: It is none and makes none.
+    """
+    if isinstance(thing, Planner) and not isinstance(thing, type):
+        return thing
+    if callable(thing):
+        try:
+            refuse_arguments(thing, name, ())
+        except ValueError as error:
+            cure = "put @drivax.python_planner or @drivax.jax_planner above a function that drives"
+            raise UsageError(str(error), cure=cure) from None
+        thing = thing()
+    if not isinstance(thing, Planner):
         raise UsageError(f"{name!r} makes no planner", cure="see drivax.planners.planner.Planner")
-    return made
+    return thing

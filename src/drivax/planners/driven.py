@@ -96,7 +96,8 @@ class PlannerTraffic:
             lights = remember_lights(bank, one)
             found, contacts, lights = measure(bank, one, frame, frames(1), apart, lights)
             state = SimState(found.scene, found.facts, contacts, lights, self.task.episode_start(), now.begin)
-            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.seed), one.index), one.step)
+            key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[one.index])
+            key = jax.random.fold_in(key, one.step)
             seen = self.task.observe(bank, found.scene, frames, frame)
             asked, _ = bank.driver.act((), bank, state, found, seen, jax.random.fold_in(key, one.slot))
             motion, length = one.history[-1], bank.agent_box[one.index, one.slot, 0]

@@ -8,6 +8,7 @@ segments feature-major (a grid query is three contiguous reads per feature).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,11 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from drivax.errors import DataError, DrivaxError
+from drivax.errors import DataError
 from drivax.geometry.angles import wrap
-from drivax.scenario.lane_codes import lane_codes
+from drivax.scenario.identity import identities
+from drivax.scenario.lane_codes import corridor_lanes, lane_codes
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
+from drivax.scenario.sizes import Sizes, last_used
 
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
@@ -67,6 +70,7 @@ class ScenarioBank:
         road_at: What decides which of them are seen: x, y, layer.
         road_curvature: Turn of each piece per metre, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
+        identity: What chance in a scenario follows from, whatever row it has (``scenario.identity``).
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
         paths: Paths of agents that react (``scenario.agent_paths.with_paths``), None where nobody does.
         driver: Planner that drives others than ego (``planners.driven.with_driver``), None where nobody does.
@@ -99,6 +103,7 @@ class ScenarioBank:
     road_at: Float[Array, "N 3 O"]
     road_curvature: Float[Array, "N O"]
     flags: UInt[Array, " N"]
+    identity: UInt[Array, " N"]
     extension: Float[Array, "N A X 2"]
     cell_m: float = static()
     edge_run: int = static()
@@ -122,28 +127,33 @@ class ScenarioBank:
         """Bytes that the bank takes on the device."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
 
+    def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
+        """Some of the scenarios as a bank; the driver is everyone's."""
+        return replace(jax.tree.map(lambda leaf: leaf[rows], replace(self, driver=None)), driver=self.driver)
+
     @classmethod
     def from_scenarios(
-        cls, scenarios: Iterable[Scenario], *, trim: bool = True, allow_no_future: bool = False
+        cls, scenarios: Iterable[Scenario], *, trim: bool | Sizes = True, allow_no_future: bool = False
     ) -> ScenarioBank:
         """Stacks scenarios of one capacity.
 
         Args:
             scenarios: All of one capacity.
-            trim: Cut padding that no scenario of the bank uses. Untrimmed banks of one capacity share one compiled
-                program; trimmed ones are smaller and faster.
+            trim: Cut padding that no scenario of the bank uses; or cut to sizes, as :meth:`Sizes.used` of more
+                scenarios. Banks of the same sizes (those that are not cut are, if of one capacity) share compiled
+                programs; smaller ones are faster.
             allow_no_future: Accept test splits.
 
         Raises:
             DrivaxError: If there are none, or one has no future and ``allow_no_future`` is not set.
         """
         kept = list(scenarios)
-        if not kept:
-            raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
         for scenario in kept:
             if Flag.NO_FUTURE in scenario.has and not allow_no_future:
                 raise DataError(
-                    "has no logged future (a test split)", record=scenario.id, cure="leave it out of the set"
+                    "has no logged future (a test split)",
+                    record=scenario.id,
+                    cure="leave it out (flag!=NO_FUTURE)",
                 )
         for scenario in kept:
             if scenario.capacity != kept[0].capacity:
@@ -152,39 +162,34 @@ class ScenarioBank:
                     record=scenario.id,
                     cure="convert all sets with one --capacity",
                 )
-        arrays, static = _stack(kept, trim)
-        return cls(**{name: jnp.asarray(value) for name, value in arrays.items()}, **static)
+        own = Sizes.used(kept)
+        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(kept[0].capacity)
+        return cls(
+            **{name: jnp.asarray(value) for name, value in _stack(kept, sizes).items()},
+            cell_m=kept[0].capacity.cell_m,
+            edge_run=sizes.edge_run,
+            lane_run=sizes.lane_run,
+            long_ego=own.long_ego or sizes.long_ego,
+            trimmed=trim is True,
+        )
 
 
 def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
     return np.stack([scenario.record[name] for scenario in scenarios])
 
 
-def _used(mask: Any, trim: bool, multiple: int = 8) -> int:
-    """How many columns of ``mask [N, columns]`` are used, rounded up; trailing padding is cut."""
-    if not trim:
-        return mask.shape[1]
-    used = np.flatnonzero(mask.any(0))
-    return 0 if used.size == 0 else min(mask.shape[1], -(-(int(used[-1]) + 1) // multiple) * multiple)
+def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    arrays = _stack_agents(scenarios, sizes) | _stack_routes(scenarios)
+    return (
+        arrays
+        | _stack_lights(scenarios, sizes)
+        | _stack_road(scenarios, sizes)
+        | _stack_maps(scenarios, sizes)
+    )
 
 
-def _stack(
-    scenarios: Sequence[Scenario], trim: bool
-) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
-    arrays = _stack_agents(scenarios, trim) | _stack_routes(scenarios)
-    arrays |= _stack_lights(scenarios, trim) | _stack_road(scenarios, trim)
-    maps, static = _stack_maps(scenarios, trim)
-    reach = np.hypot(arrays["agent_box"][:, 0, 0], arrays["agent_box"][:, 0, 1]) / 2
-    capacity = scenarios[0].capacity
-    # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
-    static |= {"cell_m": capacity.cell_m, "long_ego": bool((reach + 3.0 > capacity.cell_m - 2.0).any())}
-    static["trimmed"] = trim
-    return arrays | maps, static
-
-
-def _stack_agents(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
-    valid = _column(scenarios, "agent_valid")
-    count = max(1, _used(valid.any(1), trim))
+def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    valid, count = _column(scenarios, "agent_valid"), sizes.agents
     heading, size = _column(scenarios, "agent_heading"), _column(scenarios, "agent_size")
     agents = np.concatenate(
         [
@@ -203,18 +208,17 @@ def _stack_agents(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.nda
         "agents": agents,
         "extension": _column(scenarios, "agent_extension")[:, :count],
         "flags": _column(scenarios, "flags"),
-        **_stack_parked(scenarios, trim, _ends(valid.any(1)), box),
+        "identity": identities([(one.text("dataset"), one.id) for one in scenarios]),
+        **_stack_parked(scenarios, sizes.slots, last_used(valid.any(1)), box),
     }
 
 
 def _stack_parked(
-    scenarios: Sequence[Scenario], trim: bool, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
+    scenarios: Sequence[Scenario], slots: int, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
 ) -> dict[str, np.ndarray[Any, Any]]:
     """Parked agents, each scenario's from its slot ``first`` on, and everyone's box."""
     valid, heading = _column(scenarios, "parked_valid"), _column(scenarios, "parked_heading")
-    count = _ends(valid.any(1))
-    slots = -(-int((first + count).max()) // 8) * 8 if trim else box.shape[1] + valid.shape[2]
-    slots = max(slots, box.shape[1])
+    count = last_used(valid.any(1))
     scenario, place = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
     at = scenario, first[scenario] + place
     rows = np.zeros((len(scenarios), slots, 8), np.float32)
@@ -238,11 +242,6 @@ def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
     padded = np.pad(when, ((0, 0), (0, -steps % WORD), (0, 0)))
     bits = padded.reshape(len(when), -1, WORD, when.shape[2]).astype(np.uint32)
     return (bits << np.arange(WORD, dtype=np.uint32)[:, None]).sum(axis=2, dtype=np.uint32)
-
-
-def _ends(mask: Any) -> np.ndarray[Any, Any]:
-    """One more than the last column that each row of ``mask [N, columns]`` uses."""
-    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
 
 
 def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
@@ -276,7 +275,7 @@ def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
     return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1).astype(np.float32)
 
 
-def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_lights(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
     line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
     z, heading, exits = (_column(scenarios, f"light_{name}") for name in ("z", "heading", "exit_heading"))
     middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
@@ -285,10 +284,9 @@ def _stack_lights(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.nda
     right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
     arc = np.stack([_stop_arcs(scenario, at) for scenario, at in zip(scenarios, middle, strict=True)])
     rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exits), np.sin(exits), right, arc]
-    used = max(1, _used((state >= 0).any(1), trim))
     return {
-        "light_line": np.stack(rows, axis=1, dtype=np.float32)[:, :, :used],
-        "light_state": state[:, :, :used],
+        "light_line": np.stack(rows, axis=1, dtype=np.float32)[:, :, : sizes.lights],
+        "light_state": state[:, :, : sizes.lights],
     }
 
 
@@ -308,21 +306,12 @@ def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[A
     return arcs
 
 
-def _stack_maps(
-    scenarios: Sequence[Scenario], trim: bool
-) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
     blocks = _column(scenarios, "segment_blocks").astype(np.int64)
     edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
-    capacity = scenarios[0].capacity
-    grid_edge = _column(scenarios, "grid_edge").astype(np.int16)
-    grid_lane = (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16)
-    edge_run = _longest_run(grid_edge, capacity.grid) if trim else capacity.edge_run
-    lane_run = _longest_run(grid_lane, capacity.grid) if trim else capacity.lane_run
-    edge_rows = int(edge_count.max()) if trim else capacity.segments
-    lane_rows = int(lane_count.max()) if trim else capacity.segments
     # A run is read whole, so every start must leave room for one behind it.
-    edges = np.full((len(scenarios), 5, edge_rows + edge_run), 1e6, np.float32)
-    lanes = np.full((len(scenarios), 8, lane_rows + lane_run), 1e6, np.float32)
+    edges = np.full((len(scenarios), 5, sizes.edges + sizes.edge_run), 1e6, np.float32)
+    lanes = np.full((len(scenarios), 8, sizes.lanes + sizes.lane_run), 1e6, np.float32)
     box = np.zeros((len(scenarios), 4), np.float32)
     for row, scenario in enumerate(scenarios):
         e, n = int(edge_count[row]), int(lane_count[row])
@@ -332,23 +321,21 @@ def _stack_maps(
         points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
         if len(points):
             box[row] = [*points.min(0), *points.max(0)]
-    graphs = max(1, _used(_column(scenarios, "lane_length") > 0, trim))
-    arrays = {
+    return {
         "edges": edges,
         "lanes": lanes,
-        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, :graphs],
-        "grid_edge": grid_edge,
-        "grid_lane": grid_lane,
+        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, : sizes.graphs],
+        "grid_edge": _column(scenarios, "grid_edge").astype(np.int16),
+        "grid_lane": (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16),
         "grid_side": _column(scenarios, "grid_side"),
         "grid_origin": _column(scenarios, "grid_origin"),
         "map_box": box,
     }
-    return arrays, {"edge_run": edge_run, "lane_run": lane_run}
 
 
-def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
     rows = _column(scenarios, "road_rows").astype(np.int32)
-    used = max(1, int(rows.max())) if trim else scenarios[0].capacity.road_rows
+    used = sizes.road
     xy, direction, length, kind, limit, curvature = (
         _column(scenarios, f"road_{name}")[:, :used]
         for name in ("xy", "direction", "length", "kind", "limit", "curvature")
@@ -364,14 +351,6 @@ def _stack_road(scenarios: Sequence[Scenario], trim: bool) -> dict[str, np.ndarr
     }
 
 
-def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
-    """Longest run over three neighbouring cells of a grid row, at least 8, rounded up to 8."""
-    begin = start[:, :-1].reshape(-1, grid, grid).astype(np.int64)
-    end = start[:, 1:].reshape(-1, grid, grid).astype(np.int64)
-    longest = max(int((end[:, :, 2:] - begin[:, :, :-2]).max()), 1)
-    return -(-longest // 8) * 8
-
-
 def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
     a, b = scenario.segment_a[rows], scenario.segment_b[rows]
     lane = scenario.segment_lane[rows].astype(np.int64)
@@ -380,20 +359,7 @@ def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
     limit = scenario.lane_limit[lane].astype(np.float32)
     for kind, fallback in CLASS_LIMIT_MPS.items():
         limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
-    number = lane + 0.5 * _corridor(scenario)[lane]
+    number = lane + 0.5 * corridor_lanes(scenario)[lane]
     return np.stack(
         [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, number]
     ).astype(np.float32)
-
-
-def _corridor(scenario: Scenario) -> np.ndarray[Any, Any]:
-    """Which lanes are the route's own or their same-direction neighbours (at any distance sideways)."""
-    member = np.zeros(len(scenario.lane_id), bool)
-    todo = list(np.unique(scenario.route_lane[0][: int(scenario.route_points[0])]))
-    while todo:
-        lane = int(todo.pop())
-        if lane < 0 or member[lane]:
-            continue
-        member[lane] = True
-        todo += [int(scenario.lane_left[lane]), int(scenario.lane_right[lane])]
-    return member

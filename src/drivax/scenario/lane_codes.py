@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from drivax.geometry.angles import wrap
 from drivax.scenario.schema import Scenario
@@ -154,3 +154,16 @@ def _known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
         return np.zeros(len(xy), bool)
     low, high = log.min(axis=0) - _KNOWN_M, log.max(axis=0) + _KNOWN_M
     return ((xy >= low) & (xy <= high)).all(axis=1)
+
+
+def corridor_lanes(scenario: Scenario) -> Bool[np.ndarray, " lane"]:
+    """Which lanes are the route's own or their same-direction neighbours (at any distance sideways)."""
+    member = np.zeros(len(scenario.lane_id), bool)
+    todo = list(np.unique(scenario.route_lane[0][: int(scenario.route_points[0])]))
+    while todo:
+        lane = int(todo.pop())
+        if lane < 0 or member[lane]:
+            continue
+        member[lane] = True
+        todo += [int(scenario.lane_left[lane]), int(scenario.lane_right[lane])]
+    return member

@@ -42,8 +42,8 @@ def manifest_entry(scenario: Scenario) -> dict[str, Any]:
     """What the manifest says about one scenario."""
     return {
         "scenario_id": scenario.id,
-        "dataset": _text(scenario.record["dataset"]),
-        "segment": _text(scenario.record["segment"]),
+        "dataset": scenario.text("dataset"),
+        "segment": scenario.text("segment"),
         "flags": [str(flag.name) for flag in scenario.has],
         "segments": int(scenario.record["segment_blocks"][3]),
         "source": plain(dataclasses.asdict(scenario.source)),
@@ -207,10 +207,6 @@ class Shard:
                 cure=f"copy the file again or {AGAIN}",
             )
         self._intact[row] = True
-
-
-def _text(value: Any) -> str:
-    return bytes(value[()]).rstrip(b"\0").decode()
 
 
 def plain(value: Any) -> Any:

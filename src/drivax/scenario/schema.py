@@ -342,7 +342,11 @@ class Scenario:
     @property
     def id(self) -> str:
         """The scenario's id as text."""
-        return bytes(self.record["scenario_id"][()]).rstrip(b"\0").decode()
+        return self.text("scenario_id")
+
+    def text(self, name: str) -> str:
+        """A field of bytes (``scenario_id``, ``dataset``, ``segment``) as text."""
+        return bytes(self.record[name][()]).rstrip(b"\0").decode()
 
     @property
     def has(self) -> Flag:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from drivax.evaluation.results import NOT_SUMMARISED, RATES
+from drivax.evaluation.results import ADDED, NOT_SUMMARISED, RATES
 from drivax.metrics.catalogue import METRICS
 from drivax.show.runs import Evaluation
 
@@ -75,7 +75,8 @@ def note(name: str, runs: Sequence[Evaluation] = ()) -> Note:
             direction.
     """
     label = _LABELS.get(name, name.replace("_", " "))
-    metric = METRICS.get(name) or next((r.own_metrics[name] for r in runs if name in r.own_metrics), None)
+    ours = METRICS.get(name) or ADDED.get(name)
+    metric = ours or next((r.own_metrics[name] for r in runs if name in r.own_metrics), None)
     if metric is None:
         return Note(label, "none", "", "")
     plain = metric.unit == "-"
@@ -92,5 +93,5 @@ def headline(names: Sequence[str]) -> list[str]:
 
 def ordered(names: Sequence[str]) -> list[str]:
     """Metrics in the order in which they are defined, unknown ones after them as given; no codes."""
-    place = {name: rank for rank, name in enumerate(METRICS)}
+    place = {name: rank for rank, name in enumerate((*METRICS, *ADDED))}
     return sorted((name for name in names if name not in CODES), key=lambda n: place.get(n, len(place)))

@@ -190,7 +190,7 @@ def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames:
     """
     view, features = View.of(scene), config.features
     if config.perception.of_agents:
-        frames = perceived(config.perception, scene, frames)
+        frames = perceived(config.perception, bank, scene, frames)
     result = _ego(config, bank, scene, view)
     if features.agents:
         result |= _agents(config, bank, scene, view, frames)
@@ -293,7 +293,7 @@ def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, vie
     if config.road_cut > 1:
         rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, scene, config.road) / POSITION_M)
+        rows = rows.at[:, :2].add(moved_road(config.perception, bank, scene, config.road) / POSITION_M)
     columns = columns_of("road", wanted) + ([rows.shape[-1] - 1] if "curvature" in wanted else [])
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
@@ -351,7 +351,7 @@ def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: V
     seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
     perception, on_route = config.perception, line[LIGHT_ARC] < NEVER_M
     if perception.of_lights:
-        seen &= lights_seen(perception, scene, jnp.sqrt(dx * dx + dy * dy))
+        seen &= lights_seen(perception, bank, scene, jnp.sqrt(dx * dx + dy * dy))
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
@@ -359,7 +359,7 @@ def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: V
     def place() -> Float[Array, "K 2"]:
         middle = view.point(line[LIGHT_X : LIGHT_Y + 1, chosen].T)
         if perception.noise_m > 0:
-            middle = middle + moved_lights(perception, scene, state.shape[0])[chosen]
+            middle = middle + moved_lights(perception, bank, scene, state.shape[0])[chosen]
         return middle / POSITION_M
 
     parts = {

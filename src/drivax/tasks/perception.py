@@ -5,8 +5,8 @@ chance, each at a place with that step's error; the tracker keeps what was repor
 as it was seen then, from where ego was then, the same in every observation that holds it; a step at which the agent was
 not seen is masked; and an agent that is not seen now is not there, history included.
 
-All chance follows from the state: the key is the seed with scenario index, step, driven slot and the other's slot
-folded in. A replayed observation therefore equals the live one, and nothing has to be carried.
+All chance follows from the state: the key is the seed with the scenario's identity, step, driven slot and the other's
+slot folded in. A replayed observation therefore equals the live one, and nothing has to be carried.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
 from drivax.geometry.vectors import norm
+from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, Frame, Scene
@@ -72,11 +73,14 @@ class Perception:
         return self.range_m is not None or self.dropout_m is not None
 
 
-def perceived(config: Perception, scene: Scene, frames: Callable[[int], Frame]) -> Callable[[int], Frame]:
+def perceived(
+    config: Perception, bank: ScenarioBank, scene: Scene, frames: Callable[[int], Frame]
+) -> Callable[[int], Frame]:
     """Everyone as ego perceived them at each step; ego itself is as it is.
 
     Args:
         config: The faults.
+        bank: The scenarios.
         scene: The scene.
         frames: The truth: everyone so many steps ago.
 
@@ -86,16 +90,16 @@ def perceived(config: Perception, scene: Scene, frames: Callable[[int], Frame]) 
 
     @cache
     def seen(back: int) -> Frame:
-        return _sensed(config, scene, frames(back), back)
+        return _sensed(config, bank, scene, frames(back), back)
 
     return seen
 
 
-def _sensed(config: Perception, scene: Scene, frame: Frame, back: int) -> Frame:
+def _sensed(config: Perception, bank: ScenarioBank, scene: Scene, frame: Frame, back: int) -> Frame:
     eye, slots = scene.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
     others, seen, place = slots != scene.slot, frame.valid, frame.box[:, :2]
     distance = norm(place - eye[:2])
-    key = _key(config, scene, back)
+    key = _key(config, bank, scene, back)
     seen &= _reported(config, jax.random.fold_in(key, _DROPPED), distance)
     if config.occlusion:
         level = jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
@@ -133,25 +137,27 @@ def in_view(
     return ~cut.any(axis=2).all(axis=1)
 
 
-def lights_seen(config: Perception, scene: Scene, distance_m: Float[Array, " L"]) -> Bool[Array, " L"]:
+def lights_seen(
+    config: Perception, bank: ScenarioBank, scene: Scene, distance_m: Float[Array, " L"]
+) -> Bool[Array, " L"]:
     """Which stop lines at these distances are seen."""
-    key = jax.random.fold_in(_key(config, scene), _DROPPED_LIGHTS)
+    key = jax.random.fold_in(_key(config, bank, scene), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)
 
 
-def moved_lights(config: Perception, scene: Scene, count: int) -> Float[Array, "count 2"]:
+def moved_lights(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
     """Errors of the places of this many lights in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, scene), _MOVED_LIGHTS), count)
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_LIGHTS), count)
 
 
-def moved_road(config: Perception, scene: Scene, count: int) -> Float[Array, "count 2"]:
+def moved_road(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
     """Errors of the places of this many pieces of road in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, scene), _MOVED_ROAD), count)
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_ROAD), count)
 
 
-def _key(config: Perception, scene: Scene, back: int = 0) -> Array:
+def _key(config: Perception, bank: ScenarioBank, scene: Scene, back: int = 0) -> Array:
     key = jax.random.key(config.seed)
-    for number in (scene.index, scene.step - back + HISTORY, scene.slot):
+    for number in (bank.identity[scene.index], scene.step - back + HISTORY, scene.slot):
         key = jax.random.fold_in(key, number)
     return key
 

@@ -1,0 +1,127 @@
+"""Planners that are one function of the user's, in JAX or in plain Python.
+
+A function takes the situation and the observation of one scenario and gives an action of the task's action space. What
+remembers something from step to step, or draws random numbers, is a class (``planners.planner.Planner``).
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from drivax.planners.planner import Memoryless
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.record import record, static
+from drivax.simulator.types import SimState, Situation
+
+Drive = Callable[[Situation, Any], Any]
+
+#: Who gathers what functions raise, the last one first.
+_listeners: list[dict[int, str]] = []
+
+
+@record
+class FunctionPlanner(Memoryless):
+    """Drives by a function; :func:`jax_planner` and :func:`python_planner` make one.
+
+    Attributes:
+        function: ``(situation, observation) -> action``.
+        in_python: Whether it is called outside the compiled program, with numpy arrays.
+    """
+
+    function: Drive = static()
+    in_python: bool = static(default=False)
+    replays: bool = static(default=False)
+
+    @property
+    def name(self) -> str:
+        """The function's name."""
+        return str(getattr(self.function, "__name__", type(self.function).__name__))
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, " D"], Any]:
+        """What the function gives; not a number where it raised an error."""
+        if not self.in_python:
+            return jnp.asarray(self.function(situation, observation), jnp.float32), carry
+        # How traffic keeps its books is no concern of a driver.
+        seen = replace(situation, scene=replace(situation.scene, traffic=()))
+        who, size = bank.identity[state.scene.index], state.scene.action.shape
+
+        def answer(who: Any, *seen: Any) -> Any:
+            return _answers(self.function, np.asarray(who), jax.tree.map(np.asarray, seen), size)
+
+        result = jax.ShapeDtypeStruct(size, jnp.float32)
+        action = jax.pure_callback(answer, result, who, seen, observation, vmap_method="broadcast_all")
+        return action, carry
+
+
+def jax_planner(function: Drive) -> FunctionPlanner:
+    """The planner that a JAX function makes; it becomes part of the compiled program (``jnp.where`` instead of ``if``).
+
+    Args:
+        function: ``(situation, observation) -> action``.
+    """
+    return FunctionPlanner(function)
+
+
+def python_planner(function: Drive) -> FunctionPlanner:
+    """The planner that a Python function makes; it is called scenario by scenario, step by step, with numpy arrays.
+
+    An error that it raises is an episode that failed (``evaluation.runner``). It must not call JAX, which waits for it.
+
+    Args:
+        function: ``(situation, observation) -> action``.
+    """
+    return FunctionPlanner(function, in_python=True)
+
+
+@contextmanager
+def raised() -> Iterator[dict[int, str]]:
+    """Gathers what Python functions raise while they drive: the first error of each scenario, by its identity.
+
+    Where nobody gathers them, errors end the program that drives.
+    """
+    _listeners.append({})
+    try:
+        yield _listeners[-1]
+    finally:
+        _listeners.pop()
+
+
+def _answers(function: Drive, who: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
+    """The function's action for each scenario of a batch of any shape."""
+    actions = np.full((*who.shape, *size), np.nan, np.float32)
+    for at in np.ndindex(who.shape):
+        try:
+            action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
+            if action.shape != size:
+                raise ValueError(f"{list(action.shape)} is no action; give {size[0]} numbers")
+            actions[at] = action
+        except Exception as error:
+            if not _listeners:
+                raise
+            _listeners[-1].setdefault(int(who[at]), _told(error))
+    return actions
+
+
+def _told(error: Exception) -> str:
+    """One line: what it is, and in which line of the function."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    theirs = [place for place in traceback.extract_tb(error.__traceback__) if place.filename != __file__]
+    return f"{text} ({Path(theirs[0].filename).name}:{theirs[0].lineno})" if theirs else text

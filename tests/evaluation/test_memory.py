@@ -1,0 +1,45 @@
+"""How many scenarios are loaded at a time, and what is said when memory was too little."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from drivax.errors import DrivaxError
+from drivax.evaluation.memory import (
+    MOST,
+    free_memory,
+    memory_of,
+    scenarios_at_a_time,
+    telling_out_of_memory,
+)
+
+
+def test_half_of_what_is_free_holds_two_copies_and_the_program():
+    # 1 GB for us: 16 x 8 MB for the program leave 872 MB, for 436 scenarios of 1 MB that are there twice.
+    assert scenarios_at_a_time(1_000_000, 16, 2_000_000_000) == 436
+    assert scenarios_at_a_time(1_000_000, 16, 100_000_000) == 16, "never fewer than are driven side by side"
+    assert scenarios_at_a_time(1_000, 16, 10**12) == scenarios_at_a_time(1_000, 16, None) == MOST
+
+
+def test_this_machine_has_some_left():
+    device = jax.devices()[0]
+    assert 10**7 < free_memory(device) <= memory_of(device)
+
+
+def test_too_little_memory_is_one_line_with_the_cure():
+    """A program that asks for 4 TB; and what numpy says."""
+
+    @jax.jit
+    def greedy(x):
+        return jnp.cumsum(jnp.arange(2**40, dtype=jnp.float32) * x)[-1]
+
+    def starve():
+        raise MemoryError
+
+    for wasteful in (lambda: greedy(1.0).block_until_ready(), starve):
+        with pytest.raises(DrivaxError) as raised, telling_out_of_memory(1200):
+            wasteful()
+        line = str(raised.value)
+        assert line.startswith("out of memory with 1,200 scenarios loaded; load fewer") and "--batch" in line
+    with pytest.raises(ValueError, match="else"), telling_out_of_memory(1):
+        raise ValueError("something else")

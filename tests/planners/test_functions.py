@@ -1,0 +1,94 @@
+"""Planners that are one function, in Python or JAX."""
+
+import jax
+import numpy as np
+import pytest
+
+from drivax.errors import UsageError
+from drivax.planners.catalogue import make_planner
+from drivax.planners.functions import python_planner, raised
+from drivax.planners.planner import Planner
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from own_drivers import slow_jax, slow_python
+from scenes import bank_of, car, straight_road
+
+SEEN = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=3)
+SIMULATOR = Simulator(Task(observation=SEEN))
+STEPS = (10, 15, 40)
+
+
+@pytest.fixture(scope="module")
+def bank():
+    """Nobody else is in the second scenario."""
+    return bank_of(straight_road([car(0, 0.5, 0.1, 9), car(30, 0, 0, 5)]), straight_road([car(0, 0, 0, 3)]))
+
+
+@pytest.fixture(scope="module")
+def moments(bank):
+    """States, situations and observations of both scenarios at three steps."""
+
+    def moment(index, step):
+        state = SIMULATOR.reset(bank, index, step)
+        return state, SIMULATOR.situation(bank, state), SIMULATOR.observe(bank, state.scene)
+
+    steps = np.array(STEPS)
+    return jax.jit(jax.vmap(jax.vmap(moment, (None, 0)), (0, None)))(np.arange(2), steps)
+
+
+def actions(planner, bank, moments, batched=True):
+    def act(state, situation, observation):
+        key = jax.random.key(0)
+        return planner.act(planner.init(bank, state, key), bank, state, situation, observation, key)[0]
+
+    if batched:
+        return np.asarray(jax.jit(jax.vmap(jax.vmap(act)))(*moments))
+    row = jax.tree.map(lambda leaf: leaf[0, 0], moments)
+    return np.asarray(jax.jit(act)(*row))
+
+
+def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
+    with raised() as errors:
+        python, in_jax = (actions(planner, bank, moments) for planner in (slow_python, slow_jax))
+        np.testing.assert_allclose(
+            actions(slow_python, bank, moments, batched=False), python[0, 0], rtol=1e-6
+        )
+    sound = np.ones((2, 3), bool)
+    sound[1, 1] = False
+    np.testing.assert_array_equal(np.isfinite(python).all(axis=-1), sound)
+    np.testing.assert_array_equal(np.isfinite(in_jax).all(axis=-1), sound)
+    np.testing.assert_allclose(python[sound], in_jax[sound], rtol=1e-5, atol=1e-6)
+    # 9 m/s where 5 are wanted; the route lies 0.5 m to the right, and heading 0.1 rad to the left of it.
+    assert python[0, 0, 0] == pytest.approx((5 - 9) / 6, rel=1e-5) and python[0, 0, 1] < 0
+    assert list(errors) == [int(bank.identity[1])]
+    assert errors[int(bank.identity[1])].startswith("LookupError: nobody to follow (own_drivers.py:")
+
+
+def test_what_is_no_action_is_told(bank, moments):
+    @python_planner
+    def three(situation, observation):
+        return 0.0, 0.0, 0.0
+
+    @python_planner
+    def none(situation, observation):
+        pass
+
+    for planner, words in ((three, "[3] is no action; give 2 numbers"), (none, "[] is no action")):
+        with raised() as errors:
+            assert np.isnan(actions(planner, bank, moments)).all()
+        assert len(errors) == 2 and all(words in text for text in errors.values()), errors
+
+
+def test_errors_end_a_loop_of_ones_own(bank, moments):
+    with pytest.raises(Exception, match="nobody"):
+        actions(slow_python, bank, moments)
+
+
+def test_by_name():
+    for name in ("slow_python", "slow_jax"):
+        planner = make_planner(f"own_drivers:{name}")
+        assert isinstance(planner, Planner) and planner.name == name and not planner.replays
+    with pytest.raises(UsageError, match=r"takes \(situation, observation\).*put @drivax.python_planner or"):
+        make_planner("own_drivers:plain")
+    assert make_planner("own_drivers:fragile").name == "fragile"

@@ -1,0 +1,83 @@
+"""Which scenarios of a set are meant."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from drivax.errors import DataError, UsageError
+from drivax.scenario.choice import chosen
+
+
+def entry(number, dataset="one", **tags):
+    return {
+        "scenario_id": f"log-{number}", "dataset": dataset, "segment": f"s{number}", "flags": ["ROUTE"],
+        "audit": {"distance_m": 10.0 * number}, "overflow": {}, "source": {}, "segments": 5, "tags": tags,
+    }  # fmt: skip
+
+
+@dataclass
+class Set:
+    path: Path = Path("sets/made")
+    entries: list = field(
+        default_factory=lambda: [
+            entry(0, type="straight", place="boston"),
+            entry(1, type="turn_left", place="boston"),
+            entry(2, type="turn_left"),
+            entry(3, type="merge", place="singapore"),
+            entry(1, "two", type="straight"),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "rows"),
+    [
+        ({}, [0, 1, 2, 3, 4]),
+        ({"limit": 2}, [0, 1]),
+        ({"filters": ["type=turn_left"]}, [1, 2]),
+        ({"filters": ["type=turn_left|merge", "audit.distance_m>10"]}, [2, 3]),
+        ({"filters": ["type=turn_left"], "limit": 1}, [1]),  # the limit counts what is left
+        ({"names": ["log-3", "log-0"]}, [0, 3]),  # in the order of the set
+        ({"names": ["log-1"]}, [1, 4]),
+        ({"names": ["two\tlog-1", "log-1"]}, [1, 4]),
+        ({"names": ["two\tlog-1"]}, [4]),
+        ({"names": ["log-1", "log-2"], "filters": ["type=turn_left"], "limit": 1}, [1]),
+        ({"filters": ["scenario_id!=log-1|log-3"]}, [0, 2]),
+        ({"filters": ["flag!=NO_FUTURE"], "limit": 9}, [0, 1, 2, 3, 4]),
+    ],
+)
+def test_rows(options, rows):
+    assert chosen(Set(), **options) == rows
+
+
+def test_a_file_of_names_among_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "some.txt").write_text("log-2\r\n\n two\tlog-1\n")
+    (tmp_path / "log-3").write_text("log-0\n")  # what is an id in the set is one
+    assert chosen(Set(), names=["some.txt", "log-3"]) == [2, 3, 4]
+    assert chosen(Set(), names=[Path("log-3")]) == [0]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"names": ["log_3"]}, DataError, "sets/made: 'log_3' is not in the set; did you mean 'log-3'?"),
+        ({"names": ["x", "log-1", "y", "z", "w"]}, DataError, "'x', 'y', 'z' and 1 more are not in the set"),
+        ({"names": ["two\tlog-0"]}, DataError, "'log-0' is not in the set"),
+        ({"names": ["ids.txt"]}, DataError, "ids.txt: line 2 names 'log-7', which is not in the set sets/made"),
+        ({"names": [Path("none.txt")]}, DataError, "none.txt: No such file"),
+        ({"filters": ["typ=turn_left"]}, UsageError, "did you mean 'type'?"),
+        ({"filters": ["type=turn_lef"]}, UsageError, "did you mean 'turn_left'?"),
+        ({"filters": ["place=bostn"]}, DataError, "no scenario is selected by 'place=bostn'; did you mean 'boston'?"),
+        ({"filters": ["type=u_turn"]}, DataError, "by 'type=u_turn'; use one of merge, straight, turn_left"),
+        ({"filters": ["type=merge", "place=boston"]}, DataError, "no scenario is selected; loosen the filters"),
+        ({"limit": 0}, UsageError, "--limit 0 leaves no scenario; use 1 or more"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_meant_gets_one_line(options, error, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ids.txt").write_text("log-1\nlog-7\n")
+    with pytest.raises(error) as raised:
+        chosen(Set(), **options)
+    assert words in str(raised.value)

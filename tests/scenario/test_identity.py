@@ -1,0 +1,42 @@
+"""Who a scenario is: a number that neither set, order nor company changes."""
+
+import subprocess
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.identity import identities
+from scenes import SMALL, car, straight_road
+
+
+def test_numbers_are_those_of_another_program():
+    """``b2sum`` of coreutils, first four bytes, little-endian."""
+    names = [("womd", "a"), ("av2", "a"), ("womd", "a")]
+    wanted = []
+    for name, count in zip(names, (0, 0, 1), strict=True):
+        try:
+            done = subprocess.run(
+                ["b2sum", "--length", "32"], input="\0".join((*name, str(count))).encode(),
+                capture_output=True, check=True,
+            )  # fmt: skip
+        except FileNotFoundError:
+            pytest.skip("no b2sum here")
+        wanted.append(int.from_bytes(bytes.fromhex(done.stdout.split()[0].decode()), "little"))
+    assert identities(names).tolist() == wanted and len(set(wanted)) == 3
+
+
+def test_it_goes_with_the_scenario():
+    scenarios = [
+        assemble(replace(straight_road([car()]), scenario_id=name), SMALL) for name in ("a", "b", "c", "a")
+    ]
+    bank = ScenarioBank.from_scenarios(scenarios, trim=False)
+    other = ScenarioBank.from_scenarios([scenarios[2], scenarios[0]], trim=False)
+    a, _, c, copy = np.asarray(bank.identity).tolist()
+    assert np.asarray(other.identity).tolist() == [c, a] and copy != a
+    part = jax.jit(ScenarioBank.part)(bank, jnp.array([2, 0]))
+    jax.tree.map(np.testing.assert_array_equal, part, other)
