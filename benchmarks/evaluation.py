@@ -18,7 +18,7 @@ from typing import Any
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.runner import BATCH, evaluate
+from drivax.evaluation.runner import evaluate, lanes
 from drivax.learning.policy_traffic import find_traffic
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
@@ -31,7 +31,7 @@ RESULT = ROOT / "benchmarks" / "results" / "evaluation.json"
 PAGE = ROOT / "docs" / "results" / "speed.md"
 BEGIN, END = "<!-- evaluation.py: begin -->", "<!-- evaluation.py: end -->"
 #: Whole batches, so that their times are alike.
-SCENARIOS = 16 * BATCH
+SCENARIOS = 1024
 #: Seconds that 1,000 scenarios x 80 steps may take in recorded traffic, and how many times that in reactive traffic.
 AIMS, REACTIVE = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pdm": 600}, 3
 TRAFFIC = ("log", "idm")
@@ -50,7 +50,7 @@ def timed(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, 
         progress=lambda done, whole: ends.append(time.perf_counter()),
     )
     batch = (ends[-1] - ends[0]) / (len(ends) - 1)
-    return 1000 / BATCH * batch * 80 / (bank.steps - 1 - CURRENT_STEP)
+    return 1000 / lanes() * batch * 80 / (bank.steps - 1 - CURRENT_STEP)
 
 
 def measured(data: Path, planners: list[str]) -> dict[str, Any]:

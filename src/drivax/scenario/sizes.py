@@ -78,7 +78,7 @@ def last_used(mask: Any) -> np.ndarray[Any, Any]:
 def _needed(scenario: Scenario) -> Sizes:
     capacity, record = scenario.capacity, scenario.record
     moving, parked, lights, graphs = (
-        int(last_used(mask[None])[0])
+        int(last_used(np.asarray(mask)[None])[0])
         for mask in (
             record["agent_valid"].any(0), record["parked_valid"].any(0), (record["light_state"] >= 0).any(0),
             record["lane_length"] > 0,
