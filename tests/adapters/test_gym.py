@@ -17,6 +17,7 @@ from drivax.adapters import driving, gym
 from drivax.adapters.gym import TASKS, DrivingEnv, VectorDrivingEnv
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.rollout import judging
+from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.assemble import assemble
 from drivax.scenario.store import ScenarioWriter
@@ -140,7 +141,7 @@ def test_the_log_ends_truncated_with_the_metrics_of_an_evaluation(data):
         assert not any(terminated for _, _, terminated, _, _ in steps)
         assert [truncated for *_, truncated, _ in steps] == [False] * 79 + [True]
         assert all(set(info) == {"scenario_id"} for *_, info in steps[:-1])
-        wanted = {k: float(v[row]) for k, v in results.metrics.items() if np.isfinite(v[row])}
+        wanted = {k: float(results.metrics[k][row]) for k in METRICS if np.isfinite(results.metrics[k][row])}
         assert steps[-1][4]["metrics"] == pytest.approx(wanted, abs=1e-4)
 
 

@@ -1,10 +1,12 @@
 """Planners that are one function, in Python or JAX."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from drivax.errors import UsageError
+from drivax.evaluation.rollout import drive, episode_keys
 from drivax.planners.catalogue import make_planner
 from drivax.planners.functions import python_planner, raised
 from drivax.planners.planner import Planner
@@ -15,7 +17,7 @@ from own_drivers import slow_jax, slow_python
 from scenes import bank_of, car, straight_road
 
 SEEN = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=3)
-SIMULATOR = Simulator(Task(observation=SEEN))
+SIMULATOR = Simulator(Task(observation=SEEN, metrics="none", to_the_end=True))
 STEPS = (10, 15, 40)
 
 
@@ -63,6 +65,21 @@ def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
     assert python[0, 0, 0] == pytest.approx((5 - 9) / 6, rel=1e-5) and python[0, 0, 1] < 0
     assert list(errors) == [int(bank.identity[1])]
     assert errors[int(bank.identity[1])].startswith("LookupError: nobody to follow (own_drivers.py:")
+
+
+def test_python_and_jax_make_the_same_episodes(bank):
+    """Inside the compiled loop over all steps; both crash where nobody else is, at step 15."""
+    rows = jnp.arange(2)
+    keys = episode_keys(bank, rows, 0)
+    with raised() as errors:
+        python, in_jax = (
+            jax.device_get(drive(SIMULATOR, planner, bank, rows, keys)) for planner in (slow_python, slow_jax)
+        )
+    assert python.crashed.tolist() == in_jax.crashed.tolist() == [-1, 15] and len(errors) == 1
+    np.testing.assert_allclose(python.motion, in_jax.motion, rtol=1e-4, atol=1e-4)
+    assert np.isfinite(python.motion).all() and abs(python.motion[0, -1, 3] - 5.0) < 0.1
+    # A step without an action is a step at the same speed.
+    assert python.motion[1, 6, 3] == python.motion[1, 5, 3] < python.motion[1, 7, 3]
 
 
 def test_what_is_no_action_is_told(bank, moments):

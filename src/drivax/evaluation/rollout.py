@@ -89,7 +89,8 @@ def _episode(
     carry = planner.init(bank, state, begin_key)
 
     def one(now: Any, key: Array) -> Any:
-        state, carry, sound = advanced(simulator, planner, bank, *now, key)
+        state, carry = now
+        state, carry, sound = advanced(simulator, planner, bank, state, carry, key)
         return (state, carry), (state.scene.history[-1], state.facts.offroad, sound)
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)

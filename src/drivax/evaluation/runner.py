@@ -199,7 +199,7 @@ class _Trial:
 
     def refuse_absent(self, names: Sequence[Mapping[str, str]], there: Any) -> None:
         """Refuses logs that do not have ego where an episode is to begin: nobody could be judged in them."""
-        absent = [names[row]["scenario_id"] for row in np.flatnonzero(~there)]
+        absent = [row["scenario_id"] for row, present in zip(names, there, strict=True) if not present]
         if absent:
             ids = "|".join(absent[:_TOLD]) + ("|..." if len(absent) > _TOLD else "")
             raise UsageError(
@@ -254,9 +254,9 @@ class _Trial:
             scenarios=names,
             metrics=with_crashes(metrics, episodes.crashed >= 0),
             events=events,
-            motion=episodes.motion,
+            motion=np.asarray(episodes.motion),
             start=self.start_step,
-            offroad_steps=episodes.offroad_steps,
+            offroad_steps=np.asarray(episodes.offroad_steps),
             own={name: metric for name, metric in self.metrics.items() if name not in METRICS},
             crashes=crashes,
         )
