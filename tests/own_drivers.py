@@ -35,8 +35,8 @@ def slow_jax(situation, observation):
 
 @python_planner
 def no_haste(situation, observation):
-    """Keeps its speed, and raises where it begins faster than 15 m/s."""
-    if situation.scene.step == 10 and situation.facts.speed_mps > 15.0:
+    """Keeps its speed, and raises where it begins faster than 12 m/s."""
+    if situation.scene.step == 10 and situation.facts.speed_mps > 12.0:
         raise ValueError("too fast")
     return 0.0, 0.0
 

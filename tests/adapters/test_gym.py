@@ -17,6 +17,7 @@ from drivax.adapters import driving, gym
 from drivax.adapters.gym import TASKS, DrivingEnv, VectorDrivingEnv
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.rollout import judging
+from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.assemble import assemble
 from drivax.scenario.store import ScenarioWriter

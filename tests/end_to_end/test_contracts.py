@@ -184,9 +184,9 @@ def test_a_part_of_a_set_has_the_rows_of_the_whole(evaluation, data, tmp_path, c
 
 @pytest.mark.slow
 def test_a_python_function_that_raises(data, tmp_path, capsys):
-    """It raises where ego begins faster than 15 m/s."""
+    """It raises where ego begins faster than 12 m/s."""
     speed = {one.id: float(np.hypot(*one.agent_velocity[10, 0])) for one in ScenarioSet.open(data)}
-    fast = [name for name in speed if speed[name] > 15.0]
+    fast = [name for name in speed if speed[name] > 12.0]
     assert 0 < len(fast) < len(speed)
     call = [
         "evaluate",

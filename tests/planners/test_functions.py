@@ -1,6 +1,7 @@
 """Planners that are one function, in Python or JAX."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -68,7 +69,7 @@ def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
 
 def test_python_and_jax_make_the_same_episodes(bank):
     """Inside the compiled loop over all steps; both crash where nobody else is, at step 15."""
-    rows = np.arange(2, dtype=np.int32)
+    rows = jnp.arange(2)
     keys = episode_keys(bank, rows, 0)
     with raised() as errors:
         python, in_jax = (

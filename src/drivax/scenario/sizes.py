@@ -77,25 +77,24 @@ def last_used(mask: Any) -> np.ndarray[Any, Any]:
 
 def _needed(scenario: Scenario) -> Sizes:
     capacity, record = scenario.capacity, scenario.record
-    moving, parked, lights, graphs = (
-        int(last_used(np.asarray(mask)[None])[0])
-        for mask in (
-            record["agent_valid"].any(0), record["parked_valid"].any(0), (record["light_state"] >= 0).any(0),
-            record["lane_length"] > 0,
-        )
-    )  # fmt: skip
-    agents = max(1, _rounded(moving, capacity.agents))
+    masks = {
+        "agents": record["agent_valid"].any(0), "parked": record["parked_valid"].any(0),
+        "lights": (record["light_state"] >= 0).any(0), "graphs": record["lane_length"] > 0,
+    }  # fmt: skip
+    ends = {name: int(last_used(np.asarray(mask)[None])[0]) for name, mask in masks.items()}
+    agents = max(1, _rounded(ends["agents"], capacity.agents))
+    slots = _rounded(ends["agents"] + ends["parked"], capacity.agents + capacity.parked)
     _, edges, segments = (int(number) for number in record["segment_blocks"][:3])
     half_m = float(np.hypot(*record["agent_size"][0, :2])) / 2
     return Sizes(
         agents=agents,
-        slots=max(_rounded(moving + parked, capacity.agents + capacity.parked), agents),
-        lights=max(1, _rounded(lights, capacity.lights)),
+        slots=max(slots, agents),
+        lights=max(1, _rounded(ends["lights"], capacity.lights)),
         edges=edges,
         lanes=segments - edges,
         edge_run=_longest_run(record["grid_edge"], capacity.grid),
         lane_run=_longest_run(record["grid_lane"], capacity.grid),
-        graphs=max(1, _rounded(graphs, capacity.lanes)),
+        graphs=max(1, _rounded(ends["graphs"], capacity.lanes)),
         road=max(1, int(record["road_rows"])),
         # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
         long_ego=half_m + 3.0 > capacity.cell_m - 2.0,
