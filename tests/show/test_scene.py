@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.show.palette import DARK, LIGHT
+from drivax.show.palette import DARK, LEGEND, LIGHT
 
 from .conftest import drive_off, make_scenario
 
@@ -50,18 +50,7 @@ def test_the_legend_and_the_dark():
     image = pixels(draw_scenario(scenario, 10, theme="dark"))
     assert share(image, "ground", theme=DARK) > 0.5 * plain[..., 0].size and share(image, "ground") == 0
     below = image[len(plain) :]
-    for name in (
-        "ego",
-        "vehicle",
-        "parked",
-        "pedestrian",
-        "cyclist",
-        "other",
-        "red",
-        "amber",
-        "green",
-        "route",
-    ):
+    for name in {name for name, _ in LEGEND} - {"mark", "goal", "log"}:
         assert share(below, name, theme=DARK) > 15, name
     edges = np.abs(below - below[0, 0]).max(axis=-1) > 8
     assert not edges[:, :4].any() and not edges[:, -4:].any(), "the legend fits"
