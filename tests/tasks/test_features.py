@@ -123,7 +123,7 @@ def test_curvature_of_road_and_route(seen):
     np.testing.assert_allclose(found[clear] * 0.1, expected[clear], atol=1e-3)
     speed = column(seen, "route", "recommended_speed")
     np.testing.assert_allclose(speed[clear] * 15, 30 - 25 * expected[clear], atol=0.03)
-    np.testing.assert_array_equal(seen["everything"]["recommended_speed"][0, :10, 0], speed[:10])
+    np.testing.assert_allclose(seen["everything"]["recommended_speed"][0, :10, 0], speed[:10], rtol=1e-6)
 
 
 def test_the_goal_is_shown_from_ego(seen):
