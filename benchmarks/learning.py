@@ -1,7 +1,8 @@
 """What our presets reach on the built-in world's benchmark: trained with several seeds, judged on the test split.
 
-python benchmarks/learning.py train PRESET --data BENCHMARK --runs RUNS [--seeds 3] [--section.key value ...]
-python benchmarks/learning.py judge --data BENCHMARK --runs RUNS [--write]
+python benchmarks/learning.py train PRESET --data BENCHMARK --runs RUNS [--seeds 3] [--first 0] [--key value ...]
+python benchmarks/benchmark.py drive --data BENCHMARK --planner PRESET --traffic log
+python benchmarks/learning.py judge     (what was driven, as means with intervals)
 python benchmarks/learning.py table     (the stored results into the pages, and docs/algorithms/curve-PRESET.png)
 
 BENCHMARK is what `drivax generate BENCHMARK --benchmark` made; RUNS holds a run folder per preset. Checkpoints are
@@ -15,25 +16,21 @@ import argparse
 import json
 import multiprocessing
 import os
+import shutil
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmark import POLICIES, Driven, episodes, learned, mean
 from drivax import settings
-from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results
-from drivax.evaluation.runner import evaluate
-from drivax.evaluation.statistics import crossed_bootstrap
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policies import load_policy
-from drivax.planners.catalogue import make_planner
+from drivax.learning.policies import pack_policy
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.show.runs import read_runs
@@ -42,16 +39,20 @@ from learning_tables import COLUMNS, CURVES, drawn, filled, pages, picture
 
 RESULT = Path(__file__).resolve().parent / "results" / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
+#: What is kept of a training beside its policies.
+TRAINING = "training.json"
 REFERENCES = ("expert", "idm", "constant_velocity")
 
 
 def trained(args: argparse.Namespace, overrides: list[str]) -> None:
     """Trains one preset, each seed by itself on one core, as many side by side as there are cores.
 
-    The longest time that one of them took is kept beside the runs.
+    Their policies are kept in benchmarks/policies, with the longest time that one of them took and their curves. With
+    --first they join those of the seeds before it.
     """
     config = settings.load(TrainConfig, args.preset, overrides)
-    out = args.runs / args.preset.replace("/", "-")
+    name = args.preset.replace("/", "-")
+    out, kept = args.runs / name, POLICIES / name
     data, validation = (ScenarioSet.open(args.data / split) for split in ("train", "validation"))
     notes: dict[str, Any] = {"kind": "seeds", "seeds": args.seeds, "validation": validation.hash}
     RunFolder.create(out, config, [data], overwrite=True, **notes)
@@ -60,9 +61,22 @@ def trained(args: argparse.Namespace, overrides: list[str]) -> None:
     for core in cores:
         free.put(core)
     with ProcessPoolExecutor(len(cores), processes, initializer=_on_one_core, initargs=(free,)) as pool:
-        agents = [replace(config, seed=config.seed + number) for number in range(args.seeds)]
+        seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
+        agents = [replace(config, seed=seed) for seed in seeds]
         took = list(pool.map(partial(_trained_alone, args.data, out), agents))
-    (out / "training_seconds.json").write_text(json.dumps({"seconds": max(took), "seeds": args.seeds}) + "\n")
+    about: dict[str, Any] = {"seconds": max(took), "curves": learning_curves(out)}
+    if args.first:
+        before = json.loads((kept / TRAINING).read_text())
+        about["seconds"] = max(about["seconds"], before["seconds"])
+        about["curves"] = {
+            metric: before["curves"][metric] | lines for metric, lines in about["curves"].items()
+        }
+    else:
+        shutil.rmtree(kept, ignore_errors=True)
+    bank = ScenarioBank.from_scenarios([data[0]])
+    for folder in seed_folders(out):
+        pack_policy(folder, kept / folder.name, bank, overwrite=True)
+    (kept / TRAINING).write_text(json.dumps(about | {"seeds": len(learned()[name])}, indent=1) + "\n")
 
 
 def _on_one_core(free: Any) -> None:
@@ -78,45 +92,39 @@ def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
     return round(time.perf_counter() - began)
 
 
-def judged(args: argparse.Namespace) -> dict[str, Any]:
-    """Every run and the references on the test split, and differences in pairs."""
-    stored = ScenarioSet.open(args.data / "test")
-    scenarios = list(stored)
-    bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
-    segments = np.array([row["segment"] for row in names])
-    driven = {name: [evaluate(make_planner(name), bank, names)] for name in REFERENCES}
-    about: dict[str, Any] = {}
-    curves: dict[str, Any] = {}
-    for run in sorted(path for path in args.runs.iterdir() if (path / "training_seconds.json").is_file()):
-        folders = seed_folders(run) if RunFolder.open(run).info.get("kind") == "seeds" else [run]
-        driven[run.name] = []
-        for folder in folders:
-            planner, task = load_policy(folder, bank)
-            driven[run.name].append(evaluate(planner, bank, names, task=task))
-        about[run.name] = json.loads((run / "training_seconds.json").read_text())
-        curves[run.name] = learning_curves(run)
-    planners = {
-        name: {metric: _mean(results, metric, segments) for metric in COLUMNS}
-        for name, results in driven.items()
+def judged() -> dict[str, Any]:
+    """Every preset that `benchmark.py drive` has driven, and the references, with differences in pairs.
+
+    What is stored of presets that have not been driven since stays.
+    """
+    found = {name: episodes(name, "log") for name in (*REFERENCES, *learned())}
+    driven = {name: one for name, one in found.items() if one is not None}
+    told = {
+        name: json.loads((POLICIES / name / TRAINING).read_text()) for name in learned() if name in driven
     }
-    differences = {
-        f"{name} - {other}": {
-            metric: _difference(driven[name], driven[other], metric, segments) for metric in CURVES
-        }
-        for name in about
-        for other in ("idm", "bc")
-        if other in driven and other != name
+    result: dict[str, Any] = json.loads(RESULT.read_text())
+    if any(one.about["test"] != result["test"]["hash"] for one in driven.values()):
+        raise SystemExit("other scenarios than those of the stored results: drive the benchmark's test split")
+    result |= {"command": "python benchmarks/learning.py judge", "versions": versions()}
+    result["planners"] |= {
+        name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
     }
-    return {
-        "command": "python benchmarks/learning.py judge --data BENCHMARK --runs RUNS --write",
-        "when": datetime.now(UTC).isoformat(timespec="minutes"),
-        "test": {"scenarios": len(scenarios), "hash": stored.hash},
-        "training": about,
-        "planners": planners,
-        "differences": differences,
-        "curves": curves,
-        "versions": versions(),
+    for name in told:
+        for other in ("idm", "bc"):
+            if other in driven and other != name:
+                result["differences"][f"{name} - {other}"] = {
+                    metric: mean(driven[name], metric, driven[other]).as_dict() for metric in CURVES
+                }
+    result["training"] |= {
+        name: {key: one[key] for key in ("seconds", "seeds")} for name, one in told.items()
     }
+    result["curves"] |= {name: one["curves"] for name, one in told.items()}
+    return result
+
+
+def _mean(driven: Driven, metric: str) -> dict[str, Any]:
+    each = [round(float(np.nanmean(row)), 4) for row in driven.values[metric]]
+    return mean(driven, metric).as_dict() | {"by_seed": each}
 
 
 def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:
@@ -142,24 +150,6 @@ def tabled() -> None:
         page.write_text(filled(page, learning, training))
 
 
-def _values(results: list[Results], metric: str) -> np.ndarray[Any, Any]:
-    return np.stack([result.metrics[metric] for result in results])
-
-
-def _mean(results: list[Results], metric: str, segments: np.ndarray[Any, Any]) -> dict[str, Any]:
-    values = _values(results, metric)
-    each = [round(float(np.nanmean(row)), 4) for row in values]
-    return crossed_bootstrap(values, segments, seed=0).as_dict() | {"by_seed": each}
-
-
-def _difference(
-    one: list[Results], other: list[Results], metric: str, segments: np.ndarray[Any, Any]
-) -> dict[str, Any]:
-    """Each seed of one against the mean over the seeds of the other, scenario by scenario."""
-    reference = np.nanmean(_values(other, metric), axis=0)
-    return crossed_bootstrap(_values(one, metric) - reference, segments, seed=0).as_dict()
-
-
 def main() -> None:
     """Trains, judges, or shows what is stored."""
     parser = argparse.ArgumentParser(
@@ -169,23 +159,18 @@ def main() -> None:
     training = commands.add_parser("train")
     training.add_argument("preset")
     training.add_argument("--seeds", type=int, default=3)
-    judging = commands.add_parser("judge")
-    judging.add_argument("--write", action="store_true", help="store the result")
+    training.add_argument("--first", type=int, default=0, help="how many seeds were trained before")
+    training.add_argument("--data", type=Path, required=True)
+    training.add_argument("--runs", type=Path, required=True)
+    commands.add_parser("judge")
     commands.add_parser("table")
-    for command in (training, judging):
-        command.add_argument("--data", type=Path, required=True)
-        command.add_argument("--runs", type=Path, required=True)
     args, overrides = parser.parse_known_args()
     if args.command == "train":
         trained(args, overrides)
-        return
-    if args.command == "table":
+    elif args.command == "judge":
+        RESULT.write_text(json.dumps(judged(), indent=1) + "\n")
+    else:
         tabled()
-        return
-    result = judged(args)
-    print(json.dumps({"planners": result["planners"], "differences": result["differences"]}, indent=1))
-    if args.write:
-        RESULT.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ A page shows what stands between ``<!-- learning.py: WHAT -->`` and ``<!-- learn
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ def reached(learning: Result) -> list[str]:
     planners = learning["planners"]
     order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
     rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
-    return _table(["driver", *(f"`{column}`" for column in COLUMNS)], rows)
+    return table(["driver", *(f"`{column}`" for column in COLUMNS)], rows)
 
 
 def differences(learning: Result) -> list[str]:
@@ -77,7 +77,7 @@ def differences(learning: Result) -> list[str]:
         [pair, *(interval(found[column], signed=True) for column in CURVES)]
         for pair, found in learning["differences"].items()
     ]
-    return _table(["difference", *(f"`{column}`" for column in CURVES)], rows)
+    return table(["difference", *(f"`{column}`" for column in CURVES)], rows)
 
 
 def best(learning: Result) -> str:
@@ -102,7 +102,7 @@ def aims(learning: Result, training: Result) -> list[str]:
     speed = training["training"]["ppo"]["steps_per_second"]
     rows.append(["steps per second of training, `ppo`", f"{SPEED:,}", f"{speed:,}", speed >= SPEED])
     cells = [[*row[:3], "yes" if row[3] else "**no**"] for row in rows]
-    return _table(["what", "aim", "measured", "reached"], cells)
+    return table(["what", "aim", "measured", "reached"], cells)
 
 
 def times(learning: Result) -> list[str]:
@@ -110,7 +110,7 @@ def times(learning: Result) -> list[str]:
     rows = [
         [f"`{name}`", str(one["seeds"]), f"{one['seconds']:,}"] for name, one in learning["training"].items()
     ]
-    return _table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
+    return table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
 
 
 def speeds(training: Result) -> list[str]:
@@ -120,7 +120,7 @@ def speeds(training: Result) -> list[str]:
         shares = [f"{share:.0%}" for share in one["share"].values()]
         rows.append([name, f"{one['steps_per_second']:,}", *shares])
     first = next(iter(training["training"].values()))
-    return _table(["training", "steps/s", *first["share"]], rows)
+    return table(["training", "steps/s", *first["share"]], rows)
 
 
 def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
@@ -172,15 +172,16 @@ def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> F
     return figure
 
 
-def interval(found: Mapping[str, Any], signed: bool = False) -> str:
+def interval(found: Mapping[str, Any], signed: bool = False, digits: int = 3) -> str:
     """A mean with its interval."""
     numbers = [found[name] for name in ("mean", "low", "high")]
     if numbers[0] is None:
         return "-"
-    mean, *ends = (f"{number:{'+' if signed else ''}.3f}" for number in numbers if number is not None)
+    mean, *ends = (f"{number:{'+' if signed else ''}.{digits}f}" for number in numbers if number is not None)
     return f"{mean} [{', '.join(ends)}]" if ends else mean
 
 
-def _table(heads: list[str], rows: list[list[str]]) -> list[str]:
-    lines = [f"| {' | '.join(line)} |" for line in [heads, *rows]]
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown."""
+    lines = [f"| {' | '.join(line)} |" for line in (heads, *rows)]
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
