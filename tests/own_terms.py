@@ -68,6 +68,7 @@ nearest_other = Metric(
     of=StepValue("nearest_other", "m", _gap, frozenset()),
     operator="min",
 )
+crashed = nearest_other
 lane_changes = Metric(
     unit="-",
     better="-",

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import types
 
 import numpy as np
 import pytest
@@ -59,6 +60,58 @@ def test_the_page_of_real_files_shows_every_planner(script, stored):
     real = script("real_files")
     shown = f"{real.BEGIN}\n\n{real.tables(stored('real_files'))}\n\n{real.END}" in real.PAGE.read_text()
     assert shown, "run python benchmarks/real_files.py --table, and read what the page says about it"
+
+
+def test_the_page_of_the_benchmark_shows_what_was_driven(script, stored):
+    benchmark = script("benchmark")
+    text = benchmark.PAGE.read_text()
+    shown = benchmark.filled(text, stored("benchmark")) == text
+    assert shown, "run python benchmarks/benchmark.py table, and read what the page says about it"
+    rows = stored("benchmark")["planners"]
+    assert rows["expert"]["log"]["accuracy"]["mean"] == 1.0
+
+
+def test_how_far_it_goes_until_it_fails(script):
+    # 1 m a step from step 10 on: hits at step 13 and leaves the road later, fails never, fails at once.
+    motion = np.zeros((3, 6, 4))
+    motion[:, :, 0] = np.arange(6)
+    events = {"collision": np.array([13, -1, -1]), "offroad": np.array([14, -1, 10])}
+    results = types.SimpleNamespace(events=events, motion=motion, start=10)
+    found = script("benchmark").until_failure(results)
+    np.testing.assert_array_equal(found["steps_until_failure"], [3, 5, 0])
+    np.testing.assert_array_equal(found["metres_until_failure"], [3, 5, 0])
+
+
+def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
+    benchmark = script("benchmark")
+    monkeypatch.setattr(benchmark, "EPISODES", tmp_path)
+    monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
+    for seed in ("seed-0", "seed-1"):
+        (tmp_path / "policies" / "bc" / seed).mkdir(parents=True)
+    columns = dict.fromkeys((*benchmark.COLUMNS, *benchmark.UNTIL), np.array([[0.0, 1.0, np.nan]]))
+
+    def keep(name, kind, accuracy, test="a"):
+        about = {"planner": name, "traffic": kind, "seeds": len(accuracy), "test": test}
+        values = columns | {"accuracy": np.array(accuracy)}
+        np.savez(benchmark.file_of(name, kind), about=json.dumps(about), segment=["s", "s", "t"], **values)
+
+    keep("idm", "log", [[1, 1, 0]])
+    keep("idm", "idm", [[1, 0, 0]])
+    keep("bc", "log", [[1, 1, 1], [1, 1, 0]])
+    keep(benchmark.BOX, "log", [[0, 0, 0]])
+    found = benchmark.judged()
+    assert found["planners"]["bc"]["seeds"] == 2
+    np.testing.assert_allclose(found["planners"]["bc"]["log"]["accuracy"]["mean"], 5 / 6)
+    assert list(found["reactive"]) == ["idm"]
+    np.testing.assert_allclose(found["reactive"]["idm"]["accuracy"]["mean"], -1 / 3)
+    assert list(found["differences"]["log"]) == ["bc - idm"] and not found["differences"]["idm"]
+    np.testing.assert_allclose(found["differences"]["log"]["bc - idm"]["accuracy"]["mean"], 1 / 6)
+    shown = benchmark.page(found)
+    assert [line.split(" | ")[:2] for line in shown["idm"][2:]] == [["| `idm`", "1"]]
+    assert shown["random"][2].startswith("| `log` | 0.5 [")
+    keep("pdm", "log", [[1, 1, 1]], test="b")
+    with pytest.raises(SystemExit, match="2 test sets"):
+        benchmark.judged()
 
 
 def of(mean, half=0.01):

@@ -13,7 +13,6 @@ from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate_scenarios
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
-from drivax.learning.zoo import is_policy, zoo
 from drivax.named import is_dotted
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
@@ -26,6 +25,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
+from drivax.tracking.zoo import is_policy, zoo
 
 
 @dataclass(frozen=True)

@@ -202,7 +202,7 @@ def test_a_python_function_that_raises(data, tmp_path, capsys):
         rows = list(csv.DictReader(file))
     assert [row["scenario_id"] for row in rows] == list(speed)
     assert [row["scenario_id"] for row in rows if row["crashed"] == "1"] == fast
-    assert {(row["success"], row["collision"]) for row in rows if row["crashed"] == "1"} == {("0", "")}
+    assert {(row["success"], row["collision"]) for row in rows if row["crashed"] == "1"} == {("0", "0")}
     crashes = json.loads((tmp_path / "run" / "crashes.json").read_text())
     assert [(crash["scenario_id"], crash["step"]) for crash in crashes] == [(name, 10) for name in fast]
     out = capsys.readouterr().out

@@ -28,8 +28,9 @@ def check_exact(scenarios):
     metrics = driven_by(EXACT, scenarios)
     # Heights and headings are stored as float32 and headings as an angle: nothing is added to them.
     assert np.nanmax(metrics["ade"]) == 0.0 and np.nanmax(metrics["fde"]) == 0.0
-    for name in ("collision", "at_fault_collision", "offroad"):
+    for name in ("collision", "at_fault_collision", "offroad", "red_light"):
         assert np.nansum(metrics[name]) == 0.0, name
+    assert (metrics["accuracy"] == 1.0).all()
 
 
 def generated(seed, count):

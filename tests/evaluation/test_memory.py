@@ -7,6 +7,7 @@ import pytest
 from drivax.errors import DrivaxError
 from drivax.evaluation.memory import (
     MOST,
+    _group_limits,
     free_memory,
     memory_of,
     scenarios_at_a_time,
@@ -24,6 +25,29 @@ def test_half_of_what_is_free_holds_two_copies_and_the_program():
 def test_this_machine_has_some_left():
     device = jax.devices()[0]
     assert 10**7 < free_memory(device) <= memory_of(device)
+
+
+def test_every_group_that_we_are_in_counts(tmp_path):
+    groups, ours = tmp_path / "cgroup", tmp_path / "self"
+    job = groups / "batch" / "job-7"
+    job.mkdir(parents=True)
+    ours.write_text("0::/batch/job-7\n")
+    assert _group_limits(groups, ours) == [], "no limits are told"
+    (groups / "batch" / "memory.max").write_text("max\n")
+    (groups / "batch" / "memory.current").write_text("500\n")
+    (job / "memory.max").write_text("1000\n")
+    (job / "memory.current").write_text("400\n")
+    assert _group_limits(groups, ours) == [(1000, 400)]
+    # Files that are kept in memory only because there is room do not count.
+    (job / "memory.stat").write_text("anon 290\nactive_file 30\ninactive_file 80\n")
+    assert _group_limits(groups, ours) == [(1000, 290)]
+    # The older kind has a folder per controller; in a container the root is the group itself.
+    ours.write_text("4:memory:/elsewhere\n3:cpu:/\n0::/\n")
+    (groups / "memory").mkdir()
+    (groups / "memory" / "memory.limit_in_bytes").write_text("2000\n")
+    (groups / "memory" / "memory.usage_in_bytes").write_text("1\n")
+    assert _group_limits(groups, ours) == [(2000, 1)]
+    assert _group_limits(groups, tmp_path / "none") == []
 
 
 def test_too_little_memory_is_one_line_with_the_cure():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivax.errors import UsageError
+from drivax.evaluation.runner import evaluate
 from drivax.evaluation.runs import EvaluationConfig, run_evaluation
 from drivax.metrics.selection import selected
 from drivax.planners.catalogue import make_planner
@@ -14,7 +15,8 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.show.runs import read_runs
 from drivax.show.tables import explanations, planner_table
-from scenes import SMALL, car, straight_road
+from drivax.tasks.task import Task
+from scenes import SMALL, bank_of, car, straight_road
 
 
 def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
@@ -37,6 +39,12 @@ def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
     table = planner_table(runs, ["nearest_other"])
     assert "nearest other [m]" in table and "more is better" in table and "30.0" in table
     assert "Smallest distance between centres." in explanations(["nearest_other"], runs)
+
+
+def test_own_metrics_spoil_no_column():
+    bank, names = bank_of(straight_road([car()])), [{"dataset": "", "scenario_id": "a", "segment": "a"}]
+    with pytest.raises(UsageError, match="another column 'crashed'; give your metric another name"):
+        evaluate(make_planner("random"), bank, names, task=Task(metrics=("own_terms:crashed",)))
 
 
 def test_what_is_no_metric_is_refused():

@@ -10,14 +10,15 @@ import pytest
 import drivax
 from drivax.api import load
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.audit import audit
+from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.results import FAILED, KEYS, paired_differences, with_crashes
-from drivax.evaluation.runner import evaluate, evaluate_scenarios
+from drivax.evaluation.runner import evaluate, evaluate_in, evaluate_scenarios
 from drivax.evaluation.runs import format_crashes
 from drivax.evaluation.stored import read_episodes
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
 from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioWriter
 from drivax.simulator.simulator import Simulator
@@ -114,12 +115,15 @@ def test_a_crash_is_a_failed_episode_and_no_other_changes(scenarios, whole, cras
     before, after = by_scenario(whole), by_scenario(crashed)
     assert {name for name in before if before[name] != after[name]} == {scenarios[3].id}
     np.testing.assert_array_equal(crashed.motion[3, :31], whole.motion[3, :31])
-    assert np.isfinite(crashed.motion).all()
+    assert (crashed.motion[3, 31:] == crashed.motion[3, 30]).all(), "nobody drives it any more"
     row, sound = after[scenarios[3].id][0], before[scenarios[3].id][0]
     assert row["crashed"] == "1" and sound["crashed"] == "0"
-    for name in METRICS:
-        defined = name in FAILED and sound[name] != ""
-        assert row[name] == ("0" if defined else ""), name
+    for name in FAILED:
+        assert row[name] == ("0" if sound[name] != "" else ""), name
+    # The rest is what was measured in the 30 steps until then.
+    moved = np.hypot(*np.diff(whole.motion[3, :31, :2], axis=0).T).sum()
+    assert float(row["distance"]) == pytest.approx(moved, abs=0.05) and row["steps"] == "30"
+    assert 0 < float(row["progress_ratio"]) < float(sound["progress_ratio"])
     assert row["vmax_score"] == "0" and row["success"] == "0"
     for name in ("accuracy", "success", "vmax_score"):
         one, other = (results.summary()["metrics"][name] for results in (whole, crashed))
@@ -165,7 +169,7 @@ def test_crashes_by_hand():
     assert list(found) == ["success", "vmax_score", "vmax_score_partial", "collision", "crashed", "own"]
     expected = {
         "success": [1.0, 0.0, nan], "vmax_score": [0.5, nan, 0.0], "vmax_score_partial": [nan, 0.0, nan],
-        "collision": [0.0, nan, nan], "crashed": [0.0, 1.0, 1.0], "own": [3.0, nan, nan],
+        "collision": [0.0, 0.0, 1.0], "crashed": [0.0, 1.0, 1.0], "own": [3.0, 4.0, 5.0],
     }  # fmt: skip
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
@@ -225,5 +229,8 @@ def test_logs_in_which_nobody_could_be_judged_are_named_with_the_filter_that_lea
     assert Flag.NO_FUTURE in short.has
     with pytest.raises(DataError, match=r"record short: has no logged future.*1 of 4.*flag!=NO_FUTURE"):
         evaluate_scenarios(NOISY, fragile(), [*logs, short])
+    bank = ScenarioBank.from_scenarios([logs[0], short], allow_no_future=True)
+    with pytest.raises(DataError, match=r"record short: has no logged future.*1 of 2"):
+        evaluate_in(NOISY, fragile(), bank, scenario_names([logs[0], short]))
     with pytest.raises(UsageError, match="a batch of 0"):
         evaluate_scenarios(NOISY, fragile(), logs, batch=0)

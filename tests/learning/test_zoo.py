@@ -20,12 +20,12 @@ from drivax.errors import DataError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import PACKED, load_policy, pack_policy
 from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_traffic
-from drivax.learning.zoo import is_policy, policy_folder, zoo
 from drivax.simulator.catalogue import prepared
 from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.traffic import LogTraffic
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder
+from drivax.tracking.zoo import is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
 
 TINY = {

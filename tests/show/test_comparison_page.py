@@ -118,6 +118,11 @@ def test_a_plan_is_written_before_it_is_run(runs, tmp_path, capsys):
     assert called(capsys, *words)[0] == 2, "nothing is overwritten"
     status, out, _ = called(capsys, "--config", file)
     assert status == 0 and "A  expert" in out and "accuracy ↑" in out
+    # A primary metric is no secondary one, though it is one of those by default.
+    usual = ComparisonPlan().secondary
+    file = tmp_path / "collision.yaml"
+    assert called(capsys, "--primary", usual[0], "--save", file)[0] == 0
+    assert settings.load(ComparisonPlan, file).secondary == usual[1:]
 
 
 def test_splits(runs, plan, capsys):

@@ -69,6 +69,10 @@ def test_existing_folders(tmp_path: Path):
         RunFolder.create(tmp_path / "run", Config())
     RunFolder.create(tmp_path / "run", Config(), overwrite=True)
     assert not (run.path / "metrics.jsonl").exists()
+    RunFolder.create(tmp_path / "days", Config(), kind="training")
+    with pytest.raises(UsageError, match="holds a run of kind training, not evaluation"):
+        RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="evaluation")
+    RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="seeds")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").write_text("years of work")
     with pytest.raises(UsageError, match="is no run folder"):
@@ -124,3 +128,4 @@ def test_where_a_planner_was_trained(tmp_path):
     trained = str(tmp_path / "policy")
     assert runs.training_data(trained) == runs.training_data(f"{trained}@1000") == data
     assert runs.training_data(str(tmp_path / "judged")) == runs.training_data("idm") == []
+    assert [entry["scenarios"] for entry in runs.training_data("zoo:aggressive")] == [4096]

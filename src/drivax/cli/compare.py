@@ -62,7 +62,10 @@ def run(args: Compare) -> int:
     if len(args.runs) not in (0, 2):
         raise UsageError(f"{len(args.runs)} runs are named", cure="write drivax compare A B")
     plan = ComparisonPlan() if args.config is None else settings.load(ComparisonPlan, args.config)
-    plan = replace(plan, **_given(args))
+    given = _given(args)
+    if "primary" in given and "secondary" not in given:
+        given["secondary"] = tuple(name for name in plan.secondary if name != given["primary"])
+    plan = replace(plan, **given)
     for out in (args.save, args.html):
         if out is not None:
             refuse_page(out, args.overwrite)

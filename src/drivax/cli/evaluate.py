@@ -92,7 +92,14 @@ def run(args: Evaluate) -> int:
         batch=args.batch,
     )
     results = run_evaluation(
-        config, planner, data, args.out, task=task, traffic=traffic, overwrite=args.overwrite
+        config,
+        planner,
+        data,
+        args.out,
+        task=task,
+        traffic=traffic,
+        sizes=some.sizes,
+        overwrite=args.overwrite,
     )
     print(format_summary([results.summary()]))
     if args.metrics:

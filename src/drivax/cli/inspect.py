@@ -112,7 +112,7 @@ def _console() -> Console:
 
 def _refuse_misfits(args: Inspect) -> None:
     from drivax.errors import UsageError
-    from drivax.learning.zoo import is_policy
+    from drivax.tracking.zoo import is_policy
 
     if args.observations and (len(args.sets) > 1 or args.html is not None):
         raise UsageError(

@@ -16,10 +16,9 @@ from drivax.errors import DrivaxError
 MOST = 10_000
 #: What a program is allowed per scenario that it drives: PDM-Closed takes 4.3 MB, IDM and policies 0.1 MB.
 _PROGRAM_BYTES = 8_000_000
-#: Limits of containers, and what counts against them.
-_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-_USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
-_STATISTICS = ("/sys/fs/cgroup/memory.stat", "/sys/fs/cgroup/memory/memory.stat")
+#: What a control group (of a container, a job) says: its limit, and what counts against it.
+_GROUP_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+_GROUPS, _OUR_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _MACHINE = Path("/proc/meminfo")
 
 
@@ -30,8 +29,8 @@ def memory_of(device: Any, share: int = 1) -> int | None:
         return int(told["bytes_limit"])
     if device.platform != "cpu":
         return None
-    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), *_numbers(_LIMITS)]
-    return min(limits) // share
+    whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([whole, *(limit for limit, _ in _group_limits())]) // share
 
 
 def free_memory(device: Any) -> int | None:
@@ -47,11 +46,7 @@ def free_memory(device: Any) -> int | None:
     free = []
     if _MACHINE.is_file():
         free.append(1024 * _table(_MACHINE)["MemAvailable:"])
-    for limit, used, statistics in zip(_LIMITS, _USED, _STATISTICS, strict=True):
-        found = _numbers((limit, used))
-        if len(found) == 2:
-            kept = _table(Path(statistics)) if Path(statistics).is_file() else {}
-            free.append(found[0] - found[1] + kept.get("active_file", 0) + kept.get("inactive_file", 0))
+    free += [limit - used for limit, used in _group_limits()]
     return max(min(free), 0) if free else memory_of(device)
 
 
@@ -90,10 +85,39 @@ def telling_out_of_memory(count: int) -> Iterator[None]:
         ) from error
 
 
-def _numbers(files: tuple[str, ...]) -> list[int]:
-    """The numbers that these files hold, as far as they exist and hold one."""
-    texts = [Path(file).read_text(encoding="ascii").strip() for file in files if Path(file).is_file()]
-    return [int(text) for text in texts if text.isdecimal()]
+def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tuple[int, int]]:
+    """Limit and use (bytes) of every control group that we are in and that has a limit, files in memory not counted.
+
+    Args:
+        groups: Where the system shows them.
+        ours: The file that names ours: ``hierarchy:controllers:path`` (cgroups(7)).
+    """
+    found = []
+    rows = ours.read_text(encoding="utf-8").splitlines() if ours.is_file() else []
+    for _, controllers, path in (row.split(":", 2) for row in rows):
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        root = groups / "memory" if controllers else groups
+        # In a container our own group may be mounted as the root.
+        folder = root / path.strip("/")
+        for group in {folder, *folder.parents} - {*groups.parents} - ({groups} if controllers else set()):
+            for limit_file, used_file in _GROUP_FILES:
+                limit, used = (_number(group / file) for file in (limit_file, used_file))
+                if limit is not None and used is not None:
+                    statistics = group / "memory.stat"
+                    kept = _table(statistics) if statistics.is_file() else {}
+                    files = kept.get("active_file", 0) + kept.get("inactive_file", 0)
+                    found.append((limit, max(used - files, 0)))
+    return found
+
+
+def _number(file: Path) -> int | None:
+    """The number that a file holds; None where it cannot be read, or holds none ("max")."""
+    try:
+        text = file.read_text(encoding="ascii").strip()
+    except OSError:
+        return None
+    return int(text) if text.isdecimal() else None
 
 
 def _table(file: Path) -> dict[str, int]:

@@ -24,7 +24,7 @@ RATES = (
 )  # fmt: skip
 #: Codes and counts that no mean makes sense of.
 NOT_SUMMARISED = ("collision_type", "steps")
-#: What an episode is, by these metrics, whose planner crashed: failed. What else it would have been nobody knows.
+#: What an episode is, by these metrics, whose planner crashed: failed.
 FAILED = (
     "accuracy", "accuracy_at_fault", "success", "success_moving", "vmax_score", "nuplan_score", "vmax_score_partial",
     "nuplan_score_partial",
@@ -142,12 +142,14 @@ class Results:
         And ``crashes.json``, where the planner crashed.
         """
         if self.crashes:
-            (folder / "crashes.json").write_text(json.dumps(self.crash_rows(), indent=1) + "\n")
-        with (folder / "episodes.csv").open("w", newline="") as file:
+            (folder / "crashes.json").write_text(
+                json.dumps(self.crash_rows(), indent=1) + "\n", encoding="utf-8"
+            )
+        with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows())
-        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n")
+        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n", encoding="utf-8")
         arrays = {f"{name}_step": self.events[name].astype(np.int16) for name in EVENTS}
         np.savez_compressed(
             folder / "trajectories.npz",
@@ -163,16 +165,16 @@ def with_crashes(metrics: Mapping[str, Any], crashed: Any) -> dict[str, np.ndarr
     """Metrics in which episodes whose planner crashed have failed, and the column that says which these are.
 
     They have the value 0 in those of :data:`FAILED` that their scenario defines, so that a planner gains nothing by
-    crashing; all else is undefined.
+    crashing; all else is what was measured until then.
 
     Args:
         metrics: Values by name, NaN where undefined; those of the user's own last.
         crashed: Which episodes did.
     """
-    found: dict[str, np.ndarray[Any, Any]] = {}
-    for name, values in metrics.items():
-        failed = np.where(np.isnan(values), np.nan, 0.0) if name in FAILED else np.nan
-        found[name] = np.where(crashed, failed, values)
+    found = {
+        name: np.where(crashed & ~np.isnan(values), 0.0, values) if name in FAILED else values
+        for name, values in metrics.items()
+    }
     ours = [name for name in found if name in METRICS]
     own = [name for name in found if name not in METRICS]
     column = {"crashed": np.asarray(crashed, np.float64)}

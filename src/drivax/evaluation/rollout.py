@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.evaluation.results import FAILED
 from drivax.metrics.episode import episode_metrics, first_steps
 from drivax.metrics.scores import Value
 from drivax.planners.planner import Planner
@@ -34,7 +35,7 @@ class Episodes:
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
         offroad_steps: Number of steps off the road.
-        crashed: First step whose action was no number, -1 for none. What follows it means nothing.
+        crashed: First step whose action was no number, -1 for none. Nothing is measured from there on; motion stays.
     """
 
     metrics: dict[str, Value]
@@ -89,14 +90,23 @@ def _episode(
     carry = planner.init(bank, state, begin_key)
 
     def one(now: Any, key: Array) -> Any:
-        state, carry = now
-        state, carry, sound = advanced(simulator, planner, bank, state, carry, key)
-        return (state, carry), (state.scene.history[-1], state.facts.offroad, sound)
+        state, kept, carry, sound = now
+        state, carry, step_sound = advanced(simulator, planner, bank, state, carry, key)
+        sound &= step_sound
+        kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
+        seen = kept.scene.history[-1], sound & state.facts.offroad, sound
+        return (state, kept, carry, sound), seen
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
-    (final, _), (motion, offroad, sound) = jax.lax.scan(one, (state, carry), keys)
+    first = (state, state, carry, jnp.ones((), bool))
+    (last, final, _, _), (motion, offroad, sound) = jax.lax.scan(one, first, keys)
+    metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
+    # What a scenario defines does not depend on how soon its planner crashed.
+    failed = {
+        name: replace(metrics[name], defined=to_the_end[name].defined) for name in FAILED if name in metrics
+    }
     return Episodes(
-        metrics=episode_metrics(bank, final),
+        metrics=metrics | failed,
         events=first_steps(final.episode),
         motion=jnp.concatenate([state.scene.history[-1][None], motion]),
         offroad_steps=offroad.sum().astype(jnp.int32),

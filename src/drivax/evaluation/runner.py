@@ -20,7 +20,7 @@ from jaxtyping import Array, Int
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_out_of_memory
-from drivax.evaluation.results import Crash, Results, with_crashes
+from drivax.evaluation.results import ADDED, KEYS, Crash, Results, with_crashes
 from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import catalogue
@@ -40,7 +40,7 @@ from drivax.tasks.task import Task
 #: Scenarios that a program drives side by side on a CPU, and on anything else. PDM-Closed takes 12 % longer for each of
 #: 16 than of 8, and 20 % less than of 64 (the caches); IDM 8 % longer than of 64.
 LANES, LANES_ELSEWHERE = 16, 256
-#: So many scenarios are named in an error.
+#: No more scenarios than these are named in an error.
 _TOLD = 5
 Progress = Callable[[int, int], None]
 
@@ -102,8 +102,11 @@ def evaluate_in(
         DrivaxError: As :func:`evaluate`.
     """
     if len(scenarios) != len(bank):
-        raise UsageError(f"{len(scenarios)} scenario names for a bank of {len(bank)}")
+        raise UsageError(
+            f"{len(scenarios)} scenario names for a bank of {len(bank)}", cure="name every row of the bank"
+        )
     trial = _Trial.of(simulator, planner, start_step, seed, bank.steps)
+    _refuse_without_future(scenarios, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
     trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) > 0)
     with raised() as errors, telling_out_of_memory(len(bank)):
         episodes = trial.drive_all(bank, progress)
@@ -143,7 +146,7 @@ def evaluate_scenarios(
         raise UsageError(f"a batch of {batch} scenarios", cure="use 1 or more")
     names = scenario_names(scenarios)
     trial = _Trial.of(simulator, planner, start_step, seed, STEPS)
-    _refuse_without_future(names, scenarios)
+    _refuse_without_future(names, [Flag.NO_FUTURE in scenario.has for scenario in scenarios])
     trial.refuse_absent(names, np.array([scenario.agent_valid[start_step, 0] for scenario in scenarios]))
     numbers = identities([(row["dataset"], row["scenario_id"]) for row in names])
     total, sizes = len(scenarios), sizes or Sizes.used(scenarios)
@@ -195,17 +198,22 @@ class _Trial:
                 cure="use expert_actions",
             )
         judged = judging(task)
-        return cls(replace(simulator, task=judged), planner, start_step, seed, catalogue(judged.metrics))
+        metrics = catalogue(judged.metrics)
+        if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
+            raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
+        return cls(replace(simulator, task=judged), planner, start_step, seed, metrics)
 
     def refuse_absent(self, names: Sequence[Mapping[str, str]], there: Any) -> None:
         """Refuses logs that do not have ego where an episode is to begin: nobody could be judged in them."""
         absent = [row["scenario_id"] for row, present in zip(names, there, strict=True) if not present]
         if absent:
-            ids = "|".join(absent[:_TOLD]) + ("|..." if len(absent) > _TOLD else "")
+            cure = "begin at another step"
+            if len(absent) <= _TOLD:
+                cure += f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
             raise UsageError(
                 f"ego is not in the log at step {self.start_step} in {len(absent)} of {len(names)} scenarios",
                 record=absent[0],
-                cure=f"begin at another step, or leave them out: --filter 'scenario_id!={ids}'",
+                cure=cure,
             )
 
     def drive_all(self, bank: ScenarioBank, progress: Progress | None = None) -> Episodes:
@@ -224,7 +232,11 @@ class _Trial:
         return _joined(parts)
 
     def results(
-        self, episodes: Episodes, names: Sequence[Mapping[str, str]], numbers: Any, errors: Mapping[int, str]
+        self,
+        episodes: Episodes,
+        names: Sequence[Mapping[str, str]],
+        numbers: Any,
+        errors: Mapping[tuple[int, int], str],
     ) -> Results:
         """The episodes as results.
 
@@ -232,28 +244,23 @@ class _Trial:
             episodes: What was driven.
             names: The scenarios.
             numbers: Their identities.
-            errors: What the planner raised, by identity.
+            errors: What the planner raised, by identity and step.
         """
         self._refuse_nan(episodes, names)
         found = episodes.metrics
         metrics = {name: np.where(found[name].defined, found[name].value, np.nan) for name in self.metrics}
         crashes = tuple(
-            Crash(int(row), int(episodes.crashed[row]), errors.get(int(numbers[row]), "action is not finite"))
-            for row in np.flatnonzero(episodes.crashed >= 0)
+            Crash(row, step, errors.get((int(numbers[row]), step), "action is not finite"))
+            for row, step in enumerate(episodes.crashed.tolist())
+            if step >= 0
         )
-        # What a car runs into that nobody drives any more is no event of an episode.
-        real = (episodes.crashed < 0) | (np.stack([*episodes.events.values()]) <= episodes.crashed)
-        events = {
-            name: np.where(kept, steps, -1)
-            for (name, steps), kept in zip(episodes.events.items(), real, strict=True)
-        }
         return Results(
             planner=self.planner.name,
             traffic=self.simulator.traffic.name,
             seed=self.seed,
             scenarios=names,
             metrics=with_crashes(metrics, episodes.crashed >= 0),
-            events=events,
+            events={name: np.asarray(steps) for name, steps in episodes.events.items()},
             motion=np.asarray(episodes.motion),
             start=self.start_step,
             offroad_steps=np.asarray(episodes.offroad_steps),
@@ -288,12 +295,8 @@ def _on(progress: Progress | None, first: int, total: int) -> Progress | None:
     return None if progress is None else lambda done, _: progress(first + done, total)
 
 
-def _refuse_without_future(names: Sequence[Mapping[str, str]], scenarios: Sequence[Scenario]) -> None:
-    short = [
-        row["scenario_id"]
-        for row, scenario in zip(names, scenarios, strict=True)
-        if Flag.NO_FUTURE in scenario.has
-    ]
+def _refuse_without_future(names: Sequence[Mapping[str, str]], without: Sequence[bool] | Any) -> None:
+    short = [row["scenario_id"] for row, cut in zip(names, without, strict=True) if cut]
     if short:
         raise DataError(
             f"has no logged future (a short log or a test split), as {len(short)} of {len(names)} scenarios",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +21,7 @@ from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
-from drivax.tracking.runs import RunFolder, refuse_existing, training_data
+from drivax.tracking.runs import RunFolder, refuse_existing, replacing, training_data
 
 #: Columns of the headline, with their short names.
 HEADLINE = {
@@ -70,6 +68,7 @@ def run_evaluation(
     *,
     task: Task | None = None,
     traffic: Traffic | None = None,
+    sizes: Sizes | None = None,
     overwrite: bool = False,
 ) -> Results:
     """Evaluates a planner on a set and writes the run folder.
@@ -81,10 +80,11 @@ def run_evaluation(
         out: Run folder; it appears after the drive.
         task: Action space and observation of the planner.
         traffic: How the others move; by default what ``config.traffic`` is called in the simulator's catalogue.
+        sizes: What the whole set uses, if that is known already.
         overwrite: Replace an existing run folder.
     """
     scenarios = [data[row] for row in chosen(data, config.filter, config.scenarios, config.limit)]
-    refuse_existing(Path(out), overwrite)
+    refuse_existing(Path(out), overwrite, "evaluation")
     start = NoisyStart() if config.noisy_start else LogStart()
     judged = _with_metrics(task or Task(), config.metrics)
     with Progress(f"driving {planner.name}", "scenarios", len(scenarios)) as bar:
@@ -96,22 +96,16 @@ def run_evaluation(
             seed=config.seed,
             batch=config.batch,
             # Checksums are tested where a scenario is driven; this only looks at what each record uses.
-            sizes=Sizes.used(ScenarioSet.open(data.path, verify=False)),
+            sizes=sizes or Sizes.used(ScenarioSet.open(data.path, verify=False)),
             progress=lambda done, total: bar.update(done),
         )
-    # Everything is written beside the final name, so that a folder of that name is always a whole run.
-    out = Path(out)
-    partial = out.parent / f".{out.name}.partial-{os.getpid()}"
     notes: dict[str, Any] = {"kind": "evaluation", "planner": results.planner, "traffic": results.traffic}
     if trained := training_data(config.planner):
         notes["trained_on"] = trained
-    try:
+    # A folder of that name is always a whole run.
+    with replacing(Path(out)) as partial:
         RunFolder.create(partial, config, data=[data], overwrite=True, **notes, **results.notes())
         results.write(partial)
-        shutil.rmtree(out, ignore_errors=True)
-        partial.rename(out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return results
 
 

@@ -63,7 +63,7 @@ def train(
     if resume:
         config, folders = resumed_folders(data, validation, out, seeds)
     else:
-        refuse_existing(out, overwrite)
+        refuse_existing(out, overwrite, "training")
     if config.patience and validation is None:
         raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
     if seeds < 1:

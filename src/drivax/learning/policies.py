@@ -10,12 +10,12 @@ import jax
 
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.learning.zoo import policy_folder
 from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
 from drivax.tracking.runs import RunFolder, seed_folders
+from drivax.tracking.zoo import policy_folder
 
 #: What a packed policy has in the place of checkpoints.
 PACKED = "policy.npz"

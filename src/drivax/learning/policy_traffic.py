@@ -7,13 +7,13 @@ from pathlib import Path
 
 from drivax.errors import UsageError
 from drivax.learning.policies import load_policy, open_policy
-from drivax.learning.zoo import is_policy, zoo
 from drivax.named import is_dotted
 from drivax.planners.driven import PlannerTraffic, with_driver
 from drivax.scenario.bank import ScenarioBank
 from drivax.simulator.catalogue import TRAFFIC, make_traffic
 from drivax.simulator.traffic import LogTraffic
 from drivax.simulator.types import Traffic
+from drivax.tracking.zoo import is_policy, zoo
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from drivax.simulator.types import SimState, Situation
 Drive = Callable[[Situation, Any], Any]
 
 #: Who gathers what functions raise, the last one first.
-_listeners: list[dict[int, str]] = []
+_listeners: list[dict[tuple[int, int], str]] = []
 
 
 @record
@@ -92,8 +92,8 @@ def python_planner(function: Drive) -> FunctionPlanner:
 
 
 @contextmanager
-def raised() -> Iterator[dict[int, str]]:
-    """Gathers what Python functions raise while they drive: the first error of each scenario, by its identity.
+def raised() -> Iterator[dict[tuple[int, int], str]]:
+    """Gathers what Python functions raise while they drive, by the scenario's identity and the step of the log.
 
     Where nobody gathers them, errors end the program that drives.
     """
@@ -106,7 +106,7 @@ def raised() -> Iterator[dict[int, str]]:
 
 def _answers(function: Drive, who: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
     """The function's action for each scenario of a batch of any shape."""
-    actions = np.full((*who.shape, *size), np.nan, np.float32)
+    actions, steps = np.full((*who.shape, *size), np.nan, np.float32), seen[0].scene.step
     for at in np.ndindex(who.shape):
         try:
             action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
@@ -116,7 +116,7 @@ def _answers(function: Drive, who: Any, seen: tuple[Any, ...], size: tuple[int, 
         except Exception as error:
             if not _listeners:
                 raise
-            _listeners[-1].setdefault(int(who[at]), _told(error))
+            _listeners[-1][int(who[at]), int(steps[at])] = _told(error)
     return actions
 
 

@@ -14,7 +14,8 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -24,9 +25,11 @@ from typing import Any, TypeVar
 from drivax import settings
 from drivax.errors import DataError, UsageError
 from drivax.scenario.store import ScenarioSet
+from drivax.tracking.zoo import is_policy, policy_folder
 
 CONFIG_FILE = "config.yaml"
 RUN_FILE = "run.json"
+_TRAININGS = ("training", "seeds")
 _PACKAGES = ("drivax", "jax", "jaxlib", "flax", "optax", "numpy")
 
 Record = TypeVar("Record")
@@ -66,21 +69,11 @@ class RunFolder:
             UsageError: ``path`` exists.
         """
         path = Path(path)
-        refuse_existing(path, overwrite)
+        refuse_existing(path, overwrite, notes.get("kind"))
         info = describe_run(data) | notes
-        partial = path.parent / f".{path.name}.partial-{os.getpid()}"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        try:
+        with replacing(path) as partial:
             write_text(partial / CONFIG_FILE, settings.dump(config))
             write_text(partial / RUN_FILE, json.dumps(info, indent=1) + "\n")
-            old = path.parent / f".{path.name}.old-{os.getpid()}"
-            if path.exists():
-                path.rename(old)
-            partial.rename(path)
-            shutil.rmtree(old, ignore_errors=True)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
         return cls(path, info)
 
     @classmethod
@@ -130,21 +123,27 @@ class RunFolder:
 def seed_folders(path: str | Path) -> list[Path]:
     """The run folders that a path stands for: those that ``drivax train --seeds`` wrote inside it, or itself."""
     path = Path(path)
-    try:
-        info = json.loads((path / RUN_FILE).read_bytes())
-    except (OSError, ValueError):
-        return [path]  # whoever opens it tells what is wrong
-    if not isinstance(info, dict) or info.get("kind") != "seeds":
+    if _kind(path) != "seeds":
         return [path]
     found = path.glob("seed-*/" + RUN_FILE)
     return sorted((file.parent for file in found), key=lambda folder: int(folder.name.removeprefix("seed-")))
 
 
+def _kind(path: Path) -> str | None:
+    """The kind of the run in a folder; None where none can be read: whoever opens it tells what is wrong."""
+    try:
+        info = json.loads((path / RUN_FILE).read_bytes())
+    except (OSError, ValueError):
+        return None
+    return info.get("kind") if isinstance(info, dict) else None
+
+
 def training_data(planner: str) -> list[dict[str, Any]]:
-    """The data sets of the training run that a planner is (``RUN`` or ``RUN@STEP``); none of any other planner."""
-    path = Path(planner.partition("@")[0])
+    """The data sets that a trained policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``) learned from; none of any other."""
+    folder = planner.partition("@")[0]
+    path = policy_folder(folder) if is_policy(folder) else Path(folder)
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
-    return list(info.get("data", ())) if info.get("kind") == "training" else []
+    return list(info.get("data", ())) if info.get("kind") in ("training", "policy") else []
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
@@ -210,16 +209,40 @@ def write_text(file: Path, text: str) -> None:
     partial.replace(file)
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A new folder that takes the place of ``path`` when all is written; an error changes nothing there."""
+    partial, old = (path.parent / f".{path.name}.{what}-{os.getpid()}" for what in ("partial", "old"))
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if path.exists():
+            path.rename(old)
+        partial.rename(path)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def refuse_existing(path: Path, overwrite: bool, kind: str | None = None) -> None:
     """Refuses a folder that a run may not be written to, before any work is done.
 
+    Args:
+        path: The folder.
+        overwrite: Whether a run may be replaced.
+        kind: What is to be written; a training is replaced by nothing but a training, and replaces nothing else.
+
     Raises:
-        UsageError: It exists and is no run folder, or ``overwrite`` is not given.
+        UsageError: It exists and is no run folder, or one of another kind, or ``overwrite`` is not given.
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not (path / RUN_FILE).is_file():
         raise UsageError("exists and is no run folder", file=path, cure="choose another name")
+    there = _kind(path)
+    if kind is not None and there is not None and (there in _TRAININGS) != (kind in _TRAININGS):
+        raise UsageError(f"holds a run of kind {there}, not {kind}", file=path, cure="choose another name")
     if not overwrite:
         raise UsageError(
             "exists already", file=path, cure="choose another name, --resume it or pass --overwrite"
