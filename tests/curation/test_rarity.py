@@ -33,16 +33,20 @@ def test_density_is_that_of_every_pair():
     actions, at = RNG.uniform(-0.5, 0.5, (400, 2)), RNG.uniform(-0.5, 0.5, (60, 2))
     apart = ((at[:, None] - actions) ** 2).sum(axis=2)
     wanted = np.exp(-0.5 * apart / 0.05**2).mean(axis=1) / (2 * np.pi * 0.05**2)
-    np.testing.assert_allclose(KernelRarity(bandwidth=0.05, cells=1024).density(actions, at), wanted, rtol=0.02)
+    np.testing.assert_allclose(
+        KernelRarity(bandwidth=0.05, cells=1024).density(actions, at), wanted, rtol=0.02
+    )
 
 
 @pytest.mark.parametrize("temper", [1.0, 0.5, 0.0])
 def test_inverse_frequency_tempered_and_clipped(temper):
     """Two places far apart, one with nine tenths of the actions: the other's are nine times rarer."""
     actions = np.repeat([[0.25, 0.25], [-0.5, 0.5]], (900, 100), axis=0)
-    scores = KernelRarity(temper=temper, most=5.0).scores(actions)
+    scores = KernelRarity(temper=temper, most=5.0).scores(actions, actions)
     np.testing.assert_allclose(scores[:900], 1 / 5)
     np.testing.assert_allclose(scores[900:], min(9**temper, 5.0) / 5, rtol=1e-6)
+    unseen = KernelRarity(temper=temper, most=5.0).scores(actions, np.array([[0.9, -0.9], [0.25, 0.25]]))
+    np.testing.assert_allclose(unseen, [1.0 if temper else 0.2, 0.2])
 
 
 def test_published_histogram():
@@ -62,7 +66,7 @@ def test_published_histogram():
         cells.append((i, j))
     weight = 1 / (counts + 1)
     wanted = [weight[cell] / weight.mean() / 3 for cell in cells]
-    scores = config.scores(actions)
+    scores = config.scores(actions, actions)
     np.testing.assert_allclose(scores, wanted)
     assert scores.max() < 1.764 / 3  # the cap of 3 never binds
 

@@ -92,7 +92,7 @@ def curate(name: str, wanted: Wanted) -> ScoreTable:
 def _heuristic(name: str, config: Any, combination: Combination) -> Callable[[Wanted], ScoreTable]:
     def score(wanted: Wanted) -> ScoreTable:
         components = score_steps(wanted.data, config, wanted.progress)
-        return _table(name, asdict(config), wanted.data, components, combination)
+        return table_of(name, asdict(config), wanted.data, components, combination)
 
     return score
 
@@ -102,18 +102,18 @@ def _rarity(name: str, config: KernelRarity | PublishedRarity) -> Callable[[Want
         expert = ExpertActions()
         found = score_steps(wanted.data, expert, wanted.progress)
         components = {"rarity": rarity_steps(config, found["action"], found["known"])}
-        return _table(name, {**asdict(config), **asdict(expert)}, wanted.data, components, RARITY)
+        return table_of(name, {**asdict(config), **asdict(expert)}, wanted.data, components, RARITY)
 
     return score
 
 
 def _uniform(wanted: Wanted) -> ScoreTable:
-    return _table("uniform", {}, wanted.data, {"all": np.ones(_shape(wanted.data))}, _ALL)
+    return table_of("uniform", {}, wanted.data, {"all": np.ones(_shape(wanted.data))}, _ALL)
 
 
 def _oracle(wanted: Wanted) -> ScoreTable:
     components = {"all": event_steps(wanted.data).astype(np.float64)}
-    return _table("oracle", {}, wanted.data, components, _ALL)
+    return table_of("oracle", {}, wanted.data, components, _ALL)
 
 
 def _random_matched(wanted: Wanted) -> ScoreTable:
@@ -125,13 +125,22 @@ def _shape(data: ScenarioSet) -> tuple[int, int]:
     return len(data), data.capacity.steps
 
 
-def _table(
+def table_of(
     name: str,
     config: Mapping[str, Any],
     data: ScenarioSet,
     components: Mapping[str, np.ndarray[Any, Any]],
     combination: Combination,
 ) -> ScoreTable:
+    """The table of a set, from what a method says of every step.
+
+    Args:
+        name: Of the method.
+        config: Its configuration, as plain values.
+        data: The set.
+        components: By name, of every step and in [0, 1].
+        combination: How they become scores.
+    """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
     blank = np.zeros(valid.shape)

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from drivax.curation.kinematic import check_positive
@@ -24,6 +24,8 @@ from drivax.tasks.actions import Physical
 
 Actions = Float[np.ndarray[Any, Any], "n 2"]
 Values = Float[np.ndarray[Any, Any], " n"]
+Others = Float[np.ndarray[Any, Any], "m 2"]
+OtherValues = Float[np.ndarray[Any, Any], " m"]
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,7 @@ class KernelRarity:
         if not 1.0 <= self.most < float("inf"):
             raise UsageError(f"most is {self.most}", cure="use 1 or more")
 
-    def density(
-        self, actions: Actions, at: Float[np.ndarray[Any, Any], "m 2"]
-    ) -> Float[np.ndarray[Any, Any], " m"]:
+    def density(self, actions: Actions, at: Others) -> OtherValues:
         """Density of actions, per unit of area of the action space, at others; both in [-1, 1]."""
         edges = np.linspace(-1.0, 1.0, self.cells + 1)
         counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0]
@@ -84,11 +84,11 @@ class KernelRarity:
         place = (np.asarray(at, np.float64).T + 1.0) / cell - 0.5
         return map_coordinates(smooth, place, order=1, mode="nearest") / (len(actions) * cell * cell)
 
-    def scores(self, actions: Actions) -> Values:
-        """Scores of all actions of a set, in [0, 1]."""
-        density = self.density(actions, actions)
-        rarity = (np.median(density) / density) ** self.temper
-        return np.minimum(rarity, self.most) / self.most
+    def scores(self, actions: Actions, at: Others) -> OtherValues:
+        """Scores of actions ``at``, in [0, 1], by the density of ``actions``."""
+        usual = np.median(self.density(actions, actions))
+        density = np.maximum(self.density(actions, at), np.finfo(np.float64).tiny)
+        return np.minimum((usual / density) ** self.temper, self.most) / self.most
 
 
 @dataclass(frozen=True)
@@ -113,18 +113,21 @@ class PublishedRarity:
         curvature = [np.linspace(-1, -0.2, 25), np.linspace(-0.2, 0.2, 40), np.linspace(0.2, 1, 25)]
         return np.concatenate(acceleration), np.concatenate(curvature)
 
-    def scores(self, actions: Actions) -> Values:
-        """Scores of all actions of a set, in [0, 1]."""
+    def scores(self, actions: Actions, at: Others) -> OtherValues:
+        """Scores of actions ``at``, in [0, 1], by how often ``actions`` are in their cells."""
+        cells = 89 * 89
+        weight = 1.0 / (np.bincount(self._cell(actions), minlength=cells) + 1.0)
+        return np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
+
+    def _cell(self, actions: Others) -> Int[np.ndarray[Any, Any], " m"]:
         scale = np.where(actions[:, 0] < 0, self.space.braking_mps2, self.space.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * self.space.steering)
         # An action on the edge of two bins belongs to the upper one, when it is counted and when it is looked up.
-        bins = [
-            np.searchsorted(edges, v, side="right") - 1 for edges, v in zip(self.edges, values, strict=True)
-        ]
-        shape = tuple(len(edges) - 1 for edges in self.edges)
-        cell = np.ravel_multi_index(tuple(bins), shape)
-        weight = 1.0 / (np.bincount(cell, minlength=shape[0] * shape[1]) + 1.0)
-        return np.minimum((weight / weight.mean())[cell], self.most) / self.most
+        row, column = (
+            np.searchsorted(edges, value, side="right") - 1
+            for edges, value in zip(self.edges, values, strict=True)
+        )
+        return row * 89 + column
 
 
 def rarity_steps(
@@ -139,6 +142,7 @@ def rarity_steps(
     """
     if not known.any():
         raise DataError("no log has two steps on end, so that no action is known", cure="check the set")
+    own = np.asarray(actions[known], np.float64)
     steps = np.zeros(known.shape)
-    steps[known] = config.scores(np.asarray(actions[known], np.float64))
+    steps[known] = config.scores(own, own)
     return steps
