@@ -1,11 +1,13 @@
 """Every method by name, on a small set of the built-in world and on one that it did not make."""
 
 from dataclasses import replace
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 from drivax.cli import main
+from drivax.cli.curate import Curate
 from drivax.curation.controls import event_kinds, event_steps
 from drivax.curation.methods import METHODS, Wanted, curate
 from drivax.curation.scores import read_scores, write_scores
@@ -53,6 +55,11 @@ def test_every_method_scores_every_step_and_comes_back(data, tables, tmp_path):
         np.testing.assert_allclose(read_scores(tmp_path / f"{name}.npz", data).steps, table.steps, atol=1e-6)
 
 
+def test_the_command_offers_every_method():
+    hints = get_type_hints(Curate, include_extras=True)
+    assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)
+
+
 def test_what_they_prefer(data, tables):
     assert tables["kinematic"].scenarios.argmax() == 1
     assert sorted(tables["published"].components) == [
@@ -72,7 +79,7 @@ def test_the_oracle_knows_the_labels(data, tables):
     assert tables["oracle"].steps.sum() == 23
 
 
-def test_only_the_built_in_world_has_an_oracle(tmp_path, capsys):
+def test_only_the_built_in_world_has_an_oracle(tmp_path):
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         writer.add(assemble(straight_road([car()]), SMALL))
     with pytest.raises(

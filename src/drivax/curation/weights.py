@@ -79,6 +79,10 @@ def weights_of(table: ScoreTable, config: WeightConfig, scale: Scale) -> Float[A
         weights[drawn] = _weighted(table.steps[drawn], config)
     else:
         weights = np.where(drawn, _weighted(table.scenarios, config)[:, None], 0.0)
+    if not weights.any():
+        raise UsageError(
+            "every score is 0, so that nothing has a weight", cure="give floor, or normalise: quantile"
+        )
     return weights / weights[drawn].mean()
 
 
@@ -90,9 +94,7 @@ def _weighted(scores: Float[Array, " n"], config: WeightConfig) -> Float[Array, 
     with np.errstate(divide="ignore"):
         power = np.log(score + config.floor) / config.temperature
     if not np.isfinite(power.max()):
-        raise UsageError(
-            "every score is 0, so that nothing has a weight", cure="give floor, or normalise: quantile"
-        )
+        return np.zeros(len(score))
     weight = np.exp(power - power.max())
     weight = np.minimum(weight / weight.mean(), config.most)
     return (1.0 - config.uniform) * weight / weight.mean() + config.uniform
