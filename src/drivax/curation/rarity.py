@@ -87,8 +87,11 @@ class KernelRarity:
     def scores(self, actions: Actions, at: Others) -> OtherValues:
         """Scores of actions ``at``, in [0, 1], by the density of ``actions``."""
         usual = np.median(self.density(actions, actions))
-        density = np.maximum(self.density(actions, at), np.finfo(np.float64).tiny)
-        return np.minimum((usual / density) ** self.temper, self.most) / self.most
+        with np.errstate(
+            divide="ignore", over="ignore"
+        ):  # where nobody ever was, rarity is infinite, and clipped
+            rarity = (usual / self.density(actions, at)) ** self.temper
+        return np.minimum(rarity, self.most) / self.most
 
 
 @dataclass(frozen=True)

@@ -42,11 +42,13 @@ def score_steps(data: ScenarioSet, of: Any, progress: Progress | None = None) ->
         count = len(scenarios)
         if len(data) > BATCH:
             scenarios += [scenarios[-1]] * (BATCH - count)
-        bank = ScenarioBank.from_scenarios(scenarios, trim=sizes)
-        parts.append(jax.tree.map(lambda part, count=count: np.asarray(part)[:count], of_logs(of, bank)))
+        found = of_logs(of, ScenarioBank.from_scenarios(scenarios, trim=sizes))
+        # A batch is scored while the next one is stacked; no more than one waits.
+        jax.block_until_ready(parts[-1:])
+        parts.append({name: part[:count] for name, part in found.items()})
         if progress is not None:
             progress(first + count, len(data))
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return {name: np.concatenate([np.asarray(part[name]) for part in parts]) for name in parts[0]}
 
 
 def valid_steps(data: ScenarioSet) -> Bool[Array, "N T"]:
