@@ -159,10 +159,7 @@ def speed(path: Path, count: int) -> dict[str, Any]:
     data = ScenarioSet.open(path)[:count]
     sizes = Sizes.used(data)
     result: dict[str, Any] = {"scenarios": count}
-    began = time.process_time()
-    for first in range(0, count, BATCH):
-        ScenarioBank.from_scenarios(data[first : first + BATCH], trim=sizes)
-    result["stacking_s"] = time.process_time() - began
+    result["stacking_s"] = min(stacking(data, sizes) for _ in range(2))  # the first one reads from the disk
     for name, of in {
         "kinematic": KinematicConfig(), "published": PublishedConfig(), "action_rarity": ExpertActions()
     }.items():  # fmt: skip
@@ -171,6 +168,14 @@ def speed(path: Path, count: int) -> dict[str, Any]:
         score_steps(data, of)
         result[name] = {"cpu_s": time.process_time() - began, "wall_s": time.perf_counter() - wall}
     return result
+
+
+def stacking(data: list[Any], sizes: Sizes) -> float:
+    """Processor seconds to stack scenarios as scoring does, batch after batch."""
+    began = time.process_time()
+    for first in range(0, len(data), BATCH):
+        ScenarioBank.from_scenarios(data[first : first + BATCH], trim=sizes)
+    return time.process_time() - began
 
 
 def events_table(stored: dict[str, Any]) -> str:

@@ -86,7 +86,10 @@ def curate(name: str, wanted: Wanted) -> ScoreTable:
             "random_matched needs --like, a table of the same set, and no other method takes it",
             cure="drivax curate random_matched --like SCORES ...",
         )
-    return METHODS[name].score(wanted)
+    table = METHODS[name].score(wanted)
+    if wanted.progress is not None:
+        wanted.progress(len(wanted.data), len(wanted.data))
+    return table
 
 
 def _heuristic(name: str, config: Any, combination: Combination) -> Callable[[Wanted], ScoreTable]:
