@@ -59,17 +59,8 @@ class Wanted:
     progress: Progress | None = None
 
 
-@dataclass(frozen=True)
-class Method:
-    """A method.
-
-    Attributes:
-        meaning: One line for people.
-        score: What it does.
-    """
-
-    meaning: str
-    score: Callable[[Wanted], ScoreTable]
+#: A method: from what is asked to the table.
+Method = Callable[[Wanted], ScoreTable]
 
 
 def curate(name: str, wanted: Wanted) -> ScoreTable:
@@ -86,13 +77,13 @@ def curate(name: str, wanted: Wanted) -> ScoreTable:
             "random_matched needs --like, a table of the same set, and no other method takes it",
             cure="drivax curate random_matched --like SCORES ...",
         )
-    table = METHODS[name].score(wanted)
+    table = METHODS[name](wanted)
     if wanted.progress is not None:
         wanted.progress(len(wanted.data), len(wanted.data))
     return table
 
 
-def _heuristic(name: str, config: Any, combination: Combination) -> Callable[[Wanted], ScoreTable]:
+def _heuristic(name: str, config: Any, combination: Combination) -> Method:
     def score(wanted: Wanted) -> ScoreTable:
         components = score_steps(wanted.data, config, wanted.progress)
         return table_of(name, asdict(config), wanted.data, components, combination)
@@ -100,7 +91,7 @@ def _heuristic(name: str, config: Any, combination: Combination) -> Callable[[Wa
     return score
 
 
-def _rarity(name: str, config: KernelRarity | PublishedRarity) -> Callable[[Wanted], ScoreTable]:
+def _rarity(name: str, config: KernelRarity | PublishedRarity) -> Method:
     def score(wanted: Wanted) -> ScoreTable:
         expert = ExpertActions()
         found = score_steps(wanted.data, expert, wanted.progress)
@@ -154,22 +145,12 @@ def table_of(
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
-        "kinematic": Method(
-            "how soon and how hard the recorded driver had to act",
-            _heuristic("kinematic", KinematicConfig(), KINEMATIC),
-        ),
-        "published": Method(
-            "the published heuristic, faults included, to compare with",
-            _heuristic("published", PublishedConfig(), PUBLISHED),
-        ),
-        "action_rarity": Method(
-            "how seldom the recorded driver does what it does", _rarity("action_rarity", KernelRarity())
-        ),
-        "action_rarity_published": Method(
-            "the same by the published histogram", _rarity("action_rarity_published", PublishedRarity())
-        ),
-        "uniform": Method("all alike", _uniform),
-        "random_matched": Method("the scores of another table, dealt out by lot", _random_matched),
-        "oracle": Method("the labelled rare events of the built-in world", _oracle),
+        "kinematic": _heuristic("kinematic", KinematicConfig(), KINEMATIC),
+        "published": _heuristic("published", PublishedConfig(), PUBLISHED),
+        "action_rarity": _rarity("action_rarity", KernelRarity()),
+        "action_rarity_published": _rarity("action_rarity_published", PublishedRarity()),
+        "uniform": _uniform,
+        "random_matched": _random_matched,
+        "oracle": _oracle,
     }
 )
