@@ -114,6 +114,12 @@ def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
         benchmark.judged()
 
 
+def test_the_page_of_curation_shows_what_was_found(script, stored):
+    curation = script("curation")
+    shown = curation.filled(curation.PAGE.read_text(), stored("curation")) == curation.PAGE.read_text()
+    assert shown, "run python benchmarks/curation.py table, and read what the page says about it"
+
+
 def of(mean, half=0.01):
     return {"mean": mean, "low": mean - half, "high": mean + half, "n": 9, "by_seed": [mean, mean]}
 

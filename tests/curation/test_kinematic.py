@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.curation import kinematic
-from drivax.curation.kinematic import KinematicConfig, kinematic_steps, score_kinematic
+from drivax.curation import scoring
+from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.logged import of_logs
+from drivax.curation.methods import KINEMATIC
+from drivax.curation.scoring import score_steps
 from drivax.errors import UsageError
 from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import AgentKind, Capacity
@@ -15,6 +18,26 @@ from scenes import bank_of, car, moved, straight_road
 
 NOW = 10  # where `car` puts everyone at (x, y)
 CONFIG = KinematicConfig()
+
+TIME = (np.arange(91) - NOW) * 0.1
+NOISE = np.random.default_rng(0).standard_normal(91)
+
+
+def with_speeds(speeds):
+    """A car straight ahead at given speeds."""
+    along = np.concatenate([[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * 0.1)])
+    track = car()
+    return track | {
+        "xy": np.stack([along - along[NOW], np.zeros(91)], -1),
+        "velocity": np.stack([speeds, np.zeros(91)], -1),
+    }
+
+
+def turning(heading):
+    """A car at 5 m/s with given headings; where it gets to does not matter."""
+    track = car(speed=5.0)
+    return track | {"heading": heading, "velocity": 5.0 * np.stack([np.cos(heading), np.sin(heading)], -1)}
+
 
 SCENES = {
     "free": [car(speed=15.0)],
@@ -30,15 +53,36 @@ SCENES = {
     "far": [car(speed=15.0), car(x=60.0)],
     "standing": [car(), car(x=10.0)],
     "brief": [car(speed=15.0, steps=range(12)), car(x=60.0)],
+    "noise": [with_speeds(10.0 + 0.01 * NOISE)],
+    "jerk": [with_speeds(10.0 + 4.13 / 2 * TIME**2)],
+    "bend": [turning(0.3 * TIME**2)],
+    "aside": [car(y=0.5, speed=10.0)],
+    "kerb": [car(y=-0.5, speed=10.0)],
+    "verge": [car(y=-1.2, speed=10.0)],
+    "off the map": [car(y=-30.0, speed=10.0)],
+    "crowd": [car(speed=10.0), *(car(x=-60.0 - 8.0 * i, y=3.7) for i in range(7))],
+    "appears inside": [car(speed=10.0), car(x=1.0, speed=10.0)],
     **{f"gap {gap}": [car(speed=9.0), car(x=4.8 + gap)] for gap in (15.0, 20.0, 30.0, 40.0)},
     **{f"speed {speed}": [car(speed=speed), car(x=24.8)] for speed in (5.0, 8.0, 11.0, 14.0)},
 }
 
 
 @pytest.fixture(scope="module")
-def steps():
+def components():
+    """By scene and name."""
     bank = bank_of(*(straight_road(cars) for cars in SCENES.values()))
-    return dict(zip(SCENES, np.asarray(kinematic_steps(CONFIG, bank)), strict=True))
+    found = {name: np.asarray(part) for name, part in of_logs(CONFIG, bank).items()}
+    return {scene: {name: part[row] for name, part in found.items()} for row, scene in enumerate(SCENES)}
+
+
+def conflict(found):
+    return (found["urgency"] + found["braking"]) / 2
+
+
+@pytest.fixture(scope="module")
+def steps(components):
+    """Conflict: the mean of urgency and braking."""
+    return {scene: conflict(found) for scene, found in components.items()}
 
 
 def expected(ttc_s, braking_mps2, config=CONFIG):
@@ -84,34 +128,93 @@ def test_nearer_and_faster_is_more_critical(steps):
     assert min(near) > 0 and max(fast) < 1
 
 
-def test_invariant_to_shifting_and_turning_the_world(steps):
-    names = ("leader", "pedestrian", "far", "beside")
+def test_invariant_to_shifting_and_turning_the_world(components):
+    names = ("leader", "pedestrian", "far", "beside", "kerb")
     turned = bank_of(*(moved(straight_road(SCENES[name]), 2.1, 300.0, -70.0) for name in names))
-    for name, score in zip(names, np.asarray(kinematic_steps(CONFIG, turned)), strict=True):
-        np.testing.assert_allclose(score, steps[name], atol=5e-3, err_msg=name)
+    for name, part in of_logs(CONFIG, turned).items():
+        for row, scene in enumerate(names):
+            np.testing.assert_allclose(
+                part[row], components[scene][name], atol=5e-3, err_msg=f"{scene} {name}"
+            )
 
 
-def test_steps_where_ego_is_not_there_score_nothing(steps):
+def test_where_ego_is_not_its_last_motion_stands(steps):
     np.testing.assert_allclose(steps["brief"][:12], steps["far"][:12], atol=1e-4)
-    assert (steps["brief"][:12] > 0).all() and (steps["brief"][12:] == 0).all()
+    assert (steps["brief"][:12] > 0).all()
 
 
-def test_a_set_larger_than_a_batch_scores_the_same(tmp_path, steps, monkeypatch):
-    """Padded and batched, against the trimmed bank of all."""
-    monkeypatch.setattr(kinematic, "BATCH", 4)
+def test_noise_of_a_centimetre_per_second_is_nearly_nothing(components):
+    """Two least-squares windows of 1.5 s: the published heuristic scores the same noise 0.6."""
+    assert components["noise"]["volatility"].max() < 0.02
+
+
+def test_jerk_and_yaw_acceleration(components):
+    """Constant ones, which the fitted polynomials give exactly: half of twice nuPlan's limit, and 0.6 rad/s2."""
+    np.testing.assert_allclose(components["jerk"]["volatility"], 0.5, atol=2e-3)
+    np.testing.assert_allclose(components["bend"]["volatility"], 0.6 / (2 * 1.93), atol=2e-3)
+
+
+def test_volatility_is_that_of_the_action_that_begins_now():
+    """Speed jumps between steps 50 and 51, which is the action of step 50: the window is centred there."""
+    speeds = np.where(np.arange(91) <= 50, 10.0, 10.2)
+    bank = bank_of(straight_road([with_speeds(speeds)]))
+    found = np.asarray(of_logs(CONFIG, bank)["volatility"][0])
+    # The slope of a line through 15 values of which one is 2 m/s2, k steps from the middle: 2 k / 280 per step.
+    wanted = [2.0 * abs(k) / 280 / 0.1 / (2 * 4.13) if abs(k) <= 7 else 0.0 for k in range(-10, 11)]
+    np.testing.assert_allclose(found[40:61], wanted, atol=1e-3)
+
+
+def test_distances_are_to_segments(components):
+    """The kerb is at y = -1.85, the lanes' centres at y = 0 and 3.7; the car is 2 m wide."""
+    assert components["aside"]["lane_deviation"][NOW] == pytest.approx(0.5 / 1.25, abs=1e-3)
+    assert components["aside"]["off_road"].max() == 0.0
+    assert components["kerb"]["off_road"][NOW] == pytest.approx(1 - 0.35 / 0.75, abs=1e-3)
+    assert components["verge"]["off_road"][NOW] == 1.0
+    nowhere = components["off the map"]
+    assert nowhere["off_road"].max() == 0.0 and nowhere["lane_deviation"].max() == 0.0
+
+
+def test_density_counts_everyone(components):
+    np.testing.assert_allclose(components["crowd"]["density"], 8 / 50)
+
+
+def test_who_overlaps_when_it_appears_counts_for_nothing(steps):
+    assert steps["appears inside"].max() == 0.0
+
+
+def test_the_default_weights_rank_the_stopped_car_above_the_oncoming_one(components):
+    """The published heuristic ranks them the other way round."""
+    valid = np.ones((2, 91), bool)
+    both = {
+        name: np.stack([components[scene][name] for scene in ("stopped", "oncoming")])
+        for name in components["stopped"]
+    }
+    scored, scenarios = KINEMATIC.combine(both, valid)
+    assert sum(KINEMATIC.weights.values()) == pytest.approx(1.0)
+    assert scored[0, NOW] > 0.5 and scored[1].max() < 0.01 and scenarios[0] > 2 * scenarios[1]
+
+
+def test_a_set_larger_than_a_batch_scores_the_same(tmp_path, components, monkeypatch):
+    """Batched, against the bank of all."""
+    monkeypatch.setattr(scoring, "BATCH", 4)
     names = list(SCENES)[:6]
     with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
         for name in names:
             writer.add(assemble(replace(straight_road(SCENES[name]), scenario_id=name)))
     done = []
-    scores = score_kinematic(ScenarioSet.open(tmp_path / "set"), CONFIG, lambda *at: done.append(at))
+    scores = score_steps(ScenarioSet.open(tmp_path / "set"), CONFIG, lambda *at: done.append(at))
     assert done == [(4, 6), (6, 6)]
-    np.testing.assert_allclose(scores, np.stack([steps[name] for name in names]), atol=1e-5)
+    for name, part in scores.items():
+        np.testing.assert_allclose(part, np.stack([components[s][name] for s in names]), atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"urgent_s": 0.0}, {"urgent_s": 5.0}, {"full_braking_mps2": 0.0}, {"urgent_s": float("nan")}]
-)
+    "wrong",
+    [
+        {"urgent_s": 0.0}, {"urgent_s": 5.0}, {"full_braking_mps2": 0.0}, {"urgent_s": float("nan")},
+        {"edge_m": -1.0}, {"crowd": 0},
+    ],
+)  # fmt: skip
 def test_scales_are_checked(wrong):
     with pytest.raises(UsageError, match=next(iter(wrong))):
         KinematicConfig(**wrong)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
+from drivax.curation import scores
+from drivax.curation.combining import Combination
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.errors import DataError, UsageError
 from drivax.scenario.assemble import assemble
@@ -25,28 +27,65 @@ def write_set(path, speeds):
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    return write_set(tmp_path_factory.mktemp("scores") / "set", (6.0, 12.0))
+    return write_set(tmp_path_factory.mktemp("scores") / "set", (2.0, 12.0))
+
+
+PARTS = Combination({"urgency": 0.5, "braking": 0.5})
 
 
 @pytest.fixture
 def table(data):
-    steps = np.linspace(0, 1, 2 * 91, dtype=np.float32).reshape(2, 91)
-    return ScoreTable("kinematic", {"urgent_s": 0.95}, data.hash, ("drive-0", "drive-1"), steps)
+    rng = np.random.default_rng(0)
+    parts = {name: rng.random((2, 91)).astype(np.float32) for name in ("urgency", "braking")}
+    valid = np.ones((2, 91), bool)
+    valid[1, 80:] = False
+    blank = np.zeros((2, 91))
+    return ScoreTable(
+        "kinematic", {"urgent_s": 0.95}, data.hash, ("drive-0", "drive-1"), valid, blank, blank[:, 0], parts
+    ).combined(PARTS)
 
 
 def test_what_is_written_comes_back(data, table, tmp_path):
     out = tmp_path / "deep" / "scores"
     write_scores(table, out)
     found = read_scores(out, data)
+    config = {
+        "urgent_s": 0.95,
+        "combination": {"weights": {"urgency": 0.5, "braking": 0.5}, "scenario": "max"},
+    }
     assert (found.method, dict(found.config), found.set_hash, found.scenario_ids) == (
-        "kinematic", {"urgent_s": 0.95}, data.hash, ("drive-0", "drive-1"),
+        "kinematic", config, data.hash, ("drive-0", "drive-1"),
     )  # fmt: skip
-    np.testing.assert_array_equal(found.steps, table.steps)
-    np.testing.assert_array_equal(found.scenarios, table.steps[:, -1])
+    np.testing.assert_array_equal(found.valid, table.valid)
+    np.testing.assert_allclose(found.steps, table.steps, rtol=1e-6)
+    np.testing.assert_allclose(found.scenarios, table.steps.max(axis=1), rtol=1e-6)
+    assert sorted(found.components) == ["braking", "urgency"]
+    for name, part in table.components.items():
+        np.testing.assert_array_equal(found.components[name], part)
     with np.load(out) as stored:
         assert json.loads(str(stored["header"]))["method"] == "kinematic"
-        np.testing.assert_array_equal(stored["scenario_score"], table.steps.max(axis=1))
+        np.testing.assert_allclose(stored["scenario_score"], table.steps.max(axis=1), rtol=1e-6)
     assert [path.name for path in out.parent.iterdir()] == ["scores"]
+
+
+def test_other_weights_need_no_scoring(data, table, tmp_path):
+    write_scores(table, tmp_path / "scores.npz")
+    found = read_scores(tmp_path / "scores.npz", data)
+    again = found.combined(Combination({"braking": 0.25}, "mean"))
+    wanted = np.where(found.valid, 0.25 * found.components["braking"], 0.0)
+    np.testing.assert_allclose(again.steps, wanted, rtol=1e-6)
+    np.testing.assert_allclose(again.scenarios, [wanted[0].mean(), wanted[1, :80].mean()], rtol=1e-6)
+    assert again.config["combination"] == {"weights": {"braking": 0.25}, "scenario": "mean"}
+    with pytest.raises(UsageError, match="there is no component 'brakes'; did you mean 'braking'"):
+        found.combined(Combination({"brakes": 1.0}))
+
+
+def test_a_table_of_an_older_drivax(data, table, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(scores, "SCORES_VERSION", 1)
+        write_scores(table, tmp_path / "old.npz")
+    with pytest.raises(DataError, match="version 1, this drivax reads 2; run `drivax curate` again"):
+        read_scores(tmp_path / "old.npz", data)
 
 
 def test_a_missing_table(data, tmp_path):
@@ -80,21 +119,30 @@ def test_damaged_tables(data, table, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("name", "wrong"),
     [
-        ({"scenario_ids": ("drive-1", "drive-0")}, "does not score every scenario"),
-        ({"steps": np.zeros((2, 90), np.float32)}, "does not score every scenario and step"),
+        ("scenario_id", np.array(["drive-1", "drive-0"])),
+        ("step_score", np.zeros((2, 90), np.float32)),
+        ("valid", np.ones((2, 90), bool)),
+        ("scenario_score", np.zeros(3, np.float32)),
+        ("component_urgency", np.zeros((2, 90), np.float32)),
     ],
 )
-def test_tables_that_do_not_fit(data, table, tmp_path, change, words):
-    write_scores(replace(table, **change), tmp_path / "scores.npz")
-    with pytest.raises(DataError, match=words):
-        read_scores(tmp_path / "scores.npz", data)
+def test_tables_that_do_not_fit(data, table, tmp_path, name, wrong):
+    file = tmp_path / "scores.npz"
+    write_scores(table, file)
+    with np.load(file) as stored:
+        arrays = dict(stored) | {name: wrong}
+    np.savez(file, allow_pickle=False, **arrays)
+    with pytest.raises(DataError, match="does not score every scenario and step of its set"):
+        read_scores(file, data)
 
 
 @pytest.mark.parametrize("value", [np.nan, -0.1, 1.1])
-def test_a_missing_score_is_an_error_and_leaves_no_file(table, tmp_path, value):
-    table.steps[1, 7] = value
+@pytest.mark.parametrize("which", ["steps", "scenarios", "components"])
+def test_a_missing_score_is_an_error_and_leaves_no_file(table, tmp_path, which, value):
+    part = table.components["urgency"] if which == "components" else getattr(table, which)
+    part[1, ...] = value
     with pytest.raises(DataError, match=r"record drive-1: has a score outside \[0, 1\]"):
         write_scores(table, tmp_path / "scores.npz")
     assert not list(tmp_path.iterdir())
@@ -122,12 +170,25 @@ def test_a_failure_leaves_the_old_table(table, tmp_path, monkeypatch):
 
 
 def test_the_command(data, tmp_path, capsys):
-    out = tmp_path / "scores.npz"
-    assert main(["curate", "kinematic", "--data", str(data.path), "--out", str(out)]) == 0
+    out, top = tmp_path / "scores.npz", tmp_path / "top"
+    command = ["curate", "kinematic", "--data", str(data.path)]
+    assert main([*command, "--out", str(out), "--export", str(top), "1"]) == 0
     said = capsys.readouterr().out
     found = read_scores(out, data)
-    assert found.scenarios[1] > 0.9 and "2 scenarios, kinematic criticality" in said
-    assert main(["curate", "kinematic", "--data", str(data.path), "--out", str(out)]) == 2
+    assert found.scenarios[1] > found.scenarios[0] and found.steps[1].max() > 0.5
+    assert "2 scenarios, kinematic" in said and "effective sample" in said and "the 1 most critical" in said
+    assert max(map(len, said.replace(str(tmp_path), "").splitlines())) < 100
+    assert [entry["scenario_id"] for entry in ScenarioSet.open(top).entries] == ["drive-1"]
+    assert main([*command, "--out", str(out)]) == 2
     assert main(["curate", "kinematic", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "x")]) == 1
     assert main(["curate", "guesswork", "--data", str(data.path), "--out", str(tmp_path / "x")]) == 2
+    capsys.readouterr()
+    for out_of_range in ("0", "3"):
+        assert (
+            main([*command, "--out", str(tmp_path / "x"), "--export", str(tmp_path / "y"), out_of_range]) == 2
+        )
+        assert "most critical of 2 scenarios; ask for 1 to 2" in capsys.readouterr().err
+    for taken, words in ((data.path, "is the set that is read"), (top, "exists already")):
+        assert main([*command, "--out", str(tmp_path / "x"), "--export", str(taken), "1"]) == 2
+        assert words in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

@@ -10,13 +10,16 @@ from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.exhaustive import without_grid
 from drivax.scenario.queries import (
     EDGE_CUTOFF_M,
+    LANE_CUTOFF_M,
     around_lanes,
     lane_course,
+    lane_distance,
     left_of_edges,
     light_crossing,
     offroad_distance,
     project_on_route,
     route_ahead,
+    vertex_distances,
 )
 from drivax.synthetic.world import generate_recording
 from scenes import bank_of, car, line, straight_road
@@ -100,6 +103,40 @@ def test_edge_distance_against_float64(scenarios):
             assert is_near == (nearest <= EDGE_CUTOFF_M)
             if is_near:
                 assert abs(value) == pytest.approx(nearest, abs=2e-3)
+
+
+def test_distances_to_lanes_and_to_points_against_float64(scenarios):
+    """Points of a map are put on every segment one by one: every half metre from its beginning, and at its end."""
+    scenario = scenarios[1]
+    bank = ScenarioBank.from_scenarios([scenario])
+    xy, _ = poses(scenario, 150, np.random.default_rng(3))
+    at, row = jnp.asarray(xy, jnp.float32), jnp.asarray(0)
+    lane_m = np.asarray(jax.vmap(lambda p: lane_distance(bank, row, p, jnp.zeros(())))(at))
+    found = np.stack(jax.vmap(lambda p: vertex_distances(bank, row, p, 0.5))(at), axis=1)
+    edges, ends = int(scenario.segment_blocks[1]), int(scenario.segment_blocks[2])
+    a, b = (scenario.record[f"segment_{end}"][:, :2].astype(np.float64) for end in "ab")
+    parts = [slice(0, edges), slice(edges, ends)]
+
+    def points(part):
+        steps = np.arange(0, 4.01, 0.5)[:, None]
+        lines = [(p, q, np.linalg.norm(q - p)) for p, q in zip(a[part], b[part], strict=True)]
+        return np.concatenate(
+            [np.concatenate([p + steps[steps[:, 0] <= m] * (q - p) / m, q[None]]) for p, q, m in lines]
+        )
+
+    for column, cutoff in enumerate((EDGE_CUTOFF_M, LANE_CUTOFF_M)):
+        wanted = np.linalg.norm(xy[:, None] - points(parts[column]), axis=2).min(axis=1)
+        near = wanted < cutoff
+        assert near.sum() > 20
+        np.testing.assert_allclose(found[near, column], wanted[near], atol=2e-3)
+        assert (found[~near, column] >= cutoff - 2e-3).all()
+    begin, along = a[parts[1]], (b - a)[parts[1]]
+    t = np.clip(((xy[:, None] - begin) * along).sum(2) / (along**2).sum(1), 0, 1)
+    wanted = np.linalg.norm(xy[:, None] - begin - t[..., None] * along, axis=2).min(axis=1)
+    sure = np.abs(wanted - LANE_CUTOFF_M) > 1e-3
+    np.testing.assert_allclose(
+        lane_m[sure], np.where(wanted <= LANE_CUTOFF_M, wanted, np.inf)[sure], atol=2e-3
+    )
 
 
 def test_side_of_a_sharp_vertex():

@@ -2,50 +2,100 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from drivax.curation.scores import ScoreTable
 
 
 @dataclass(frozen=True)
 class Curate:
     """Score how critical every scenario and step of a set is.
 
-    kinematic: how soon and how hard the recorded driver had to act (time to collision, required braking).
+    kinematic: how soon and how hard the recorded driver had to act, and how it drove.
 
-    Example: drivax curate kinematic --data sets/world --out scores.npz
+    published: the published heuristic, faults included, to compare with.
+
+    action_rarity: how seldom the recorded driver does what it does (action_rarity_published: by the published bins).
+
+    uniform, random_matched, oracle: all alike; the scores of --like, dealt out by lot; the built-in world's labels.
+
+    Example: drivax curate kinematic --data sets/world --out scores.npz --export sets/critical 500
     """
 
-    method: Annotated[Literal["kinematic"], tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
-    """How to score: kinematic."""
+    method: Annotated[
+        Literal[
+            "kinematic",
+            "published",
+            "action_rarity",
+            "action_rarity_published",
+            "uniform",
+            "random_matched",
+            "oracle",
+        ],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="METHOD"),
+    ]
+    """How to score."""
     data: Path
     """Scenario set."""
     out: Path
     """Table of scores to write."""
+    export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
+    """Write the N most critical scenarios as the scenario set TOP, the most critical first."""
+    like: Path | None = None
+    """Table of the same set whose scores random_matched deals out."""
+    seed: int = 0
+    """What random_matched deals by."""
     overwrite: bool = False
-    """Replace OUT if it is a file."""
+    """Replace OUT if it is a file, and TOP if it is a scenario set."""
 
 
 def run(args: Curate) -> int:
-    """Score, write the table, and say how the scores lie."""
-    import numpy as np
-
-    from drivax.curation.kinematic import KinematicConfig, score_kinematic
-    from drivax.curation.scores import ScoreTable, refuse_existing, write_scores
+    """Score, write the table and the subset, and say how scores and weights lie."""
+    from drivax.curation.methods import Wanted, curate
+    from drivax.curation.scores import refuse_existing, write_scores
+    from drivax.curation.subset import check_top, write_top
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 
     refuse_existing(args.out, args.overwrite)
-    data, config = ScenarioSet.open(args.data), KinematicConfig()
+    data = ScenarioSet.open(args.data)
+    if args.export is not None:
+        check_top(data, *args.export, overwrite=args.overwrite)
     with Progress("scoring", "scenarios", len(data)) as bar:
-        steps = score_kinematic(data, config, lambda done, total: bar.update(done))
-    ids = tuple(entry["scenario_id"] for entry in data.entries)
-    table = ScoreTable(args.method, asdict(config), data.hash, ids, steps)
+        wanted = Wanted(data, args.like, args.seed, lambda done, total: bar.update(done))
+        table = curate(args.method, wanted)
     write_scores(table, args.out, args.overwrite)
+    _tell(table, args.out)
+    if args.export is not None:
+        top, count = args.export
+        with Progress("exporting", "scenarios", count) as bar:
+            write_top(table, data, count, top, args.overwrite, lambda done, total: bar.update(done))
+        print(f"{top}: the {count:,} most critical")
+    return 0
+
+
+def _tell(table: ScoreTable, out: Path) -> None:
+    import numpy as np
+
+    from drivax.curation.weights import WeightConfig, draws_of, weights_of
+
     low, middle, high, most = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
     first = table.scenario_ids[int(table.scenarios.argmax())]
-    print(f"{args.out}: {len(table.scenario_ids):,} scenarios, {args.method} criticality")
-    print(f"  5 % {low:.3f}, median {middle:.3f}, 95 % {high:.3f}, largest {most:.3f} ({first})")
-    return 0
+    print(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
+    print(f"  scores: 5 % {low:.3f}, median {middle:.3f}, 95 % {high:.3f}, largest {most:.3f} ({first})")
+    for scale in ("step", "scenario"):
+        drawn = draws_of(weights_of(table, WeightConfig(), scale), table.drawn)
+        print(
+            f"  weights by {scale}: effective sample {drawn.effective:.0%} of the steps, "
+            f"{drawn.effective_scenarios:.0%} of the scenarios"
+        )
+        print(
+            f"    tilt {drawn.tilt:.2f} (99 % over mean), largest {drawn.largest:.2f}, "
+            f"{drawn.concentration:.0%} of draws from 5 % of the steps"
+        )

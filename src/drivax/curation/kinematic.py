@@ -1,6 +1,6 @@
-"""Criticality from motion alone: how soon, and how hard, a recorded driver had to act.
+"""Criticality from motion: how soon, and how hard, a recorded driver had to act, and how it drove.
 
-At every step of the log, while the expert is replayed in the graph:
+Per step of the log, all in [0, 1]:
 
 - urgency is the inverse of the time to collision (Hayward, 1972; the inverse so that no conflict is 0), scaled from
   0 at the horizon of 5 s to 1 at ``urgent_s``;
@@ -8,91 +8,125 @@ At every step of the log, while the expert is replayed in the graph:
   ``(v - v_leader)^2 / (2 gap)`` (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
   can do (the brake threat number of Braennstroem, Sjoeberg and Coelingh, A Situation and Threat Assessment Algorithm
   for a Rear-End Collision Avoidance System, 2008);
-- criticality is their mean: a conflict counts fully where it is near in time and in the way.
+- volatility is the larger of jerk and yaw acceleration, each as a share of a limit, over a Savitzky-Golay window
+  (Savitzky and Golay, 1964) that is centred at the action of the step;
+- off_road is how near a corner of the car is to the road's edge, or beyond it;
+- lane_deviation is the distance to the nearest lane centre;
+- density is how many agents there are.
 
 Time to collision sees crossing traffic but takes headings as fixed, so that it finds oncoming traffic in bends.
-Required braking follows the way through bends but sees only who is on it. The mean keeps either error below a half.
+Required braking follows the way through bends but sees only who is on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from drivax.curation.logged import LOG_ROUTE, Logged
 from drivax.errors import UsageError
-from drivax.planners.simple import logged_motion
+from drivax.geometry.angles import wrap
+from drivax.geometry.boxes import corners
+from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, filter_operator
 from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import LEVEL_M, project_on_route
-from drivax.scenario.store import ScenarioSet
-from drivax.simulator.contact import TTC_HORIZON_S, Contact
-from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone
-from drivax.simulator.types import Facts, Frame, SimState
-from drivax.tasks.task import Task
+from drivax.scenario.queries import LEVEL_M, lane_distance, left_of_edges, project_on_route
+from drivax.scenario.schema import DT_S
+from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
+from drivax.simulator.types import Frame
 
-#: Scenarios that are scored side by side; more than these are stacked untrimmed, so that one program serves all.
-BATCH = 64
-_LOG_ROUTE = 1
 #: Middles of the two windows of the map query that cover about 75 m of the way ahead, m.
 _WINDOWS_M = (6.0, 45.0)
+#: nuPlan's window of 1.5 s, at its orders: jerk from accelerations, yaw acceleration from headings.
+_WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
 
 @dataclass(frozen=True)
 class KinematicConfig:
-    """Scales of the two terms.
+    """Scales of the components: where each is 1.
 
     Attributes:
         urgent_s: Time to collision at and below which urgency is 1; the bound of the metric ``ttc_ok``.
         full_braking_mps2: Required deceleration at and above which braking is 1; the physical action space's limit.
+        full_jerk_mps3, full_yaw_rps2: Jerk, and yaw acceleration (rad/s2), of volatility 1; twice nuPlan's limits.
+        edge_m: A corner this far inside the road's edge has off_road 0.
+        lane_m: Distance to the lane centre of lane_deviation 1.
+        crowd: Agents, ego included, of density 1.
     """
 
     urgent_s: float = 0.95
     full_braking_mps2: float = 6.0
+    full_jerk_mps3: float = 2 * JERK_MPS3
+    full_yaw_rps2: float = 2 * YAW_ACCELERATION_RPS2
+    edge_m: float = 0.75
+    lane_m: float = 1.25
+    crowd: int = 50
 
     def __post_init__(self) -> None:
         if not 0.0 < self.urgent_s < TTC_HORIZON_S:
             raise UsageError(
                 f"urgent_s is {self.urgent_s}", cure=f"use more than 0 and less than {TTC_HORIZON_S}"
             )
-        if not 0.0 < self.full_braking_mps2 < float("inf"):
-            raise UsageError(f"full_braking_mps2 is {self.full_braking_mps2}", cure="use a positive number")
+        names = ("full_braking_mps2", "full_jerk_mps3", "full_yaw_rps2", "edge_m", "lane_m", "crowd")
+        check_positive({name: getattr(self, name) for name in names})
+
+    def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
+        """The components of every step of a log."""
+        return {
+            "urgency": _urgencies(self, log),
+            "braking": jnp.clip(_required(bank, log) / self.full_braking_mps2, 0.0, 1.0),
+            "volatility": _volatility(self, log),
+            "off_road": _edge_nearness(self, bank, log),
+            "lane_deviation": _deviation(self, bank, log),
+            "density": crowding(log, self.crowd),
+        }
 
 
-def urgency(facts: Facts, config: KinematicConfig) -> Float[Array, ""]:
+def check_positive(values: dict[str, float]) -> None:
+    """Refuses scales that are not positive and finite.
+
+    Raises:
+        UsageError: The first of them.
+    """
+    for name, value in values.items():
+        if not 0.0 < value < float("inf"):
+            raise UsageError(f"{name} is {value}", cure="use a positive number")
+
+
+def urgency(
+    ttc_s: Float[Array, ""], speed_mps: Float[Array, ""], config: KinematicConfig
+) -> Float[Array, ""]:
     """Inverse time to collision between 0 (none within 5 s, or standing) and 1 (``urgent_s`` or less)."""
     least, most = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
-    inverse = 1.0 / jnp.maximum(facts.ttc_s, 1e-3)
-    return jnp.where(facts.ttc_defined, jnp.clip((inverse - least) / (most - least), 0.0, 1.0), 0.0)
+    share = (1.0 / jnp.maximum(ttc_s, 1e-3) - least) / (most - least)
+    return jnp.where(speed_mps >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
 
 
 def required_braking(
-    bank: ScenarioBank, state: SimState, frame: Frame, along_m: Float[Array, ""]
-) -> Float[Array, ""]:
+    bank: ScenarioBank, index: Any, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
+    speed_mps: Float[Array, ""],
+) -> Float[Array, ""]:  # fmt: skip
     """Deceleration (m/s2) that avoids reaching the nearest agent on the log's own way at its present speed.
 
     An agent is on the way where its box reaches into the strip as wide as ego along the log's route, on ego's level,
-    up to about 75 m ahead. Whom the simulator leaves out of the time to collision is left out here too. 0 where nobody
-    is, or the nearest one is not approached.
+    up to about 75 m ahead. 0 where nobody is, or the nearest one is not approached.
 
     Args:
         bank: The scenarios.
-        state: The driven agent.
-        frame: Everyone now.
-        along_m: Arc length of the driven agent along the log's route.
+        index: Row of the bank.
+        frame: Everyone now; ego is slot 0.
+        counts: Who may be on the way.
+        along_m: Arc length of ego along the log's route.
+        speed_mps: Of ego.
     """
-    scene, slot = state.scene, state.scene.slot
-    me, xy = frame.box[slot], frame.box[:, :2]
+    me, xy = frame.box[0], frame.box[:, :2]
 
     def window(offset_m: float) -> Any:
         near = along_m + offset_m
-        return jax.vmap(lambda point: project_on_route(bank, scene.index, point, near, route=_LOG_ROUTE))(xy)
+        return jax.vmap(lambda point: project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
 
     # Beyond the end of a window a hit is its last point, so each agent counts where it is nearest.
     first, second = map(window, _WINDOWS_M)
@@ -101,73 +135,71 @@ def required_braking(
     cos = jnp.sum(frame.box[:, 2:4] * hits.heading, axis=-1)
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
-    left_out = (state.contacts == Contact.IGNORED) | (state.contacts == Contact.HIT)
-    counts = frame.valid & (jnp.arange(len(xy)) != slot) & ~left_out
-    counts &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
+    counts = counts & (jnp.abs(frame.z - frame.z[0]) <= LEVEL_M)
     on_way = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
     gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
     gap = jnp.where(counts & on_way & (hits.along_m > along_m), gap, jnp.inf)
     nearest = jnp.argmin(gap)
     speed = jnp.sum(frame.velocity[nearest] * hits.heading[nearest])
-    closing = jnp.maximum(state.facts.speed_mps - speed, 0.0)
+    closing = jnp.maximum(speed_mps - speed, 0.0)
     return closing * closing / (2.0 * jnp.maximum(gap[nearest], 0.1))
 
 
-@partial(jax.jit, static_argnums=0)
-def kinematic_steps(config: KinematicConfig, bank: ScenarioBank) -> Float[Array, "N T"]:
-    """Criticality in [0, 1] of every step of every log of a bank; 0 where ego is not valid."""
-    return jax.vmap(partial(_one_log, config, bank))(jnp.arange(len(bank)))
+def crowding(log: Logged, crowd: int) -> Float[Array, " T"]:
+    """Agents that are there, ego included, as a share of ``crowd``, at most 1."""
+    return jnp.minimum(log.frame.valid.sum(axis=1) / crowd, 1.0)
 
 
-def _one_log(config: KinematicConfig, bank: ScenarioBank, index: Array) -> Float[Array, " T"]:
-    simulator = Simulator(Task(ends=()))
-    still = jnp.zeros(2)
+def _urgencies(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
+    def one(frame: Frame, left_out: Array, motion: Array) -> Array:
+        return urgency(time_to_collision(frame, jnp.int32(0), left_out), motion[3], config)
 
-    def score(state: SimState, along_m: Array) -> tuple[Array, Array]:
-        frame = simulator.frame(bank, state.scene, alone(state.scene), 0)
-        # No further than the car can have come, as the simulator follows its own route.
-        reach_m = 1.5 * state.facts.moved_m + 2.0
-        here = state.scene.history[-1, :2]
-        hit = project_on_route(bank, index, here, along_m, reach_m, route=_LOG_ROUTE)
-        along_m = jnp.maximum(along_m, hit.along_m)
-        braking = required_braking(bank, state, frame, along_m) / config.full_braking_mps2
-        value = (urgency(state.facts, config) + jnp.clip(braking, 0.0, 1.0)) / 2
-        there = bank.agents[index, state.scene.step, state.scene.slot, 7] > 0
-        return along_m, jnp.where(there, value, 0.0)
-
-    def step(carry: tuple[SimState, Array], _: None) -> tuple[tuple[SimState, Array], Array]:
-        state, along_m = carry
-        state = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), still)[0]
-        along_m, value = score(state, along_m)
-        return (state, along_m), value
-
-    state = simulator.reset(bank, index, 0)
-    along_m, first = score(state, jnp.zeros(()))
-    _, rest = jax.lax.scan(step, (state, along_m), None, length=bank.steps - 1)
-    return jnp.concatenate([first[None], rest])
+    return jax.vmap(one)(log.frame, log.left_out, log.motion)
 
 
-def score_kinematic(
-    data: ScenarioSet, config: KinematicConfig, progress: Callable[[int, int], None] | None = None
-) -> Float[np.ndarray[Any, Any], "N T"]:
-    """Criticality of every step of every log of a set.
+def _required(bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
+    def one(frame: Frame, left_out: Array, along_m: Array, speed: Array) -> Array:
+        counts = frame.valid & ~left_out & (jnp.arange(len(frame.valid)) > 0)
+        return required_braking(bank, log.index, frame, counts, along_m, speed)
 
-    Args:
-        data: The scenarios.
-        config: Scales.
-        progress: Called with (done, total) after every batch.
+    return jax.vmap(one)(log.frame, log.left_out, log.along_m, log.motion[:, 3])
 
-    Raises:
-        DataError: A scenario has no future.
+
+def _volatility(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
+    """Of the action between step t and the next; the last step, which has none, has that of the one before.
+
+    The derivatives are nuPlan's (``metrics.comfort``): of a polynomial fitted to 1.5 s, so that a centimetre per second
+    of noise in the speed is some hundredths of a m/s3.
     """
-    parts = []
-    for first in range(0, len(data), BATCH):
-        scenarios = data[first : first + BATCH]
-        count = len(scenarios)
-        if len(data) > BATCH:
-            scenarios += [scenarios[-1]] * (BATCH - count)
-        bank = ScenarioBank.from_scenarios(scenarios, trim=len(data) <= BATCH)
-        parts.append(np.asarray(kinematic_steps(config, bank))[:count])
-        if progress is not None:
-            progress(first + count, len(data))
-    return np.concatenate(parts)
+    speed, heading = log.motion[:, 3], log.motion[:, 2]
+    acceleration = (speed[1:] - speed[:-1]) / DT_S
+    turned = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
+    jerk = _derivative(acceleration, _JERK_ORDER, 1)
+    # At the middle of the action, where the jerk is too.
+    yaw = _derivative((turned[1:] + turned[:-1]) / 2, _YAW_ORDER, 2)
+    share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
+    share = jnp.minimum(share, 1.0)
+    return jnp.concatenate([share, share[-1:]])
+
+
+def _derivative(signal: Float[Array, " K"], order: int, derivative: int) -> Float[Array, " K"]:
+    matrix = filter_operator(len(signal), _WINDOW, order, derivative)
+    return jnp.asarray(matrix, jnp.float32) @ signal / DT_S**derivative
+
+
+def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
+    def one(box: Array, ground: Array) -> Array:
+        inside, known = left_of_edges(bank, log.index, box[:2], corners(box), ground)
+        share = jnp.clip(1.0 - inside / config.edge_m, 0.0, 1.0)
+        return jnp.max(jnp.where(known, share, 0.0))
+
+    return jax.vmap(one)(log.frame.box[:, 0], log.ground_m)
+
+
+def _deviation(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
+    def one(xy: Array, ground: Array) -> Array:
+        distance = lane_distance(bank, log.index, xy, ground)
+        # Beyond the cut-off there is no lane to deviate from: a car park, a driveway, the end of the map.
+        return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
+
+    return jax.vmap(one)(log.motion[:, :2], log.ground_m)

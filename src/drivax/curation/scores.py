@@ -8,20 +8,22 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from drivax.curation.combining import Combination
 from drivax.errors import DataError, UsageError
 from drivax.scenario.partial import sync_folder
 from drivax.scenario.store import ScenarioSet
 
-SCORES_VERSION = 1
+SCORES_VERSION = 2
 _AGAIN = "run `drivax curate` again"
+_COMPONENT = "component_"
 
 
 @dataclass(frozen=True)
@@ -30,39 +32,52 @@ class ScoreTable:
 
     Attributes:
         method: How they were made.
-        config: Its configuration.
+        config: Its configuration; ``combination`` is what :meth:`combined` was given.
         set_hash: ``ScenarioSet.hash`` of the data.
         scenario_ids: Of each row.
+        valid: Whether ego is there; other steps score 0.
         steps: Score of every step, in [0, 1].
+        scenarios: Score of every scenario, in [0, 1].
+        components: What the scores are made of, by name, each of every step and in [0, 1].
     """
 
     method: str
     config: Mapping[str, Any]
     set_hash: str
     scenario_ids: tuple[str, ...]
+    valid: Bool[np.ndarray[Any, Any], "N T"]
     steps: Float[np.ndarray[Any, Any], "N T"]
+    scenarios: Float[np.ndarray[Any, Any], " N"]
+    components: Mapping[str, Float[np.ndarray[Any, Any], "N T"]] = field(default_factory=dict)
 
     @property
-    def scenarios(self) -> Float[np.ndarray[Any, Any], " N"]:
-        """Score of every scenario: the largest of its steps."""
-        return self.steps.max(axis=1)
+    def drawn(self) -> Bool[np.ndarray[Any, Any], "N T"]:
+        """Which steps can be drawn: those at which the log knows what ego did, since it is there one step later too."""
+        return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
+
+    def combined(self, combination: Combination) -> ScoreTable:
+        """The same components, weighted and aggregated otherwise; nothing is scored again.
+
+        Raises:
+            UsageError: The table lacks a component.
+        """
+        steps, scenarios = combination.combine(self.components, self.valid)
+        config = {**self.config, "combination": asdict(combination)}
+        return replace(self, config=config, steps=steps, scenarios=scenarios)
 
 
 def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
-    """Writes a table as ``.npz``: ``header`` (JSON), ``scenario_id``, ``step_score``, ``scenario_score``.
+    """Writes a table as ``.npz``.
+
+    It holds ``header`` (JSON), ``scenario_id``, ``valid``, ``step_score``, ``scenario_score``, and of each component
+    ``component_NAME``.
 
     Raises:
         UsageError: ``out`` exists and ``overwrite`` is not given, or is a folder.
         DataError: A score is not in [0, 1].
     """
     refuse_existing(out, overwrite)
-    wrong = np.flatnonzero(~((table.steps >= 0) & (table.steps <= 1)).all(axis=1))
-    if wrong.size:
-        raise DataError(
-            "has a score outside [0, 1]",
-            record=table.scenario_ids[int(wrong[0])],
-            cure="report this as a defect of drivax",
-        )
+    _check_range(table, None, "report this as a defect of drivax")
     header = {
         "version": SCORES_VERSION,
         "method": table.method,
@@ -79,8 +94,10 @@ def write_scores(table: ScoreTable, out: Path, overwrite: bool = False) -> None:
                 allow_pickle=False,
                 header=np.array(json.dumps(header)),
                 scenario_id=np.array(table.scenario_ids),
+                valid=table.valid,
                 step_score=table.steps.astype(np.float32),
                 scenario_score=table.scenarios.astype(np.float32),
+                **{_COMPONENT + name: part.astype(np.float32) for name, part in table.components.items()},
             )
             file.flush()
             os.fsync(file.fileno())
@@ -120,14 +137,34 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
         # np.load leaves a file that it opened itself open where it is damaged.
         with file.open("rb") as raw, np.load(raw, allow_pickle=False) as stored:
             header = json.loads(str(stored["header"][()]))
+            version, found = header["version"], header["set_hash"]
             ids = tuple(str(name) for name in stored["scenario_id"])
-            steps = stored["step_score"]
-        version, found = header["version"], header["set_hash"]
-        table = ScoreTable(header["method"], header["config"], found, ids, steps)
+            _check_source(version, found, file, data)
+            arrays = {name: stored[name] for name in stored.files if name not in ("header", "scenario_id")}
+            _check_shapes(ids, arrays, file, data)
+            table = ScoreTable(
+                method=header["method"],
+                config=header["config"],
+                set_hash=found,
+                scenario_ids=ids,
+                valid=arrays["valid"],
+                steps=arrays["step_score"],
+                scenarios=arrays["scenario_score"],
+                components={
+                    name.removeprefix(_COMPONENT): part
+                    for name, part in arrays.items()
+                    if name.startswith(_COMPONENT)
+                },
+            )
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(
             f"is no table of scores, or damaged ({type(error).__name__})", file=file, cure=_AGAIN
         ) from error
+    _check_range(table, file, _AGAIN)
+    return table
+
+
+def _check_source(version: object, found: object, file: Path, data: ScenarioSet) -> None:
     if version != SCORES_VERSION:
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_AGAIN)
     if found != data.hash:
@@ -136,14 +173,21 @@ def read_scores(file: Path, data: ScenarioSet) -> ScoreTable:
             file=file,
             cure=_AGAIN,
         )
-    _check(table, file, data)
-    return table
 
 
-def _check(table: ScoreTable, file: Path, data: ScenarioSet) -> None:
+def _check_shapes(ids: tuple[str, ...], arrays: Mapping[str, Any], file: Path, data: ScenarioSet) -> None:
     wanted = tuple(entry["scenario_id"] for entry in data.entries)
-    if table.scenario_ids != wanted or table.steps.shape != (len(wanted), data.capacity.steps):
+    shape = (len(wanted), data.capacity.steps)
+    fits = all(
+        part.shape == (shape[:1] if name == "scenario_score" else shape) for name, part in arrays.items()
+    )
+    if ids != wanted or not fits:
         raise DataError("does not score every scenario and step of its set", file=file, cure=_AGAIN)
-    wrong = np.flatnonzero(~((table.steps >= 0) & (table.steps <= 1)).all(axis=1))
-    if wrong.size:
-        raise DataError("has a score outside [0, 1]", file=file, record=wanted[int(wrong[0])], cure=_AGAIN)
+
+
+def _check_range(table: ScoreTable, file: Path | None, cure: str) -> None:
+    for scores in (table.steps, table.scenarios[:, None], *table.components.values()):
+        wrong = np.flatnonzero(~((scores >= 0) & (scores <= 1)).all(axis=1))
+        if wrong.size:
+            record = table.scenario_ids[int(wrong[0])]
+            raise DataError("has a score outside [0, 1]", file=file, record=record, cure=cure)

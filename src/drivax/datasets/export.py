@@ -100,7 +100,7 @@ def export(
     names = () if options.ids is None else (options.ids,)
     rows = chosen(opened, options.filters, names, options.limit)
     if options.format == "set":
-        return _write_set(opened, rows, out, options, progress)
+        return write_part(opened, rows, out, options.overwrite, progress)
     write = {"tfexample": _write_examples, "gpudrive": _write_scenes}[options.format]
     _refuse_existing(out, options)
     partial = PartialFolder(out)
@@ -115,19 +115,46 @@ def export(
     return Exported(out, len(rows), len(set(files)), +lost)
 
 
-def _write_set(
-    opened: ScenarioSet, rows: Sequence[int], out: Path, options: Export, progress: Progress | None
+def write_part(
+    opened: ScenarioSet,
+    rows: Sequence[int],
+    out: Path,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    chosen_by: Mapping[str, Any] | None = None,
 ) -> Exported:
-    """The records as they are, with their entries."""
-    if out.exists() and out.resolve() == opened.path.resolve():
-        raise UsageError("is the set that is read", file=out, cure="choose another name")
-    source = {**opened.manifest["source"], "part_of": {"set": opened.path.name, "hash": opened.hash}}
-    with ScenarioWriter(out, opened.capacity, source, overwrite=options.overwrite) as writer:
+    """Some scenarios of a set as a set of their own: the records as they are, with their entries.
+
+    Args:
+        opened: The set.
+        rows: Which, in the order in which they are written.
+        out: Folder to create.
+        overwrite: Replace an existing scenario set; other folders are never replaced.
+        progress: Called with (scenarios done, scenarios).
+        chosen_by: What the manifest says about how they were chosen, as plain JSON values.
+
+    Raises:
+        UsageError: ``out`` exists, or is the set that is read.
+    """
+    refuse_part(opened, out)
+    part = {"set": opened.path.name, "hash": opened.hash, **(chosen_by or {})}
+    source = {**opened.manifest["source"], "part_of": part}
+    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite) as writer:
         for done, row in enumerate(rows, start=1):
             writer.add(opened[row])
             if progress is not None:
                 progress(done, len(rows))
     return Exported(out, len(rows), len(ScenarioSet.open(out).manifest["shards"]), {})
+
+
+def refuse_part(opened: ScenarioSet, out: Path) -> None:
+    """Refuses to write a part of a set over the set.
+
+    Raises:
+        UsageError: ``out`` is the set that is read.
+    """
+    if out.exists() and out.resolve() == opened.path.resolve():
+        raise UsageError("is the set that is read", file=out, cure="choose another name")
 
 
 #: The file of every scenario, and what did not fit.

@@ -7,8 +7,6 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -24,6 +22,7 @@ from drivax.scenario.bank import (
     ROUTE_LIMIT,
     ScenarioBank,
 )
+from drivax.scenario.nearby import edges_around, lanes_around, to_segments
 from drivax.scenario.record import record
 from drivax.scenario.sides import NOT_DRIVABLE, SPLIT
 from drivax.scenario.smallest import first_smallest
@@ -40,52 +39,6 @@ _FOLLOWED_M = 2.5
 _FAR = 1e9
 
 
-def _grid_side(bank: ScenarioBank) -> int:
-    """Cells along one side of the grid."""
-    return round((bank.grid_edge.shape[1] - 1) ** 0.5)
-
-
-def _cell(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Int[Array, " 2"]:
-    """Grid cell (x, y) of a point, clamped so that its 3 x 3 block lies in the grid."""
-    grid = _grid_side(bank)
-    cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
-    return jnp.clip(cell, 1, grid - 2)
-
-
-def _runs(
-    start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int, index: Int[Array, ""],
-    cell: Int[Array, " 2"], grid: int,
-) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
-    """The rows of the 3 x 3 cells around ``cell``: three contiguous reads of fixed length, and which rows count.
-
-    A grid of one cell is read whole (``scenario.exhaustive``).
-    """
-    if grid == 1:
-        return rows[index], jnp.arange(rows.shape[2]) < start[index, 1]
-    features, inside = [], []
-    for below in (-1, 0, 1):
-        first = (cell[1] + below) * grid + cell[0] - 1
-        bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
-        block = jax.lax.dynamic_slice(rows, (index, jnp.int32(0), bounds[0]), (1, rows.shape[1], run))[0]
-        features.append(block)
-        inside.append(jnp.arange(run) < bounds[3] - bounds[0])
-    # Read once: without the barrier XLA repeats the reads in every operation that uses them.
-    return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
-
-
-def _to_segments(
-    rows: Float[Array, "F K"] | Sequence[Float[Array, " K"]], points: Float[Array, "P 2"]
-) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
-    """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
-    ax, ay, bx, by = rows[0], rows[1], rows[2], rows[3]
-    ux, uy = bx - ax, by - ay
-    wx, wy = points[:, 0:1] - ax, points[:, 1:2] - ay
-    squared = jnp.maximum(ux * ux + uy * uy, 1e-9)
-    along = jnp.clip((wx * ux + wy * uy) / squared, 0.0, 1.0)
-    dx, dy = wx - along * ux, wy - along * uy
-    return dx * dx + dy * dy, (ux * wy - uy * wx) * jax.lax.rsqrt(squared)
-
-
 def left_of_edges(
     bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
     z: Float[Array, ""],
@@ -98,9 +51,8 @@ def left_of_edges(
     Returns:
         Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
     """
-    grid = _grid_side(bank)
-    rows, inside = _runs(bank.grid_edge, bank.edges, bank.edge_run, index, _cell(bank, index, centre), grid)
-    squared, side = _to_segments(rows, points)
+    rows, inside = edges_around(bank, index, centre)
+    squared, side = to_segments(rows, points)
     squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
     nearest = squared.min(axis=1)
     tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
@@ -153,10 +105,9 @@ def around_lanes(
         points: Its corners.
         z: Its height.
     """
-    grid = _grid_side(bank)
-    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, centre), grid)
+    rows, inside = lanes_around(bank, index, centre)
     inside = inside & (jnp.abs(rows[4] - z) <= LEVEL_M)
-    squared, side = _to_segments(rows, jnp.concatenate([centre[None], points]))
+    squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
     squared = jnp.where(inside, squared, _FAR)
     half, limit = rows[5], rows[6]
     ux, uy = rows[2] - rows[0], rows[3] - rows[1]
@@ -198,12 +149,48 @@ def aligned_lanes(
 
     Those that do not count have lane -1 and are very far away.
     """
-    grid = _grid_side(bank)
-    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, xy), grid)
-    squared, side = _to_segments(rows, xy[None])
+    rows, inside = lanes_around(bank, index, xy)
+    squared, side = to_segments(rows, xy[None])
     aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
     counts = inside & aligned & (jnp.abs(rows[4] - z) <= LEVEL_M)
     return jnp.where(counts, rows[7], -1.0).astype(jnp.int32), jnp.where(counts, squared[0], _FAR), side[0]
+
+
+def lane_distance(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], z: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Distance to the nearest lane centre, whichever way it runs, m; infinite where none is within the cut-off."""
+    rows, inside = lanes_around(bank, index, xy)
+    squared = to_segments(rows, xy[None])[0][0]
+    nearest = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR).min()
+    return jnp.where(nearest <= LANE_CUTOFF_M**2, root(nearest), jnp.inf)
+
+
+def vertex_distances(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], spacing_m: float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Distance to the nearest vertex of a road edge and of a lane centre, on any level, m.
+
+    What others measure who keep maps as points. Segments as stored are drawn with a vertex every ``spacing_m`` from
+    their beginning on, and one at their end. Exact within the cut-offs; beyond them it may be too large.
+    """
+    return (
+        _nearest_vertex(*edges_around(bank, index, xy), xy, spacing_m),
+        _nearest_vertex(*lanes_around(bank, index, xy), xy, spacing_m),
+    )
+
+
+def _nearest_vertex(
+    rows: Float[Array, "F K"], inside: Bool[Array, " K"], xy: Float[Array, " 2"], spacing_m: float
+) -> Float[Array, ""]:
+    u, w = rows[2:4] - rows[0:2], xy[:, None] - rows[0:2]
+    length = root(jnp.sum(u * u, axis=0))
+    along = jnp.sum(u * w, axis=0) / jnp.maximum(length, 1e-6)
+    across = (u[0] * w[1] - u[1] * w[0]) / jnp.maximum(length, 1e-6)
+    last = jnp.floor(length / spacing_m) * spacing_m
+    at = jnp.clip(jnp.round(along / spacing_m) * spacing_m, 0.0, last)
+    away = jnp.minimum(jnp.abs(along - at), jnp.abs(along - length))
+    return root(jnp.where(inside, across * across + away * away, _FAR).min())
 
 
 def _outside_lanes(
@@ -221,9 +208,8 @@ def _corner_lanes(
     z: Float[Array, ""],
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """For a corner that its box's own cells may not reach: whether a lane is near, and whether it is outside all."""
-    grid = _grid_side(bank)
-    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, point), grid)
-    squared = _to_segments(rows, point[None])[0]
+    rows, inside = lanes_around(bank, index, point)
+    squared = to_segments(rows, point[None])[0]
     squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
     aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
     return squared.min() <= LANE_CUTOFF_M**2, _outside_lanes(squared, aligned, rows[5])[0]
@@ -311,7 +297,7 @@ def project_on_route(
     place = first + jnp.arange(size - 1)
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
     rows = [a[:, 0], a[:, 1], b[:, 0], b[:, 1]]
-    squared, side = _to_segments(rows, xy[None])
+    squared, side = to_segments(rows, xy[None])
     k = first_smallest(jnp.where(real, squared[0], _FAR))
     u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
@@ -377,9 +363,8 @@ def lane_course(
     Returns:
         Direction of that lane, the point's signed distance to it (positive left of it, m), and whether there is one.
     """
-    grid = _grid_side(bank)
-    rows, inside = _runs(bank.grid_lane, bank.lanes, bank.lane_run, index, _cell(bank, index, xy), grid)
-    squared, side = _to_segments(rows, xy[None])
+    rows, inside = lanes_around(bank, index, xy)
+    squared, side = to_segments(rows, xy[None])
     ux, uy = rows[2] - rows[0], rows[3] - rows[1]
     length = jnp.sqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     cos = (ux * heading[0] + uy * heading[1]) / length

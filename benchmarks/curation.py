@@ -1,0 +1,274 @@
+"""Does curation find rare events? Scores of every method against the labels of the built-in world's benchmark.
+
+    drivax generate sets/bench --benchmark
+    python benchmarks/curation.py events --bench sets/bench
+    python benchmarks/curation.py speed --data sets/bench/validation
+    python benchmarks/curation.py table
+
+``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
+Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
+as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
+``test`` alone says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.curation.controls import event_kinds, event_steps, matched
+from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.methods import RARITY, Wanted, curate, table_of
+from drivax.curation.published import PublishedConfig
+from drivax.curation.ranking import auc_interval, precision_at_base_rate, roc_auc
+from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
+from drivax.curation.scores import ScoreTable
+from drivax.curation.scoring import BATCH, score_steps
+from drivax.curation.weights import WeightConfig, draws_of, weights_of
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.sizes import Sizes
+from drivax.scenario.store import ScenarioSet
+from drivax.synthetic.events import EventKind
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+STORED = REPOSITORY / "benchmarks" / "results" / "curation.json"
+PAGE = REPOSITORY / "docs" / "results" / "curation.md"
+BEGIN, END = "<!-- curation.py: {} -->", "<!-- curation.py: end -->"
+#: An event forces a reaction where it asks for no less braking than IDM finds comfortable, m/s2.
+FORCED_MPS2 = 3.0
+#: Share of scenarios with an event in an ordinary set (``WorldConfig.rare_rate``).
+NATURAL = 0.05
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of the scenarios of both test sets: kind and severity of the event, its steps, where ego is."""
+
+    kind: Any
+    severity: Any
+    during: Any
+    valid: Any
+
+    @classmethod
+    def of(cls, sets: list[ScenarioSet]) -> Truth:
+        """Of sets, one after the other."""
+        entries = [entry for data in sets for entry in data.entries]
+        return cls(
+            np.concatenate([event_kinds(data) for data in sets]),
+            np.array([float(entry["tags"].get("severity_mps2", 0.0)) for entry in entries]),
+            np.concatenate([event_steps(data) for data in sets]),
+            np.concatenate([[s.record["agent_valid"][:, 0] for s in data] for data in sets]).astype(bool),
+        )
+
+    def groups(self) -> dict[str, Any]:
+        """Which scenarios are to be found: all with an event, those that force a reaction, those of every kind."""
+        found = {"all": self.kind > 0, "forced": (self.kind > 0) & (self.severity >= FORCED_MPS2)}
+        return found | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
+
+
+def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
+    """How well scores find a group of events among scenarios that have none, at both scales."""
+    rows = wanted | (truth.kind == 0)
+    label = wanted[rows]
+    weight = np.where(label, NATURAL / label.sum(), (1 - NATURAL) / (~label).sum())
+    low, high = auc_interval(scenarios[rows], label)
+    valid = truth.valid[rows]
+    step_label = (truth.during & wanted[:, None])[rows][valid]
+    step_weight = np.broadcast_to(weight[:, None], valid.shape)[valid]
+    step_scores = steps[rows][valid]
+    return {
+        "scenarios": int(label.sum()),
+        "auc": roc_auc(scenarios[rows], label),
+        "low": low,
+        "high": high,
+        "precision": precision_at_base_rate(scenarios[rows], label, weight),
+        "step_auc": roc_auc(step_scores, step_label, step_weight),
+        "step_precision": precision_at_base_rate(step_scores, step_label, step_weight),
+        "step_rate": float(step_weight[step_label].sum() / step_weight.sum()),
+    }
+
+
+def events(bench: Path) -> dict[str, Any]:
+    """Every method on both test sets."""
+    sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
+    truth = Truth.of(sets)
+    methods: dict[str, Any] = {}
+    for name, own, both in scored(sets):
+        methods[name] = found_by(truth, both) | {"draws": draws(own)}
+        if name == "kinematic":
+            methods["random_matched"] = found_by(truth, matched(both, 0)) | {"draws": draws(matched(own, 0))}
+        print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
+    hashes = {data.path.name: data.hash for data in sets}
+    return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL, "methods": methods}
+
+
+def scored(sets: list[ScenarioSet]) -> Iterator[tuple[str, ScoreTable, ScoreTable]]:
+    """By method: the table of the first set, and of all sets one after the other."""
+    for name in ("kinematic", "published"):
+        tables = [curate(name, Wanted(data)) for data in sets]
+        yield name, tables[0], joined(tables)
+    actions = [score_steps(data, ExpertActions()) for data in sets]
+    for name, config in (("action_rarity", KernelRarity()), ("action_rarity_published", PublishedRarity())):
+        usual = actions[0]["action"][actions[0]["known"]].astype(np.float64)
+        tables = []
+        for data, found in zip(sets, actions, strict=True):
+            known, steps = found["known"], np.zeros(found["known"].shape)
+            steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
+            tables.append(table_of(name, vars(config), data, {"rarity": steps}, RARITY))
+        yield name, tables[0], joined(tables)
+
+
+def joined(tables: list[ScoreTable]) -> ScoreTable:
+    """Tables one after the other."""
+    first = tables[0]
+    stacked = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ("valid", "steps", "scenarios")
+    }
+    ids = sum((table.scenario_ids for table in tables), ())
+    return ScoreTable(first.method, first.config, "both", ids, **stacked)
+
+
+def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
+    """What a method finds of every group."""
+    return {
+        "events": {
+            name: measured(truth, wanted, table.steps, table.scenarios)
+            for name, wanted in truth.groups().items()
+        }
+    }
+
+
+def draws(table: ScoreTable) -> dict[str, Any]:
+    """What the default weights of a table do."""
+    return {
+        scale: vars(draws_of(weights_of(table, WeightConfig(), scale), table.drawn))
+        for scale in ("step", "scenario")
+    }
+
+
+def speed(path: Path, count: int) -> dict[str, Any]:
+    """Processor seconds to score the first scenarios of a set, reading and stacking included, compiling not."""
+    data = ScenarioSet.open(path)[:count]
+    sizes = Sizes.used(data)
+    result: dict[str, Any] = {"scenarios": count}
+    result["stacking_s"] = min(stacking(data, sizes) for _ in range(2))  # the first one reads from the disk
+    for name, of in {
+        "kinematic": KinematicConfig(), "published": PublishedConfig(), "action_rarity": ExpertActions()
+    }.items():  # fmt: skip
+        score_steps(data, of)
+        began, wall = time.process_time(), time.perf_counter()
+        score_steps(data, of)
+        result[name] = {"cpu_s": time.process_time() - began, "wall_s": time.perf_counter() - wall}
+    return result
+
+
+def stacking(data: list[Any], sizes: Sizes) -> float:
+    """Processor seconds to stack scenarios as scoring does, batch after batch."""
+    began = time.process_time()
+    for first in range(0, len(data), BATCH):
+        ScenarioBank.from_scenarios(data[first : first + BATCH], trim=sizes)
+    return time.process_time() - began
+
+
+def events_table(stored: dict[str, Any]) -> str:
+    """By method: all events and those that force a reaction, at both scales."""
+    lines = [
+        "| method | events | scenarios: AUC | precision | steps: AUC | precision |",
+        "|---|---|---|---|---|---|",
+    ]
+    for method, found in stored["methods"].items():
+        for group, words in (("forced", "that force a reaction"), ("all", "all")):
+            one = found["events"][group]
+            auc = f"{one['auc']:.3f} [{one['low']:.3f}, {one['high']:.3f}]"
+            lines.append(
+                f"| `{method}` | {words} ({one['scenarios']}) | {auc} | {one['precision']:.2f} | "
+                f"{one['step_auc']:.3f} | {one['step_precision']:.2f} |"
+            )
+    return "\n".join(lines)
+
+
+def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
+    """One measure by kind of event and method."""
+    methods = stored["methods"]
+    kinds = [kind.name.lower() for kind in EventKind if kind]
+    lines = ["| event | scenarios | " + " | ".join(f"`{name}`" for name in methods) + " |"]
+    lines.append("|---|---|" + "---|" * len(methods))
+    for kind in kinds:
+        ones = [found["events"][kind] for found in methods.values()]
+        cells = " | ".join(f"{one[measure]:.{digits}f}" for one in ones)
+        lines.append(f"| `{kind}` | {ones[0]['scenarios']} | {cells} |")
+    return "\n".join(lines)
+
+
+def draws_table(stored: dict[str, Any]) -> str:
+    """What the default weights do to an ordinary set."""
+    lines = [
+        "| method | scale | effective sample | of scenarios | tilt | largest | draws from 5 % |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for method, found in stored["methods"].items():
+        for scale, one in found["draws"].items():
+            lines.append(
+                f"| `{method}` | {scale} | {one['effective']:.2f} | {one['effective_scenarios']:.2f} | "
+                f"{one['tilt']:.2f} | {one['largest']:.2f} | {one['concentration']:.2f} |"
+            )
+    return "\n".join(lines)
+
+
+def speed_table(stored: dict[str, Any]) -> str:
+    """Processor seconds per 10,000 scenarios."""
+    one = stored["speed"]
+    times = 10_000 / one["scenarios"]
+    lines = ["| method | processor seconds for 10,000 scenarios | over stacking alone |", "|---|---|---|"]
+    for name in ("kinematic", "published", "action_rarity"):
+        cpu = one[name]["cpu_s"]
+        lines.append(f"| `{name}` | {cpu * times:,.0f} | {cpu / one['stacking_s']:.1f} |")
+    return "\n".join(lines)
+
+
+def filled(text: str, stored: dict[str, Any]) -> str:
+    """The page with its tables as stored."""
+    tables = {
+        "events": events_table(stored),
+        "scenario auc": kinds_table(stored, "auc", 3),
+        "scenario precision": kinds_table(stored, "precision", 2),
+        "step auc": kinds_table(stored, "step_auc", 3),
+        "step precision": kinds_table(stored, "step_precision", 2),
+        "draws": draws_table(stored),
+        "speed": speed_table(stored),
+    }
+    for name, table in tables.items():
+        before, rest = text.split(BEGIN.format(name))
+        after = rest.split(END, 1)[1]
+        text = f"{before}{BEGIN.format(name)}\n\n{table}\n\n{END}{after}"
+    return text
+
+
+def main() -> None:
+    """Measure, or write the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("events", "speed", "table"))
+    parser.add_argument("--bench", type=Path)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--count", type=int, default=256)
+    args = parser.parse_args()
+    stored = json.loads(STORED.read_text()) if STORED.exists() else {}
+    if args.what == "table":
+        PAGE.write_text(filled(PAGE.read_text(), stored))
+        return
+    made = events(args.bench) if args.what == "events" else {"speed": speed(args.data, args.count)}
+    STORED.write_text(json.dumps(stored | made, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""What curation has to be compared with: no preference, a preference by lot, and the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from drivax.curation.scores import ScoreTable
+from drivax.errors import DataError
+from drivax.scenario.store import ScenarioSet
+from drivax.synthetic.events import EventKind
+
+Array = np.ndarray[Any, Any]
+
+
+def matched(table: ScoreTable, seed: int) -> ScoreTable:
+    """The scores of a table, dealt out anew by lot: among the steps that can be drawn, and among the scenarios.
+
+    The scores stay the same ones, so that at either scale every weighting of them has the same distribution, and with
+    it the same effective sample size, as the table's own; only what it prefers is chance. (At scenario scale that is
+    exact where equally many steps of all scenarios can be drawn.)
+
+    Args:
+        table: What to match.
+        seed: Of the lot.
+    """
+    rng = np.random.default_rng(seed)
+    steps = table.steps.copy()
+    steps[table.drawn] = rng.permutation(table.steps[table.drawn])
+    config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
+    scenarios = rng.permutation(table.scenarios)
+    return replace(
+        table, method="random_matched", config=config, steps=steps, scenarios=scenarios, components={}
+    )
+
+
+def event_steps(data: ScenarioSet) -> Bool[Array, "N T"]:
+    """At which steps a labelled event of the built-in world goes on.
+
+    Raises:
+        DataError: The set is not of the built-in world, or of before its labels.
+    """
+    dataset = {str(entry["dataset"]) for entry in data.entries}
+    if dataset != {"drivax"}:
+        raise DataError(
+            f"only the built-in world knows its rare events, this set is of {', '.join(sorted(dataset))}",
+            file=data.path,
+            cure="use another method, or a set that `drivax generate` made",
+        )
+    step = np.arange(data.capacity.steps)
+    rows = []
+    for scenario in data:
+        kind, first, last = (scenario.record[f"event_{name}"][:, None] for name in ("kind", "start", "end"))
+        rows.append(((kind > EventKind.NONE) & (step >= first) & (step <= last)).any(axis=0))
+    return np.stack(rows)
+
+
+def event_kinds(data: ScenarioSet) -> Int[Array, " N"]:
+    """Kind of the first event of every scenario (:class:`drivax.synthetic.events.EventKind`), 0 where there is none."""
+    return np.array([max(int(scenario.record["event_kind"][0]), 0) for scenario in data])

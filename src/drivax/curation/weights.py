@@ -1,0 +1,144 @@
+"""From scores to weights of a sampler, and what the weights do to the data that is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import rankdata
+
+from drivax.curation.scores import ScoreTable
+from drivax.errors import UsageError
+
+Scale = Literal["step", "scenario"]
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class WeightConfig:
+    """How a score becomes a weight. All of it is global: over every step, or every scenario, of a set.
+
+    For score s, in this order:
+
+    1. ``quantile``: u is the mid-rank of s among all n, over n, in (0, 1): what a score means no longer depends on how
+       it is spread, and equal scores have equal weights; ``none``: u = s. Then u + ``floor``.
+    2. w = u ** (1 / ``temperature``): 1 leaves it, a higher temperature evens it out, a lower one sharpens it.
+    3. w over the mean of all, clipped to at most ``most``, and over the mean again.
+    4. ``(1 - uniform) w + uniform``: a mixture with uniform sampling, whose mean is 1.
+
+    Attributes:
+        normalise: See 1.
+        floor: See 1.
+        temperature: See 2.
+        most: See 3.
+        uniform: See 4.
+    """
+
+    normalise: Literal["quantile", "none"] = "quantile"
+    floor: float = 0.0
+    temperature: float = 0.5
+    most: float = 10.0
+    uniform: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.floor < float("inf"):
+            raise UsageError(f"floor is {self.floor}", cure="use 0 or more")
+        if not 0.0 < self.temperature < float("inf"):
+            raise UsageError(f"temperature is {self.temperature}", cure="use a positive number")
+        if not self.most > 1.0:
+            raise UsageError(f"most is {self.most}", cure="use more than 1, inf for no limit")
+        if not 0.0 <= self.uniform <= 1.0:
+            raise UsageError(f"uniform is {self.uniform}", cure="use 0 to 1")
+
+
+#: As the study draws: in proportion to the score, plus a hundredth.
+PUBLISHED = WeightConfig(normalise="none", floor=0.01, temperature=1.0, most=float("inf"), uniform=0.0)
+
+
+def weights_of(table: ScoreTable, config: WeightConfig, scale: Scale) -> Float[Array, "N T"]:
+    """Weights of every step of a set, of mean 1 over the steps that can be drawn.
+
+    Steps that cannot be drawn (``ScoreTable.drawn``) weigh 0. At the scale of scenarios every step of a scenario has
+    the scenario's weight.
+
+    Args:
+        table: The scores.
+        config: How scores become weights.
+        scale: Whether steps are weighted one by one, or as their scenarios are.
+
+    Raises:
+        UsageError: No step can be drawn, or none would have a weight.
+    """
+    drawn = table.drawn
+    if not drawn.any():
+        raise UsageError("no log has two steps on end, so that nothing can be drawn", cure="check the set")
+    weights = np.zeros(drawn.shape)
+    if scale == "step":
+        weights[drawn] = _weighted(table.steps[drawn], config)
+    else:
+        weights = np.where(drawn, _weighted(table.scenarios, config)[:, None], 0.0)
+    if not weights.any():
+        raise UsageError(
+            "every score is 0, so that nothing has a weight", cure="give floor, or normalise: quantile"
+        )
+    return weights / weights[drawn].mean()
+
+
+def _weighted(scores: Float[Array, " n"], config: WeightConfig) -> Float[Array, " n"]:
+    score = np.asarray(scores, np.float64)
+    if config.normalise == "quantile":
+        score = (rankdata(score) - 0.5) / len(score)
+    # In logarithms, so that a low temperature neither overflows nor makes everything 0.
+    with np.errstate(divide="ignore"):
+        power = np.log(score + config.floor) / config.temperature
+    if not np.isfinite(power.max()):
+        return np.zeros(len(score))
+    weight = np.exp(power - power.max())
+    weight = np.minimum(weight / weight.mean(), config.most)
+    return (1.0 - config.uniform) * weight / weight.mean() + config.uniform
+
+
+@dataclass(frozen=True)
+class Draws:
+    """What weights do to the data that is drawn.
+
+    Attributes:
+        effective: Effective sample size over the number of steps that can be drawn, ``(sum w)^2 / (n sum w^2)`` (Kish,
+            1965): 1 for uniform weights, 1 / n where one step has all.
+        effective_scenarios: The same of the scenarios' sums of weights.
+        tilt: 99th percentile of the weights over their mean.
+        largest: Largest weight over the mean.
+        concentration: Share of the draws that goes to the 5 % of the steps that weigh most; 0.05 for uniform weights.
+    """
+
+    effective: float
+    effective_scenarios: float
+    tilt: float
+    largest: float
+    concentration: float
+
+
+def draws_of(weights: Float[Array, "N T"], drawn: Bool[Array, "N T"]) -> Draws:
+    """Measures weights.
+
+    Args:
+        weights: Of every step.
+        drawn: Which steps can be drawn (``ScoreTable.drawn``).
+    """
+    one = weights[drawn]
+    some = drawn.any(axis=1)
+    ordered = np.sort(one)[::-1]
+    return Draws(
+        effective=effective_share(one),
+        effective_scenarios=effective_share(weights.sum(axis=1)[some]),
+        tilt=float(np.quantile(one, 0.99) / one.mean()),
+        largest=float(ordered[0] / one.mean()),
+        concentration=float(ordered[: max(round(len(one) * 0.05), 1)].sum() / one.sum()),
+    )
+
+
+def effective_share(weights: Float[Array, " n"]) -> float:
+    """``(sum w)^2 / (n sum w^2)`` (Kish, Survey Sampling, 1965)."""
+    return float(weights.sum() ** 2 / (len(weights) * np.sum(weights**2)))

@@ -1,0 +1,68 @@
+"""Aggregators and weighted sums, by other means."""
+
+import numpy as np
+import pytest
+
+from drivax.curation.combining import Combination, aggregate
+from drivax.errors import UsageError
+
+RNG = np.random.default_rng(3)
+STEPS = RNG.random((6, 40))
+VALID = RNG.random((6, 40)) < 0.7
+VALID[4] = False  # nobody is there
+VALID[5] = np.arange(40) == 7  # for one step only
+
+
+def by_hand(name, values):
+    if not len(values):
+        return 0.0
+    if name.startswith("top"):
+        return np.mean(sorted(values)[-int(name[3:]) :])
+    if name.startswith("p"):
+        return np.percentile(values, int(name[1:]))
+    return {"max": np.max, "mean": np.mean, "std": np.std}[name](values)
+
+
+@pytest.mark.parametrize("name", ["max", "mean", "std", "p0", "p50", "p99", "p100", "top1", "top10", "top99"])
+def test_aggregators(name):
+    wanted = [by_hand(name, steps[valid]) for steps, valid in zip(STEPS, VALID, strict=True)]
+    np.testing.assert_allclose(aggregate(STEPS, VALID, name), wanted, atol=1e-12)
+    # What is beside the valid steps does not matter.
+    np.testing.assert_array_equal(
+        aggregate(np.where(VALID, STEPS, 9.0), VALID, name), aggregate(STEPS, VALID, name)
+    )
+
+
+def test_a_weighted_sum():
+    parts = {"a": STEPS, "b": STEPS[::-1], "unused": STEPS}
+    steps, scenarios = Combination({"a": 0.9, "b": 0.3}, "mean").combine(parts, VALID)
+    wanted = np.where(VALID, np.minimum(0.9 * STEPS + 0.3 * STEPS[::-1], 1.0), 0.0)
+    assert (wanted == 1.0).any()  # it is clipped somewhere
+    np.testing.assert_allclose(steps, wanted)
+    np.testing.assert_allclose(scenarios, aggregate(wanted, VALID, "mean"))
+
+
+def test_one_aggregator_for_each_component():
+    parts = {"a": STEPS, "b": STEPS[::-1]}
+    both = Combination({"a": 0.6, "b": 0.3}, {"a": "p90", "b": "std"})
+    wanted = 0.6 * aggregate(STEPS, VALID, "p90") + 0.3 * aggregate(STEPS[::-1], VALID, "std")
+    np.testing.assert_allclose(both.combine(parts, VALID)[1], wanted)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (({"a": -1.0},), "weight of 'a' is -1.0"),
+        (({"a": float("nan")},), "weight of 'a' is nan"),
+        (({"a": 0.0},), "no component has a weight"),
+        (({},), "no component has a weight"),
+        (({"a": 1.0}, "median"), "'median' aggregates no steps; use max, mean"),
+        (({"a": 1.0}, "p101"), "'p101' aggregates no steps"),
+        (({"a": 1.0}, "top0"), "'top0' aggregates no steps"),
+        (({"a": 1.0, "b": 1.0}, {"a": "max"}), "no aggregator for 'b'"),
+        (({"a": 1.0}, {"a": "best"}), "'best' aggregates no steps"),
+    ],
+)
+def test_what_cannot_be_meant(given, words):
+    with pytest.raises(UsageError, match=words):
+        Combination(*given)

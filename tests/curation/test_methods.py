@@ -1,0 +1,112 @@
+"""Every method by name, on a small set of the built-in world and on one that it did not make."""
+
+from dataclasses import replace
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from drivax.cli import main
+from drivax.cli.curate import Curate
+from drivax.curation.controls import event_kinds, event_steps
+from drivax.curation.methods import METHODS, Wanted, curate
+from drivax.curation.scores import read_scores, write_scores
+from drivax.curation.subset import top_rows, write_top
+from drivax.errors import DataError, UsageError
+from drivax.scenario.assemble import assemble
+from drivax.scenario.recording import Event
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from scenes import SMALL, car, straight_road
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Four drives, said to be of the built-in world; the second has an event, the third ends early."""
+    path = tmp_path_factory.mktemp("methods") / "set"
+    drives = [
+        ([car(speed=10.0)], ()),
+        ([car(speed=15.0), car(x=20.0)], (Event(3, 8, 30, (101,)),)),
+        ([car(speed=10.0, steps=range(40)), car(x=80.0)], ()),
+        ([car(speed=10.0), car(x=30.0, speed=8.0)], ()),
+    ]
+    with ScenarioWriter(path, SMALL) as writer:
+        for row, (cars, events) in enumerate(drives):
+            recording = replace(
+                straight_road(cars), scenario_id=f"drive-{row}", dataset="drivax", events=events
+            )
+            writer.add(assemble(recording, SMALL))
+    return ScenarioSet.open(path)
+
+
+@pytest.fixture(scope="module")
+def tables(data, tmp_path_factory):
+    like = tmp_path_factory.mktemp("tables") / "kinematic.npz"
+    write_scores(curate("kinematic", Wanted(data)), like)
+    return {name: curate(name, Wanted(data, like if name == "random_matched" else None)) for name in METHODS}
+
+
+def test_every_method_scores_every_step_and_comes_back(data, tables, tmp_path):
+    for name, table in tables.items():
+        assert table.method == name and table.set_hash == data.hash
+        assert table.steps.shape == table.valid.shape == (4, 91) and table.scenarios.shape == (4,)
+        assert (table.steps[~table.valid] == 0).all()
+        assert table.valid.sum(axis=1).tolist() == [91, 91, 40, 91]
+        write_scores(table, tmp_path / f"{name}.npz")
+        np.testing.assert_allclose(read_scores(tmp_path / f"{name}.npz", data).steps, table.steps, atol=1e-6)
+
+
+def test_the_command_offers_every_method():
+    hints = get_type_hints(Curate, include_extras=True)
+    assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)
+
+
+def test_what_they_prefer(data, tables):
+    assert tables["kinematic"].scenarios.argmax() == 1
+    assert sorted(tables["published"].components) == [
+        "density", "interaction", "lane_deviation", "off_road", "volatility"
+    ]  # fmt: skip
+    assert (tables["uniform"].steps == tables["uniform"].valid).all()
+    kinematic, lot = tables["kinematic"], tables["random_matched"]
+    np.testing.assert_allclose(np.sort(lot.scenarios), np.sort(kinematic.scenarios), atol=1e-6)
+    assert lot.config["like"] == "kinematic" and lot.config["like_config"]["urgent_s"] == 0.95
+
+
+def test_the_oracle_knows_the_labels(data, tables):
+    step = np.arange(91)
+    np.testing.assert_array_equal(event_steps(data)[1], (step >= 8) & (step <= 30))
+    assert event_kinds(data).tolist() == [0, 3, 0, 0]
+    assert tables["oracle"].scenarios.tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert tables["oracle"].steps.sum() == 23
+
+
+def test_only_the_built_in_world_has_an_oracle(tmp_path):
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        writer.add(assemble(straight_road([car()]), SMALL))
+    with pytest.raises(
+        DataError, match="only the built-in world knows its rare events, this set is of test; use"
+    ):
+        curate("oracle", Wanted(ScenarioSet.open(tmp_path / "set")))
+
+
+def test_a_subset_is_a_set_in_order_of_criticality(data, tables, tmp_path):
+    table = tables["kinematic"]
+    rows = top_rows(table, 3)
+    assert (np.diff(table.scenarios[rows]) <= 0).all() and rows[0] == 1
+    write_top(table, data, 3, tmp_path / "top")
+    top = ScenarioSet.open(tmp_path / "top")
+    top.check()
+    assert [entry["scenario_id"] for entry in top.entries] == [f"drive-{row}" for row in rows]
+    np.testing.assert_array_equal(top.records(range(3)), data.records(rows))
+    assert top.manifest["source"]["part_of"]["method"] == "kinematic"
+    assert top_rows(tables["uniform"], 2) == [0, 1]  # of equal ones the first
+    assert main(["inspect", str(tmp_path / "top")]) == 0
+
+
+def test_what_cannot_be_meant(data, tmp_path):
+    for name, like in (("random_matched", None), ("uniform", tmp_path / "x.npz")):
+        with pytest.raises(UsageError, match="random_matched needs --like"):
+            curate(name, Wanted(data, like))
+    with pytest.raises(UsageError, match="no method 'kinematics'; did you mean 'kinematic'"):
+        curate("kinematics", Wanted(data))
+    with pytest.raises(DataError, match="there are no scores"):
+        curate("random_matched", Wanted(data, tmp_path / "none.npz"))

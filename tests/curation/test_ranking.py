@@ -1,0 +1,70 @@
+"""Rankings, pair by pair."""
+
+import numpy as np
+import pytest
+
+from drivax.curation.ranking import auc_interval, precision_at_base_rate, roc_auc
+from drivax.errors import UsageError
+
+RNG = np.random.default_rng(5)
+SCORES = RNG.integers(0, 12, 150) / 12  # with ties
+LABELS = RNG.random(150) < 0.1 + 0.5 * SCORES
+WEIGHTS = RNG.random(150)
+
+
+def by_pairs(scores, labels, weights):
+    a, b = scores[labels][:, None], scores[~labels]
+    pairs = weights[labels][:, None] * weights[~labels]
+    return (pairs * ((a > b) + (a == b) / 2)).sum() / pairs.sum()
+
+
+def test_auc_is_that_of_all_pairs():
+    assert roc_auc(SCORES, LABELS) == pytest.approx(by_pairs(SCORES, LABELS, np.ones(150)), rel=1e-12)
+    assert roc_auc(SCORES, LABELS, WEIGHTS) == pytest.approx(by_pairs(SCORES, LABELS, WEIGHTS), rel=1e-12)
+    assert roc_auc(np.ones(150), LABELS) == 0.5
+    assert roc_auc(LABELS.astype(float), LABELS) == 1.0
+
+
+def test_the_interval_is_that_of_the_placement_values():
+    a, b = SCORES[LABELS][:, None], SCORES[~LABELS]
+    right = (a > b) + (a == b) / 2
+    spread = np.sqrt(right.mean(1).var(ddof=1) / len(a) + right.mean(0).var(ddof=1) / len(b))
+    wanted = right.mean() + 1.959964 * spread * np.array([-1, 1])
+    np.testing.assert_allclose(auc_interval(SCORES, LABELS), wanted, rtol=1e-6)
+
+
+def test_the_interval_covers_the_truth():
+    """Normal scores a standard deviation apart: the truth is Phi(1 / sqrt 2) = 0.7602."""
+    covered = 0
+    for _ in range(400):
+        labels = np.arange(120) < 40
+        low, high = auc_interval(RNG.normal(size=120) + labels, labels)
+        covered += low <= 0.7602 <= high
+    assert 0.91 <= covered / 400 <= 0.98
+
+
+def test_precision_at_the_base_rate():
+    scores = np.array([0.9, 0.8, 0.7, 0.6, 0.5, 0.4])
+    labels = np.array([True, False, True, False, False, True])
+    assert precision_at_base_rate(scores, labels) == pytest.approx(2 / 3)
+    # Two of three equal scores at the edge are taken: two thirds of the one that is to be found.
+    tied = np.array([0.9, 0.5, 0.5, 0.5, 0.1, 0.1])
+    assert precision_at_base_rate(tied, labels) == pytest.approx((1 + 2 / 3) / 3)
+    assert precision_at_base_rate(np.ones(6), labels) == pytest.approx(0.5)
+    assert precision_at_base_rate(labels.astype(float), labels) == 1.0
+
+
+def test_weights_are_repetitions():
+    times = RNG.integers(1, 4, 150)
+    scores, labels = (np.repeat(part, times) for part in (SCORES, LABELS))
+    for measure in (roc_auc, precision_at_base_rate):
+        wanted = measure(scores, labels)
+        assert measure(SCORES, LABELS, times.astype(float)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_what_cannot_be_meant():
+    for measure in (roc_auc, precision_at_base_rate):
+        with pytest.raises(UsageError, match="nothing to find, or nothing else"):
+            measure(SCORES, np.zeros(150, bool))
+    with pytest.raises(UsageError, match="two of either kind"):
+        auc_interval(SCORES, np.arange(150) == 0)

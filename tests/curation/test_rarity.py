@@ -1,0 +1,100 @@
+"""Densities against the formula for every pair, closed forms, and the published histogram by another program."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivax.curation.logged import of_logs
+from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
+from drivax.errors import DataError, UsageError
+from scenes import bank_of, car, straight_road
+
+RNG = np.random.default_rng(2)
+
+
+def test_density_of_one_action_is_the_kernel():
+    density = KernelRarity(bandwidth=0.1, cells=512).density
+    middle = np.zeros((1, 2)) + 1 / 512  # the centre of a cell
+    at = middle + np.array([[0.0, 0.0], [0.1, 0.0], [0.0, -0.2], [0.15, 0.15]])
+    wanted = np.exp(-0.5 * ((at - middle) ** 2).sum(axis=1) / 0.01) / (2 * np.pi * 0.01)
+    np.testing.assert_allclose(density(middle, at), wanted, rtol=2e-3)
+
+
+def test_density_integrates_to_one_at_the_bounds_too():
+    """Kernels that reach over a bound are mirrored."""
+    actions = np.clip(RNG.normal(0.9, 0.3, (500, 2)), -1, 1)
+    centres = -1 + (np.arange(256) + 0.5) / 128
+    grid = np.stack(np.meshgrid(centres, centres), -1).reshape(-1, 2)
+    assert KernelRarity().density(actions, grid).sum() / 128**2 == pytest.approx(1.0, rel=1e-9)
+
+
+def test_density_is_that_of_every_pair():
+    actions, at = RNG.uniform(-0.5, 0.5, (400, 2)), RNG.uniform(-0.5, 0.5, (60, 2))
+    apart = ((at[:, None] - actions) ** 2).sum(axis=2)
+    wanted = np.exp(-0.5 * apart / 0.05**2).mean(axis=1) / (2 * np.pi * 0.05**2)
+    np.testing.assert_allclose(
+        KernelRarity(bandwidth=0.05, cells=1024).density(actions, at), wanted, rtol=0.02
+    )
+
+
+@pytest.mark.parametrize("temper", [1.0, 0.5, 0.0])
+def test_inverse_frequency_tempered_and_clipped(temper):
+    """Two places far apart, one with nine tenths of the actions: the other's are nine times rarer."""
+    actions = np.repeat([[0.25, 0.25], [-0.5, 0.5]], (900, 100), axis=0)
+    scores = KernelRarity(temper=temper, most=5.0).scores(actions, actions)
+    np.testing.assert_allclose(scores[:900], 1 / 5)
+    np.testing.assert_allclose(scores[900:], min(9**temper, 5.0) / 5, rtol=1e-6)
+    unseen = KernelRarity(temper=temper, most=5.0).scores(actions, np.array([[0.9, -0.9], [0.25, 0.25]]))
+    np.testing.assert_allclose(unseen, [1.0 if temper else 0.2, 0.2])
+
+
+def test_published_histogram():
+    """Counted and weighed cell by cell."""
+    config = PublishedRarity()
+    acceleration, curvature = config.edges
+    assert len(acceleration) == len(curvature) == 90
+    assert (np.diff(acceleration) == 0).sum() == (np.diff(curvature) == 0).sum() == 2
+    actions = np.concatenate([np.zeros((300, 2)), RNG.uniform(-1, 1, (200, 2)), [[1.0, 1.0], [-1.0, -1.0]]])
+    values = actions * [6.0, 0.3]
+    counts = np.zeros((89, 89))
+    cells = []
+    for a, k in values:
+        i = max(i for i in range(89) if acceleration[i] <= a and acceleration[i + 1] > acceleration[i])
+        j = max(j for j in range(89) if curvature[j] <= k and curvature[j + 1] > curvature[j])
+        counts[i, j] += 1
+        cells.append((i, j))
+    weight = 1 / (counts + 1)
+    wanted = [weight[cell] / weight.mean() / 3 for cell in cells]
+    scores = config.scores(actions, actions)
+    np.testing.assert_allclose(scores, wanted)
+    assert scores.max() < 1.764 / 3  # the cap of 3 never binds
+
+
+def test_actions_of_the_expert_and_where_they_are_known():
+    """Constant speed, constant acceleration of 2 m/s2 (a third of the bound), and a log that ends early."""
+    time = (np.arange(91) - 10) * 0.1
+    faster = car() | {
+        "xy": np.stack([10.0 * time + time**2, np.zeros(91)], -1),
+        "velocity": np.stack([10.0 + 2.0 * time, np.zeros(91)], -1),
+    }
+    bank = bank_of(
+        straight_road([car(speed=10.0)]),
+        straight_road([faster]),
+        straight_road([car(speed=5.0, steps=range(30))]),
+    )
+    found = {name: np.asarray(part) for name, part in of_logs(ExpertActions(), bank).items()}
+    np.testing.assert_allclose(found["action"][0, :89], 0.0, atol=1e-3)
+    np.testing.assert_allclose(found["action"][1, :89], [[1 / 3, 0.0]] * 89, atol=2e-3)
+    assert found["known"].sum(axis=1).tolist() == [90, 90, 29]
+    steps = rarity_steps(KernelRarity(), found["action"], found["known"])
+    assert (steps[found["known"]] > 0).all() and (steps[~found["known"]] == 0).all()
+    assert steps[1, 20] > steps[0, 20]  # 90 steps against 118 without acceleration
+
+
+def test_what_cannot_be_meant():
+    for name, wrong in (("bandwidth", 0.0), ("cells", 1), ("temper", 2.0), ("most", 0.5)):
+        with pytest.raises(UsageError, match=name):
+            replace(KernelRarity(), **{name: wrong})
+    with pytest.raises(DataError, match="no log has two steps on end"):
+        rarity_steps(KernelRarity(), np.zeros((1, 3, 2)), np.zeros((1, 3), bool))

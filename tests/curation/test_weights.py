@@ -1,0 +1,148 @@
+"""Weights and what they do, against closed forms."""
+
+import numpy as np
+import pytest
+
+from drivax.curation.controls import matched
+from drivax.curation.scores import ScoreTable
+from drivax.curation.weights import PUBLISHED, WeightConfig, draws_of, effective_share, weights_of
+from drivax.errors import UsageError
+
+RNG = np.random.default_rng(1)
+
+
+def table_of(steps, valid=None, scenarios=None):
+    steps = np.asarray(steps, np.float64)
+    valid = np.ones(steps.shape, bool) if valid is None else valid
+    ids = tuple(map(str, range(len(steps))))
+    scenarios = steps.max(axis=1) if scenarios is None else np.asarray(scenarios, np.float64)
+    return ScoreTable("made", {}, "hash", ids, valid, np.where(valid, steps, 0.0), scenarios)
+
+
+def plain(**given):
+    return WeightConfig(
+        **({"normalise": "none", "temperature": 1.0, "most": float("inf"), "uniform": 0.0} | given)
+    )
+
+
+TABLE = table_of(RNG.permutation(2000 * 51).reshape(2000, 51) / (2000 * 51))
+DRAWN = TABLE.drawn
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.5, 2.0])
+def test_quantiles_to_a_power(temperature):
+    """Of u uniform in (0, 1), u^k has mean 1/(k+1) and mean square 1/(2k+1): an effective share of (2k+1)/(k+1)^2."""
+    k = 1 / temperature
+    weights = weights_of(TABLE, plain(normalise="quantile", temperature=temperature), "step")
+    found = draws_of(weights, DRAWN)
+    assert found.effective == pytest.approx((2 * k + 1) / (k + 1) ** 2, rel=1e-3)
+    assert found.tilt == pytest.approx((k + 1) * 0.99**k, rel=1e-2)
+    assert found.largest == pytest.approx(k + 1, rel=1e-2)
+    assert found.concentration == pytest.approx(1 - 0.95 ** (k + 1), rel=1e-2)
+
+
+def test_mixture_with_uniform():
+    """(1 - m) w + m has the variance (1 - m)^2 var(w), so 1 / effective share - 1 shrinks by that factor."""
+    before, after = (effective_share(weights_of(TABLE, plain(uniform=m), "step")[DRAWN]) for m in (0.0, 0.3))
+    assert 1 / after - 1 == pytest.approx(0.7**2 * (1 / before - 1), rel=1e-6)
+    assert (weights_of(TABLE, plain(uniform=1.0), "step")[DRAWN] == 1.0).all()
+
+
+def test_clipping_and_floor():
+    table = table_of([[0.0, 0.1, 0.1, 0.8, 1.0]])  # the last step leads nowhere
+    np.testing.assert_allclose(weights_of(table, plain(), "step")[0], np.array([0, 0.1, 0.1, 0.8, 0]) / 0.25)
+    clipped = np.array([0.0, 0.4, 0.4, 2.0]) / 0.7
+    np.testing.assert_allclose(weights_of(table, plain(most=2.0), "step")[0, :4], clipped)
+    floored = np.array([0.2, 0.3, 0.3, 1.0]) / 0.45
+    np.testing.assert_allclose(weights_of(table, plain(floor=0.2), "step")[0, :4], floored)
+
+
+def test_published_weights_tilt_as_the_study_says():
+    """A score of 0.2835 +- 0.1712 drawn with 0.01 on top: an effective share of 0.75 (the study's own statistics)."""
+    a = 0.2835 - 0.1712, 0.2835 + 0.1712
+    table = table_of(np.resize(a, (40, 51)))
+    weights = weights_of(table, PUBLISHED, "step")
+    assert effective_share(weights[table.drawn]) == pytest.approx(0.746, abs=1e-3)
+
+
+def test_equal_scores_are_uniform_at_either_scale():
+    table = table_of(np.full((3, 9), 0.3))
+    for scale in ("step", "scenario"):
+        weights = weights_of(table, WeightConfig(), scale)
+        np.testing.assert_allclose(weights[:, :-1], 1.0)
+        assert (weights[:, -1] == 0).all()
+        found = draws_of(weights, table.drawn)
+        assert (found.effective, found.effective_scenarios) == (pytest.approx(1.0), pytest.approx(1.0))
+
+
+def test_steps_of_a_scenario_share_its_weight():
+    valid = np.ones((3, 6), bool)
+    valid[1, 4:] = False
+    table = table_of(RNG.random((3, 6)), valid, scenarios=[0.1, 0.2, 0.6])
+    weights = weights_of(table, plain(), "scenario")
+    drawn = table.drawn
+    assert drawn.sum(axis=1).tolist() == [5, 3, 5]
+    mean = (5 * 0.1 + 3 * 0.2 + 5 * 0.6) / 13
+    np.testing.assert_allclose(weights, np.where(drawn, np.array([[0.1], [0.2], [0.6]]) / mean, 0.0))
+
+
+@pytest.mark.parametrize("scale", ["step", "scenario"])
+def test_weights_are_global_and_of_mean_one_and_zero_where_ego_is_not(scale):
+    valid = RNG.random((30, 20)) < 0.8
+    table = table_of(RNG.random((30, 20)) ** 4, valid)
+    weights, drawn = weights_of(table, WeightConfig(), scale), table.drawn
+    assert weights.shape == valid.shape and weights[drawn].mean() == pytest.approx(1.0)
+    assert (weights[~drawn] == 0).all() and (weights[drawn] > 0).all() and not drawn[~valid].any()
+
+
+def test_a_low_temperature_neither_overflows_nor_vanishes():
+    weights = weights_of(table_of([[0.1, 0.2, 0.4, 0.4]]), plain(temperature=1e-3), "step")
+    np.testing.assert_allclose(weights, [[0.0, 0.0, 3.0, 0.0]], atol=1e-12)
+
+
+def test_one_step_with_all_the_weight():
+    one = np.zeros((4, 26))
+    one[2, 3] = 1.0
+    found = draws_of(
+        weights_of(table_of(one), plain(), "step"), np.pad(np.ones((4, 25), bool), ((0, 0), (0, 1)))
+    )
+    assert (found.effective, found.effective_scenarios) == (pytest.approx(0.01), pytest.approx(0.25))
+    assert (found.largest, found.concentration) == (pytest.approx(100.0), pytest.approx(1.0))
+
+
+@pytest.mark.parametrize(
+    "config", [WeightConfig(), PUBLISHED, plain(temperature=0.3)], ids=["ours", "published", "sharp"]
+)
+@pytest.mark.parametrize("scale", ["step", "scenario"])
+def test_matched_random_weights_prefer_nothing_and_are_spread_alike(config, scale):
+    table = table_of(RNG.random((500, 41)) ** 3)
+    lot = matched(table, seed=7)
+    drawn = table.drawn
+    own, other = (weights_of(one, config, scale)[drawn] for one in (table, lot))
+    np.testing.assert_allclose(np.sort(own), np.sort(other))
+    assert effective_share(own) == pytest.approx(effective_share(other), rel=1e-9)
+    assert abs(np.corrcoef(own, other)[0, 1]) < 0.1
+    np.testing.assert_array_equal(matched(table, seed=7).steps, lot.steps)
+    assert not np.array_equal(matched(table, seed=8).steps, lot.steps)
+    assert lot.config["like"] == "made" and not lot.components
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"floor": -0.1}, "floor is -0.1"),
+        ({"temperature": 0.0}, "temperature is 0.0"),
+        ({"most": 1.0}, "most is 1.0"),
+        ({"uniform": 1.1}, "uniform is 1.1"),
+    ],
+)
+def test_what_cannot_be_meant(given, words):
+    with pytest.raises(UsageError, match=words):
+        WeightConfig(**given)
+
+
+def test_no_weight_is_an_error():
+    with pytest.raises(UsageError, match="every score is 0"):
+        weights_of(table_of(np.zeros((2, 5))), plain(), "step")
+    with pytest.raises(UsageError, match="nothing can be drawn"):
+        weights_of(table_of(np.ones((2, 5)), np.arange(5) % 2 * np.ones((2, 1)) > 0), plain(), "step")

@@ -1,0 +1,54 @@
+"""Scores of a recorded drive against NumPy and SciPy on the recording itself."""
+
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+
+from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.logged import of_logs
+from drivax.curation.published import PublishedConfig
+from drivax.datasets.womd_scenario import WomdScenario
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+
+
+@pytest.fixture(scope="module")
+def recording(real_data):
+    pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
+    return next(iter(WomdScenario().read(real_data / "womd/motion_data_one_scenario.tfrecord")))
+
+
+@pytest.fixture(scope="module")
+def bank(recording):
+    return ScenarioBank.from_scenarios([assemble(recording)])
+
+
+def test_published_components_of_a_recorded_drive(recording, bank):
+    tracks, ego = recording.tracks, recording.ego
+    speed, heading = np.hypot(*tracks.velocity[ego].T), np.unwrap(tracks.heading[ego])
+
+    def twice(values):
+        first = np.diff(values, prepend=values[0]) / 0.1
+        return np.abs(np.diff(first, prepend=first[0])) / 0.1
+
+    found = {name: np.asarray(part[0]) for name, part in of_logs(PublishedConfig(), bank).items()}
+    # Headings go through a cosine and a sine in float32, which 1 / dt^2 makes a hundred times larger.
+    wanted = np.minimum(np.maximum(twice(speed) / 2.5, twice(heading) / 1.5), 1.0)
+    np.testing.assert_allclose(found["volatility"], wanted, atol=5e-3)
+    apart, closing = tracks.xy - tracks.xy[ego], tracks.velocity - tracks.velocity[ego]
+    product = np.where(tracks.valid, -(apart * closing).sum(2), 0.0).max(axis=0)
+    np.testing.assert_allclose(found["interaction"], np.clip(product / 1000, 0, 1), atol=2e-3)
+    np.testing.assert_allclose(found["density"], np.minimum(tracks.valid.sum(axis=0) / 50, 1.0), atol=1e-6)
+
+
+def test_jerk_of_a_recorded_drive_is_that_of_scipy(recording, bank):
+    tracks, ego = recording.tracks, recording.ego
+    heading = np.unwrap(tracks.heading[ego])
+    forward = np.stack([np.cos(heading), np.sin(heading)], -1)
+    speed = np.maximum((tracks.velocity[ego] * forward).sum(1), 0.0)
+    jerk = savgol_filter(np.diff(speed) / 0.1, 15, 2, deriv=1, delta=0.1)
+    yaw = savgol_filter((heading[1:] + heading[:-1]) / 2, 15, 3, deriv=2, delta=0.1)
+    wanted = np.minimum(np.maximum(np.abs(jerk) / 8.26, np.abs(yaw) / 3.86), 1.0)
+    found = np.asarray(of_logs(KinematicConfig(), bank)["volatility"][0])
+    np.testing.assert_allclose(found[:-1], wanted, atol=2e-3)
+    assert found[-1] == found[-2]
