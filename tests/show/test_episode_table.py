@@ -160,6 +160,6 @@ def test_plots_follow_the_player(page, tmp_path):
         at: plots[0].querySelector(".now").getAttribute("x1") });"""
     dom = browse(acted(page, act), tmp_path, "--dump-dom", "--window-size=390,900")
     found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
-    assert len(found["words"]) == 6 and found["words"][0] == "speed [m/s]" and found["lines"] == [3] * 6
+    assert len(found["words"]) == 8 and found["words"][0] == "speed [m/s]" and found["lines"] == [3] * 8
     assert float(found["speed"].split()[-1]) == pytest.approx(float(found["shown"].split()[0]), abs=0.051)
     np.testing.assert_allclose(float(found["at"]), 44 + 60 / 90 * (380 - 44 - 8), atol=0.1)

@@ -40,9 +40,12 @@ class About:
     text: str
 
 
-#: The column that evaluation adds to the metrics.
+#: The columns that evaluation adds to the metrics.
 ADDED = {
-    "crashed": About("-", "low", "the planner raised an error, or its action was no number: a failed episode")
+    "crashed": About("-", "low", "the planner raised an error, or its action was no number: a failed episode"),
+    "action_jerk": About(
+        "-", "low", "standard deviation of the change of the action from step to step; 0.82 is pure chance"
+    ),
 }
 
 
@@ -71,6 +74,7 @@ class Results:
         metrics: Values by metric name, NaN where undefined.
         events: First step of each kind of failure, -1 for none.
         motion: x, y, heading, speed per step from ``start`` on.
+        actions: What was carried out from ``start`` on, NaN from a crash on.
         start: Step of the log at which the episodes began.
         offroad_steps: Steps off the road.
         own: Those of the metrics that are the user's own: unit, direction and text.
@@ -84,6 +88,7 @@ class Results:
     metrics: Mapping[str, np.ndarray[Any, Any]]
     events: Mapping[str, np.ndarray[Any, Any]]
     motion: np.ndarray[Any, Any]
+    actions: np.ndarray[Any, Any]
     start: int
     offroad_steps: np.ndarray[Any, Any]
     own: Mapping[str, Metric] = field(default_factory=dict)
@@ -154,6 +159,7 @@ class Results:
             allow_pickle=False,
             scenario_id=np.array([row["scenario_id"] for row in self.scenarios]),
             ego=self.motion.astype(np.float32),
+            action=self.actions.astype(np.float16),
             start=np.full(len(self), self.start, np.int32),
             **arrays,
         )

@@ -33,6 +33,7 @@ class Episodes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
+        actions: What was carried out in each step: within bounds, and as the actuators let it be.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was no number, -1 for none. What follows it means nothing.
     """
@@ -40,6 +41,7 @@ class Episodes:
     metrics: dict[str, Value]
     events: dict[str, Int[Array, "*batch"]]
     motion: Float[Array, "*batch steps 4"]
+    actions: Float[Array, "*batch actions D"]
     offroad_steps: Int[Array, "*batch"]
     crashed: Int[Array, "*batch"]
 
@@ -91,14 +93,16 @@ def _episode(
     def one(now: Any, key: Array) -> Any:
         state, carry = now
         state, carry, sound = advanced(simulator, planner, bank, state, carry, key)
-        return (state, carry), (state.scene.history[-1], state.facts.offroad, sound)
+        scene = state.scene
+        return (state, carry), (scene.history[-1], scene.action, state.facts.offroad, sound)
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
-    (final, _), (motion, offroad, sound) = jax.lax.scan(one, (state, carry), keys)
+    (final, _), (motion, actions, offroad, sound) = jax.lax.scan(one, (state, carry), keys)
     return Episodes(
         metrics=episode_metrics(bank, final),
         events=first_steps(final.episode),
         motion=jnp.concatenate([state.scene.history[-1][None], motion]),
+        actions=actions,
         offroad_steps=offroad.sum().astype(jnp.int32),
         crashed=jnp.where(sound.all(), -1, start_step + jnp.argmin(sound)),
     )

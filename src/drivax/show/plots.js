@@ -92,7 +92,9 @@
     episode = event.detail;
     room.replaceChildren();
     const read = (drive, i) => values(drive.signals[i], signals[i].step);
-    plots = signals.map((signal, i) => plot(signal, episode.drives.map((drive) => read(drive, i))));
+    plots = signals.map((signal, i) => [signal, episode.drives.map((drive) => read(drive, i))])
+      .filter(([, lines]) => lines.flat().some((value) => value !== null))  // the log, for one, was given no commands
+      .map(([signal, lines]) => plot(signal, lines));
   });
 
   stage.addEventListener("moment", (event) => {

@@ -28,12 +28,14 @@ class Trajectories:
     Attributes:
         rows: (scenario id, how many rows of that scenario came before) -> row.
         ego: Position [m], heading [rad] and speed [m/s] at every step from ``start`` on.
+        action: What was asked of it from ``start`` on; without numbers in a run that does not tell.
         start: Step of the log at which the planner took over.
         events: Step of the first event by name (:data:`EVENTS`), -1 where there was none.
     """
 
     rows: Mapping[tuple[str, int], int]
     ego: Float32[Array, "episode step 4"]
+    action: Float32[Array, "episode action D"]
     start: Int64[Array, " episode"]
     events: Mapping[str, Int64[Array, " episode"]]
 
@@ -128,6 +130,7 @@ def _trajectories(path: Path) -> Trajectories:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             ids = [_text(value) for value in stored["scenario_id"]]
             ego = stored["ego"].astype(np.float32)
+            action = (stored["action"] if "action" in stored else ego[:, 1:, :0]).astype(np.float32)
             start = stored["start"].astype(np.int64)
             events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
     except KeyError as error:
@@ -135,7 +138,7 @@ def _trajectories(path: Path) -> Trajectories:
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
     n = len(ids)
-    if ego.ndim != 3 or ego.shape[0] != n or ego.shape[2] != 4 or any(
+    if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
         array.shape != (n,) for array in (start, *events.values())
     ):  # fmt: skip
         raise DataError("its arrays disagree in shape", file=path, cure=AGAIN)
@@ -144,7 +147,7 @@ def _trajectories(path: Path) -> Trajectories:
     for row, scenario_id in enumerate(ids):
         rows[scenario_id, seen.get(scenario_id, 0)] = row
         seen[scenario_id] = seen.get(scenario_id, 0) + 1
-    return Trajectories(rows, ego, start, events)
+    return Trajectories(rows, ego, action, start, events)
 
 
 def _text(value: Any) -> str:
