@@ -11,10 +11,11 @@ import drivax
 from drivax.api import load
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit
-from drivax.evaluation.results import ADDED, FAILED, KEYS, paired_differences, with_crashes
+from drivax.evaluation.results import ADDED, FAILED, KEYS, with_crashes
 from drivax.evaluation.runner import evaluate, evaluate_scenarios
 from drivax.evaluation.runs import format_crashes
-from drivax.evaluation.stored import read_episodes
+from drivax.evaluation.stored import EpisodeTable, read_episodes, read_evaluation
+from drivax.evaluation.tables import paired_difference, paired_differences, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
 from drivax.scenario.assemble import assemble
@@ -160,8 +161,23 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
     assert format_crashes(whole) == ""
     same = paired_differences(crashed, whole, "success")
     assert same.n == COUNT and same.mean <= 0
+    assert same == paired_difference(EpisodeTable.of(crashed), EpisodeTable.of(whole), "success")
+    elsewhere = [row | {"dataset": "other"} for row in whole.scenarios]
     with pytest.raises(UsageError, match="different scenarios"):
-        paired_differences(crashed, replace(whole, scenarios=whole.scenarios[::-1]), "success")
+        paired_differences(crashed, replace(whole, scenarios=elsewhere), "success")
+
+
+def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
+    """Segments of two data sets may share a name, and where none is known scenarios are their own clusters."""
+    names = [{"dataset": f"set-{row % 2}", "segment": "a" if row < 4 else ""} for row in range(COUNT)]
+    mixed = replace(whole, scenarios=[row | new for row, new in zip(whole.scenarios, names, strict=True)])
+    assert len(set(EpisodeTable.of(mixed).clusters)) == 2 + COUNT - 4
+    mixed.write(tmp_path)
+    (tmp_path / "run.json").write_text('{"kind": "evaluation", "planner": "fragile"}')
+    stored, summary = read_evaluation(tmp_path), json.loads((tmp_path / "summary.json").read_text())["metrics"]
+    for name in ("success", "offroad", "progress_ratio"):
+        told = summarise(stored, name).as_dict()
+        assert summary[name] == pytest.approx(told, rel=1e-4), name
 
 
 def test_crashes_by_hand():

@@ -233,8 +233,27 @@ def test_other_traffic_is_said_and_not_compared(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
-    assert "different scenarios or traffic" in parsed.text
-    assert all(row[1] == "other scenarios or traffic" for row in parsed.tables[2][1:])
+    said = "expert and policy drove in different traffic (idm and log)."
+    assert said in parsed.text and "constant and policy" not in parsed.text
+    assert all(
+        row[1] == "no pairs: drove in different traffic (idm and log)" for row in parsed.tables[2][1:]
+    )
+
+
+def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
+    """A noisy run from another step makes no pairs; one of two of the eight scenarios makes two."""
+    (runs[0] / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
+    (runs[2] / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
+    lines = (runs[1] / "episodes.csv").read_text().splitlines()
+    (runs[1] / "episodes.csv").write_text("\n".join(lines[:3]) + "\n")
+    page = Page(write_report(runs, tmp_path / "report.html").read_text())
+    assert (
+        "expert and policy differ in noisy_start (True and False); "
+        "constant and policy have 2 of 2 and 8 scenarios in common." in page.text
+    )
+    assert all("no pairs" in row[1] and "no pairs" not in row[2] for row in page.tables[2][1:])
+    drives = [json.loads(t)["drives"] for a, t in page.scripts if a.get("class") == "episode"]
+    assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 
 def test_the_command(runs, tmp_path, capsys):

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from drivax.errors import DataError, UsageError
-from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap, rate
+from drivax.errors import DataError
+from drivax.evaluation.clusters import recordings
+from drivax.evaluation.statistics import Interval, bootstrap_mean, rate
 from drivax.metrics.catalogue import EVENTS, METRICS, Metric
 
 #: Columns of ``episodes.csv`` before the metrics.
@@ -100,10 +101,11 @@ class Results:
     def summary(self) -> dict[str, Any]:
         """Mean and 95 % interval of every metric, as ``summary.json`` holds them.
 
-        Rates have Wilson's interval over the effective number of segments, other means a bootstrap over segments. A
+        Rates have Wilson's interval over the effective number of recordings, other means a bootstrap over them. A
         metric that is defined nowhere has null mean and n 0.
         """
-        clusters = np.array([row["segment"] for row in self.scenarios])
+        rows = ([row[key] for row in self.scenarios] for key in ("dataset", "segment", "scenario_id"))
+        clusters = np.array(recordings(*rows))
         table = {
             name: interval_of(name, values, clusters).as_dict()
             for name, values in self.metrics.items()
@@ -196,19 +198,6 @@ def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95,
     if name in RATES:
         return rate(values, clusters, confidence)
     return bootstrap_mean(values, clusters, confidence, seed=seed)
-
-
-def paired_differences(one: Results, other: Results, metric: str) -> Interval:
-    """Mean difference of a metric over the scenarios of both, ``one - other``, with its 95 % interval.
-
-    Raises:
-        UsageError: If they did not drive the same scenarios.
-    """
-    ids = [[row["scenario_id"] for row in result.scenarios] for result in (one, other)]
-    if ids[0] != ids[1]:
-        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
-    clusters = np.array([row["segment"] for row in one.scenarios])
-    return paired_bootstrap(one.metrics[metric], other.metrics[metric], clusters, seed=0)
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

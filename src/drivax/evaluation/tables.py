@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from drivax.evaluation.results import interval_of
+from drivax.errors import UsageError
+from drivax.evaluation.results import Results, interval_of
 from drivax.evaluation.statistics import NOTHING, Interval, paired_bootstrap, rate
 from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, comparable
 from drivax.scenario.tags import TAGS
@@ -93,6 +94,18 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
     pairs = Pairs.of(run, other)
     mine, theirs = pairs.values(run, metric), pairs.values(other, metric)
     return paired_bootstrap(mine, theirs, pairs.clusters, CONFIDENCE, seed=SEED)
+
+
+def paired_differences(one: Results, other: Results, metric: str) -> Interval:
+    """:func:`paired_difference` of evaluations that have just been made.
+
+    Raises:
+        UsageError: If they did not drive the same scenarios.
+    """
+    tables = EpisodeTable.of(one), EpisodeTable.of(other)
+    if len({frozenset(table.scenarios) for table in tables}) > 1:
+        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
+    return paired_difference(*tables, metric)
 
 
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:

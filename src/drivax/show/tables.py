@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from drivax.evaluation.statistics import Interval
-from drivax.evaluation.stored import comparable
+from drivax.evaluation.stored import mismatch
 from drivax.evaluation.tables import Row, Table, summarise
 from drivax.show.comparison import Difference, difference
 from drivax.show.glossary import ARROWS, Note, note
@@ -158,17 +158,17 @@ def _best(intervals: Sequence[Interval], entry: Note) -> float | None:
 
 
 def _difference_cell(policy: Evaluation, other: Evaluation, metric: str) -> str:
-    if not comparable(policy, other):
-        return "<td class=undefined>other scenarios or traffic</td>"
-    found: Difference = difference(policy, other, metric)
-    if found.interval.mean is None:
+    if found := mismatch(policy, other):
+        return f"<td class=undefined>no pairs: {escape(found[0])}</td>"
+    compared: Difference = difference(policy, other, metric)
+    if compared.interval.mean is None:
         return '<td class=undefined title="no scenario where both are defined">–<small>n 0</small></td>'
     unit = note(metric, [policy]).unit
     points = " points" if unit == "rate" else ""
-    sign, words = _VERDICTS[found.verdict]
+    sign, words = _VERDICTS[compared.verdict]
     return (
-        f"<td class={found.verdict}><b>{number(found.interval.mean, unit, signed=True)}{points}</b>"
-        f"<em>{sign} {words}</em><small>{bounds(found.interval, unit, signed=True)}, n {found.interval.n}</small></td>"
+        f"<td class={compared.verdict}><b>{number(compared.interval.mean, unit, signed=True)}{points}</b>"
+        f"<em>{sign} {words}</em><small>{bounds(compared.interval, unit, signed=True)}, n {compared.interval.n}</small></td>"
     )
 
 
