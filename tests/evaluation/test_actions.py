@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ def test_action_jerk_is_the_deviation_of_differences():
     actions = np.random.default_rng(3).uniform(-1, 1, (4, 80, 2))
     found = action_jerk(actions)
     for row, mine in enumerate(actions):
-        of = [statistics.pvariance([b - a for a, b in zip(one, one[1:], strict=False)]) for one in mine.T.tolist()]
+        of = [statistics.pvariance([b - a for a, b in pairwise(one)]) for one in mine.T.tolist()]
         assert found[row] == pytest.approx(statistics.fmean(of) ** 0.5)
     large = action_jerk(np.random.default_rng(4).uniform(-1, 1, (1, 100_000, 2)))
     assert large[0] == pytest.approx((2 / 3) ** 0.5, abs=0.01), "what the docstring says of chance"

@@ -174,7 +174,10 @@ def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
     assert len(set(EpisodeTable.of(mixed).clusters)) == 2 + COUNT - 4
     mixed.write(tmp_path)
     (tmp_path / "run.json").write_text('{"kind": "evaluation", "planner": "fragile"}')
-    stored, summary = read_evaluation(tmp_path), json.loads((tmp_path / "summary.json").read_text())["metrics"]
+    stored, summary = (
+        read_evaluation(tmp_path),
+        json.loads((tmp_path / "summary.json").read_text())["metrics"],
+    )
     for name in ("success", "offroad", "progress_ratio"):
         told = summarise(stored, name).as_dict()
         assert summary[name] == pytest.approx(told, rel=1e-4), name

@@ -8,12 +8,14 @@ import math
 import re
 import shutil
 import subprocess
+from html import unescape
 
 import pytest
 
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.show.exports import tex, write_tables
+from drivax.show.report import write_report
 
 LATEX = next(filter(None, map(shutil.which, ("pdflatex", "xelatex", "tectonic"))), None)
 NASTY = r"50% of_a & b #1 {x} $y^2$ ~ \cmd <i>|é|😀"
@@ -138,4 +140,8 @@ def test_transfer_needs_two_sets(runs, tmp_path):
     with written["transfer-success.csv"].open(newline="") as file:
         rows = list(csv.DictReader(file))
     told = {(r["planner"], r["trained_on"], r["evaluated_on"]): float(r["mean"]) for r in rows}
+    page = write_report(runs, tmp_path / "report.html").read_text()
+    transfer = page[page.index("<h2>Transfer") : page.index("<h2>Kinds")]
+    behind = {json.loads(unescape(found))["run"] for found in re.findall(r'data-behind="(.*?)"', transfer)}
+    assert behind == {"expert", "constant", "policy"}
     assert told["expert", "b", "b"] == 1.0 and math.isclose(told["policy", "–", "hand-made roads"], 3 / 8)

@@ -40,5 +40,7 @@ def action_jerk(actions: Float[Array, "episode step D"]) -> Float64[Array, " epi
     """
     change = np.diff(np.asarray(actions, np.float64), axis=1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # an episode of less than two actions has an empty mean
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # an episode of less than two actions has an empty mean
         return np.sqrt(np.nanvar(change, axis=1).mean(axis=-1))

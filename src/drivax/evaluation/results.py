@@ -43,7 +43,9 @@ class About:
 
 #: The columns that evaluation adds to the metrics.
 ADDED = {
-    "crashed": About("-", "low", "the planner raised an error, or its action was no number: a failed episode"),
+    "crashed": About(
+        "-", "low", "the planner raised an error, or its action was no number: a failed episode"
+    ),
     "action_jerk": About(
         "-", "low", "standard deviation of the change of the action from step to step; 0.82 is pure chance"
     ),

@@ -21,6 +21,8 @@ CONFIDENCE = 0.95
 SEED = 0
 #: Tags by which results are broken down.
 STRATA = ("difficulty", "type", "density")
+#: The word of a scenario that lacks a tag.
+UNKNOWN = "unknown"
 #: What a kind of collision says about the driver: name and reading.
 READINGS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
     {
@@ -37,10 +39,11 @@ READINGS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of a table: which metric, and its interval."""
+    """One number of a table: which metric, its interval, and the run behind it where row and column do not say."""
 
     metric: str
     interval: Interval
+    run: str | None = None
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ def strata_table(
         tag: By which one to break down; a scenario without it counts as ``unknown``.
         metrics: Columns.
     """
-    words = {run.name: [tags.get(key, {}).get(tag, "unknown") for key in run.scenarios] for run in runs}
+    words = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
     order = {word: place for place, word in enumerate(TAGS.get(tag, ()))}
     values = {word for found in words.values() for word in found}
     rows = []
@@ -205,7 +208,7 @@ def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
         labels = (str(run.about.get("planner", run.name)), trained, run.traffic)
         if where in found.get(labels, {}):
             labels = (run.name, *labels[1:])
-        found.setdefault(labels, {})[where] = Cell(metric, summarise(run, metric))
+        found.setdefault(labels, {})[where] = Cell(metric, summarise(run, metric), run.name)
     columns = tuple(dict.fromkeys(driven))
     rows = tuple(Row(labels, tuple(cells.get(name) for name in columns)) for labels, cells in found.items())
     caption = f"By training and evaluation data: mean and {CONFIDENCE:.0%} interval"

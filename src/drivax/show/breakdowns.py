@@ -95,9 +95,14 @@ def transfer_tables(runs: Sequence[Evaluation]) -> list[Table]:
 
 def transfer_section(runs: Sequence[Evaluation]) -> str:
     """What was trained where and how it drives elsewhere; empty where all runs drove one set."""
+
+    def behind(row: Row, place: int) -> dict[str, Any]:
+        cell = row.cells[place]
+        return {"run": cell.run, "metric": cell.metric} if cell else {}
+
     parts = [
         f"<h3>{escape(note(table.name.removeprefix('transfer-'), runs).label)}</h3>"
-        f"{table_html(table, runs, lambda row, place: None)}"
+        f"{table_html(table, runs, behind)}"
         for table in transfer_tables(runs)
     ]
     return (

@@ -9,6 +9,7 @@ import numpy as np
 
 from drivax.evaluation.results import RATES
 from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.tables import UNKNOWN
 from drivax.show.breakdowns import Tags
 from drivax.show.comparison import metric_names
 from drivax.show.glossary import CODES, note, ordered
@@ -44,7 +45,7 @@ def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[Scenari
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
     metric with four significant digits, null where undefined, rows worst first; ``tags`` holds for each tag its words
-    and for each scenario the number of its word, -1 without.
+    and for each scenario the number of its word, which is ``unknown`` where it has none.
 
     Args:
         runs: Evaluations, the policy last.
@@ -106,9 +107,9 @@ def _short(value: float) -> float:
 def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     found = []
     for name in dict.fromkeys(name for words in tagged for name in words):
-        words = sorted({one[name] for one in tagged if name in one})
+        said = [one.get(name, UNKNOWN) for one in tagged]
+        words = sorted(set(said))
         if 1 < len(words) <= MOST_VALUES:
             number = {word: place for place, word in enumerate(words)}
-            of = [number.get(one.get(name, ""), -1) for one in tagged]
-            found.append({"name": name, "words": words, "of": of})
+            found.append({"name": name, "words": words, "of": [number[word] for word in said]})
     return found

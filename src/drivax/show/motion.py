@@ -1,4 +1,4 @@
-"""What a driven path says about driving: speed, accelerations, jerk, yaw rate, curvature, for plots; and what was asked of the car."""
+"""What plots show of a drive: speed, accelerations, jerk, yaw rate and curvature of its path, and the commands."""
 
 from __future__ import annotations
 

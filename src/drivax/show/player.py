@@ -40,8 +40,8 @@ def player_html() -> str:
         "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript>"
         "<h3>How it drove</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the filters "
         "of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are what was "
-        "carried out: acceleration (or metres ahead) and steering (or metres to the left), as shares of the most that the "
-        "action space allows.</small></p>"
+        "carried out: acceleration (or metres ahead) and steering (or metres to the left), as shares of the most "
+        "that the action space allows.</small></p>"
     )
 
 

@@ -52,14 +52,14 @@ def difference_table(policy: Evaluation, others: Sequence[Evaluation], metrics: 
 
 
 def table_html(
-    table: Table, runs: Sequence[Evaluation], behind: Callable[[Row, int], Mapping[str, Any] | None]
+    table: Table, runs: Sequence[Evaluation], behind: Callable[[Row, int], Mapping[str, Any]]
 ) -> str:
     """A table of ``evaluation.tables``.
 
     Args:
         table: The table; metrics, where it has any, stand in its columns.
         runs: Evaluations, which say what metrics of the user's own are.
-        behind: From a row and the number of a column to what the page's list of episodes is asked for; None: nothing.
+        behind: From a row and the number of a column to what the page's list of episodes is asked for.
     """
     keys = "".join(f"<th scope=col>{escape(key)}</th>" for key in table.keys)
     named = table.across == "metric"
@@ -144,9 +144,14 @@ def _cell(
     if interval.mean is None:
         return '<td class=undefined title="undefined in every episode">–<small>n 0</small></td>'
     mark = " class=best" if best is not None and interval.mean == best else ""
-    mark += f' data-behind="{escape(json.dumps(behind))}"' if behind else ""
+    mark += _behind(behind) if behind else ""
     mean = number(interval.mean, entry.unit) + percent(entry.unit)
     return f"<td{mark}><b>{mean}</b><small>{bounds(interval, entry.unit)}</small><small>n {interval.n}</small></td>"
+
+
+def _behind(asked: Mapping[str, Any]) -> str:
+    """The attribute that leads from a cell to the page's list of episodes."""
+    return f' data-behind="{escape(json.dumps(asked))}"'
 
 
 def _best(intervals: Sequence[Interval], entry: Note) -> float | None:
@@ -166,9 +171,12 @@ def _difference_cell(policy: Evaluation, other: Evaluation, metric: str) -> str:
     unit = note(metric, [policy]).unit
     points = " points" if unit == "rate" else ""
     sign, words = _VERDICTS[compared.verdict]
+    mean = number(compared.interval.mean, unit, signed=True) + points
+    between = bounds(compared.interval, unit, signed=True)
+    behind = _behind({"run": policy.name, "metric": metric})
     return (
-        f"<td class={compared.verdict}><b>{number(compared.interval.mean, unit, signed=True)}{points}</b>"
-        f"<em>{sign} {words}</em><small>{bounds(compared.interval, unit, signed=True)}, n {compared.interval.n}</small></td>"
+        f"<td class={compared.verdict}{behind}><b>{mean}</b><em>{sign} {words}</em>"
+        f"<small>{between}, n {compared.interval.n}</small></td>"
     )
 
 
