@@ -78,7 +78,7 @@ def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
     packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
     (one, task), (best, _) = load_policy(packed.path, bank), load_policy(run.path, bank, step=4)
     assert task == settings.load(TrainConfig, TINY).task and one.name == "packed"
-    assert jax.tree.structure(replace(one, name="bold")) == jax.tree.structure(best)
+    assert jax.tree.structure(replace(one, name="bold@4")) == jax.tree.structure(best)
     for mine, its in zip(weights(one), weights(best), strict=True):
         np.testing.assert_array_equal(mine, its)
     newest, _ = load_policy(run.path, bank, step=8)

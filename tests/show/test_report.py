@@ -203,7 +203,7 @@ def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch
     before = out.read_bytes()
     with pytest.raises(UsageError, match="--overwrite"):
         write_report(runs, out)
-    with pytest.raises(UsageError, match="name an HTML file"):
+    with pytest.raises(UsageError, match="name a file in it"):
         write_report(runs, out.parent, overwrite=True)
     with pytest.raises(UsageError, match="-1 episodes"):
         write_report(runs, tmp_path / "new.html", episodes=-1)

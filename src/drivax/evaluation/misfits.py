@@ -28,7 +28,8 @@ def refuse_misfits(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None
     if len({table.folder.resolve() for table in tables}) < len(tables):
         raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
     for side in (a, b):
-        planners = {re.sub(r"[0-9]+$", "", table.name): table.name for table in side}
+        # The seeds of a policy are numbered at the end, before the checkpoint; two checkpoints are two planners.
+        planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
         if len(planners) > 1:
             names = ", ".join(sorted(planners.values()))
             raise UsageError(

@@ -195,17 +195,38 @@ def _set_name(entry: Mapping[str, Any]) -> str:
     return str(entry.get("name") or (Path(str(path)).name if path else _set_key(entry)[:12]))
 
 
+def _planner_key(run: EpisodeTable) -> str:
+    """Who drove: what the command called it, or else the planner's name."""
+    return str(run.settings.get("planner") or run.about.get("planner", run.name))
+
+
+def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
+    """A name for each planner by its key: its own, or where two share that, as much of their paths as it takes."""
+    own = {_planner_key(run): str(run.about.get("planner", run.name)) for run in runs}
+    named = {}
+    for key, name in own.items():
+        paths = [Path(other).parts for other in own if other != key and own[other] == name]
+        parts = Path(key).parts
+        take = next(
+            (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths)), len(parts)
+        )
+        named[key] = "/".join(parts[-take:]) if paths else name
+    return named
+
+
 def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     """What was trained in rows, what was driven in columns: a metric of every pair that was evaluated.
 
-    Where the same planner drove one set more than once (from other starts, say), each run has a row of its own.
+    A planner is who the command named, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``) stay apart. Where
+    the same one drove one set more than once (from other starts, say), each run has a row of its own.
     """
+    planners = _planner_names(runs)
     names = set_names(runs)
     driven = [names[_set_key(run.data)] for run in runs]
     found: dict[tuple[str, ...], dict[str, Cell]] = {}
     for run, where in zip(runs, driven, strict=True):
         trained = ", ".join(names[_set_key(entry)] for entry in _trained_on(run)) or "–"
-        labels = (str(run.about.get("planner", run.name)), trained, run.traffic)
+        labels = (planners[_planner_key(run)], trained, run.traffic)
         if where in found.get(labels, {}):
             labels = (run.name, *labels[1:])
         found.setdefault(labels, {})[where] = Cell(metric, summarise(run, metric), run.name)
