@@ -62,6 +62,9 @@ def test_kinds_of_collision_are_shares_of_all_episodes():
     kinds = [1, 1, 3, 6, 0, 0, 0, 0, 0, 0, np.nan, np.nan]
     table = collisions_table([run("a", {"collision_type": kinds}), run("old", {"success": [1] * N})])
     assert table.columns == ("a",), "a run that does not know kinds has no column"
+    assert "share of the episodes in which they are known" in table.caption
+    whole = collisions_table([run("a", {"collision_type": [*kinds[:10], 0, 2]})])
+    assert "share of all episodes" in whole.caption and {row.cells[0].interval.n for row in whole.rows} == {N}
     assert set(READINGS) == set(CollisionType) - {CollisionType.NONE}
     found = dict(zip((row.labels[0] for row in table.rows), means(table), strict=True))
     assert found["rear end"] == [0.2] and found["side"] == [0.1] and found["standing object"] == [0.1]

@@ -108,6 +108,7 @@ def _lacks(folder):
         (_edit("episodes.csv", "log,0", "log,inf"), "record 1: collision is infinite"),
         (_edit("episodes.csv", "log,0", "log,0,0"), "record 1: has"),
         (_cut("trajectories.npz"), "cannot be read"),
+        (_write("crashes.json", '[{"dataset": "hand"}]'), "crashes.json: cannot be read ('scenario_id')"),
         (_shapes, "disagree in shape"),
         (_lacks, "lacks an array"),
     ],

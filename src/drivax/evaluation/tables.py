@@ -131,8 +131,10 @@ def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metr
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
-    """Kinds of the first collision in rows, runs in columns: share of all episodes."""
+    """Kinds of the first collision in rows, runs in columns: share of the episodes in which they are known."""
     runs = [run for run in runs if "collision_type" in run.metrics]
+    known = not any(np.isnan(run.metrics["collision_type"]).any() for run in runs)
+    of = "all episodes" if known else "the episodes in which they are known (n)"
     rows = []
     for code, (words, _) in READINGS.items():
         cells = []
@@ -141,7 +143,7 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
             found = rate(np.where(np.isnan(kinds), np.nan, kinds == code), run.clusters, CONFIDENCE)
             cells.append(Cell("collision", found))
         rows.append(Row((words,), tuple(cells)))
-    caption = f"First collisions by kind: share of all episodes with {CONFIDENCE:.0%} interval"
+    caption = f"First collisions by kind: share of {of} with {CONFIDENCE:.0%} interval"
     names = tuple(run.name for run in runs)
     return Table("collisions", caption, ("first collision",), "planner", names, tuple(rows))
 
@@ -217,8 +219,8 @@ def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
 def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     """What was trained in rows, what was driven in columns: a metric of every pair that was evaluated.
 
-    A planner is who the command named, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``) stay apart. Where
-    the same one drove one set more than once (from other starts, say), each run has a row of its own.
+    A planner is who the command named, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``) stay apart.
+    Where the same one drove one set more than once (from other starts, say), each run has a row of its own.
     """
     planners = _planner_names(runs)
     names = set_names(runs)

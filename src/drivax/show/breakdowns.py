@@ -51,8 +51,8 @@ def collision_section(runs: Sequence[Evaluation]) -> str:
     )
     return (
         f"<section><h2>Kinds of collision</h2><p>Episodes with a collision: {total}.</p>"
-        f"{table_html(table, runs, behind)}<dl class=metrics>{readings}</dl><p><small>Of the first collision of an "
-        "episode; share of all episodes, with Wilson's 95 % interval.</small></p></section>"
+        f"{table_html(table, runs, behind)}<dl class=metrics>{readings}</dl><p><small>{escape(table.caption)} "
+        "(Wilson's).</small></p></section>"
     )
 
 

@@ -72,6 +72,7 @@ def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
     driven = stored.ego[place, : steps - start]
     ego[start : start + len(driven)] = driven
     events = {name: int(at[place]) for name, at in stored.events.items()}
+    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
     action, asked = np.full((steps, COMMANDED), np.nan), stored.action[place, : steps - start, :COMMANDED]
     action[start : start + len(asked), : asked.shape[1]] = asked
     return Drive(run.name, ego, start, events, outcome(run, row), action)

@@ -201,7 +201,9 @@ def _drive(drive: Drive, scale: Scale, steps: int) -> dict[str, Any]:
         "speed": _text(speed.astype(np.int16)),
         "signals": _signals(ego, drive.action),
         "start": drive.start,
-        "events": {name: drive.events[name] for name in EVENTS if drive.events.get(name, -1) >= 0},
+        "events": {
+            name: drive.events[name] for name in (*EVENTS, "crashed") if drive.events.get(name, -1) >= 0
+        },
         "outcome": drive.outcome,
     }
 

@@ -100,7 +100,7 @@
   }
 
   function drawRow(row) {
-    const { scenario, outcome, outcomes: words, values, playable } = run();
+    const { scenario, outcome, outcomes: words, values, playable, errors } = run();
     const line = make("tr", rows), head = make("th", line), number = scenario[row];
     head.scope = "row";
     const player = playable ? players[data.played[number]] : undefined;
@@ -112,7 +112,8 @@
     } else make("span", head, data.scenarios[number]);
     make("small", head, data.tags.map((tag) => tag.words[tag.of[number]])
       .filter((word) => word !== "unknown").slice(0, 4).join(" · "));
-    make("td", line, words[outcome[row]], words[outcome[row]] === "success" ? "good" : "bad");
+    const cell = make("td", line, words[outcome[row]], words[outcome[row]] === "success" ? "good" : "bad");
+    if (errors[row]) cell.title = `step ${errors[row][0]}: ${errors[row][1]}`;
     for (const i of columns()) {
       const metric = data.metrics[i], value = values[i][row];
       make("td", line, text(value, metric), metric.bad !== null && value === metric.bad ? "bad" : "");

@@ -44,8 +44,9 @@ def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[Scenari
     """The data of the list as a script element.
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
-    metric with four significant digits, null where undefined, rows worst first; ``tags`` holds for each tag its words
-    and for each scenario the number of its word, which is ``unknown`` where it has none.
+    metric with four significant digits, null where undefined, rows worst first, ``runs[].errors`` by row the step and
+    the words of a crash; ``tags`` holds for each tag its words and for each scenario the number of its word, which is
+    ``unknown`` where it has none.
 
     Args:
         runs: Evaluations, the policy last.
@@ -88,6 +89,11 @@ def _run(
         "scenario": [place[scenarios[row]] for row in rows],
         "outcomes": words,
         "outcome": [words.index(word) for word in outcomes],
+        "errors": {
+            str(place): run.crashes[scenarios[row]]
+            for place, row in enumerate(rows)
+            if scenarios[row] in run.crashes
+        },
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
 

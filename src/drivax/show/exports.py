@@ -43,7 +43,7 @@ def write_tables(
         out: The folder.
         data: The scenario set that was driven, where it has moved.
         overwrite: Replace existing files.
-        metrics: In ``results`` and ``differences`` beside the usual ones: columns of ``episodes.csv``, or a set of them.
+        metrics: In ``results`` and ``differences`` beside the usual ones: columns of ``episodes.csv``, or a set.
 
     Returns:
         The files.

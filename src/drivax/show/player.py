@@ -8,7 +8,7 @@ from typing import Any
 
 from drivax.show.motion import COMMANDS, SIGNALS
 from drivax.show.page import asset, data_element
-from drivax.show.palette import LEGEND, SERIES, THEMES
+from drivax.show.palette import LEGEND, STROKES, THEMES
 
 KEYS = (
     ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
@@ -52,9 +52,10 @@ def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
         {"words": one.title, "unit": one.unit, "step": one.step, "limits": one.limits}
         for one in (*SIGNALS, *COMMANDS)
     ]
+    strokes = [[one.colour, one.dash, one.key] for one in STROKES]
     head = [
         data_element(themes, id="palette"),
-        data_element({"signals": signals, "colours": SERIES}, id="signals"),
+        data_element({"signals": signals, "strokes": strokes}, id="signals"),
     ]
     return head + [data_element(episode, **{"class": "episode"}) for episode in episodes]
 

@@ -9,6 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivax.errors import UsageError
 from drivax.evaluation.stored import ScenarioKey, comparable, mismatch
 from drivax.evaluation.tables import CONFIDENCE, summarise
@@ -118,7 +120,7 @@ def _lead(runs: Sequence[Evaluation]) -> str:
 
 def _results(runs: Sequence[Evaluation]) -> str:
     names = metric_names(runs)
-    first = headline(names)
+    first = _first(runs, names)
     rest = [name for name in ordered(names) if name not in first]
     more = (
         f"<details><summary>{len(rest)} more metrics</summary>{planner_table(runs, rest)}</details>"
@@ -132,6 +134,12 @@ def _results(runs: Sequence[Evaluation]) -> str:
         "leads to the episodes behind it. Intervals: Wilson's for rates (with the effective number of episodes "
         "where some share a recording), a bootstrap over recordings otherwise.</small></p></section>"
     )
+
+
+def _first(runs: Sequence[Evaluation], names: Sequence[str]) -> list[str]:
+    """The headline; with the crashes, where there were any."""
+    crashed = any(run.metrics.get("crashed", np.zeros(1)).any() for run in runs)
+    return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
 
 
 def _warning(runs: Sequence[Evaluation]) -> str:
@@ -151,7 +159,7 @@ def _warning(runs: Sequence[Evaluation]) -> str:
 
 def _differences(runs: Sequence[Evaluation]) -> str:
     policy, others = runs[-1], runs[:-1]
-    names = headline(list(policy.metrics)) or ordered(list(policy.metrics))
+    names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
     if not others or not names:
         return ""
     return (

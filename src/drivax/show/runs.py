@@ -6,7 +6,7 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.stored import AGAIN, EpisodeTable, present, read_about, read_episodes
+from drivax.evaluation.stored import AGAIN, EpisodeTable, ScenarioKey, present, read_about, read_episodes
 from drivax.metrics.catalogue import EVENTS
 from drivax.tracking.runs import seed_folders
 
@@ -46,9 +46,11 @@ class Evaluation(EpisodeTable):
 
     Attributes:
         trajectories: What was driven.
+        crashes: Of the scenarios in which the planner crashed, the step and what it raised.
     """
 
     trajectories: Trajectories
+    crashes: Mapping[ScenarioKey, tuple[int, str]] = field(default_factory=dict)
 
     @property
     def occurrences(self) -> list[tuple[str, int]]:
@@ -122,7 +124,19 @@ def _unique(name: str, folder: Path, names: set[str]) -> str:
 
 def _evaluation(folder: Path, name: str, about: Mapping[str, Any]) -> Evaluation:
     columns = read_episodes(folder)
-    return Evaluation(folder, name, about, *columns, _trajectories(present(folder / "trajectories.npz")))
+    driven = _trajectories(present(folder / "trajectories.npz"))
+    return Evaluation(folder, name, about, *columns, driven, _crashes(folder / "crashes.json"))
+
+
+def _crashes(path: Path) -> dict[ScenarioKey, tuple[int, str]]:
+    """What ``crashes.json`` tells; nothing where the planner never crashed."""
+    if not path.is_file():
+        return {}
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        return {(row["dataset"], row["scenario_id"]): (int(row["step"]), str(row["error"])) for row in rows}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
 
 
 def _trajectories(path: Path) -> Trajectories:
