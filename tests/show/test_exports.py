@@ -15,7 +15,8 @@ from markdown_it import MarkdownIt
 
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
-from drivax.show.exports import tex, write_tables
+from drivax.evaluation.tables import Row, Table
+from drivax.show.exports import latex, tex, write_tables
 from drivax.show.report import write_report
 
 LATEX = next(filter(None, map(shutil.which, ("pdflatex", "xelatex", "tectonic"))), None)
@@ -125,6 +126,7 @@ def test_latex_is_sound(written):
 
 def test_special_characters_by_hand():
     assert tex("a_b & 5 %") == r"a\_b \& 5 \%"
+    assert tex("[0.5]") == "{[}0.5]", "behind the end of a row a bracket would begin an option"
     assert tex("−1.5 m/s²") == r"$-$1.5 m/s$^2$"
     assert tex("\\x{}") == r"\textbackslash{}x\{\}"
     assert tex("é😀\n") == r"é\texttt{U+1F600}\texttt{U+000A}"
@@ -133,6 +135,8 @@ def test_special_characters_by_hand():
 @pytest.mark.skipif(LATEX is None, reason="no LaTeX on this machine")
 def test_latex_compiles(written, tmp_path):
     inputs = "\n\n".join(rf"\input{{{file}}}" for name, file in written.items() if name.endswith(".tex"))
+    rows = tuple(Row((name,), (None,)) for name in (NASTY, HARD, "[b]"))
+    inputs += latex(Table("names", "Names", ("planner",), "metric", ("success",), rows), ())
     paper = tmp_path / "paper.tex"
     paper.write_text("\\documentclass{article}\n\\begin{document}\n" + inputs + "\n\\end{document}\n")
     command = [

@@ -30,7 +30,7 @@ def action_jerk(actions: Float[Array, "episode step D"]) -> Float64[Array, " epi
     """Standard deviation of the change of the action from one step to the next, the root of the mean over its numbers.
 
     ``sqrt(mean_d var_t(a[t + 1, d] - a[t, d]))`` with the population's variance. A steady change (a ramp) has none;
-    uniform random actions in [-1, 1] have about ``sqrt(2 / 3) = 0.82``.
+    uniform random actions in [-1, 1] have about ``sqrt(2 / 3) = 0.82``. In the units of the action space.
 
     Args:
         actions: NaN where there is none.
@@ -40,7 +40,6 @@ def action_jerk(actions: Float[Array, "episode step D"]) -> Float64[Array, " epi
     """
     change = np.diff(np.asarray(actions, np.float64), axis=1)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # an episode of less than two actions has an empty mean
+        # Less than two actions have no change, of which NumPy warns.
+        warnings.simplefilter("ignore", RuntimeWarning)
         return np.sqrt(np.nanvar(change, axis=1).mean(axis=-1))

@@ -138,7 +138,7 @@ def _results(runs: Sequence[Evaluation]) -> str:
 
 def _first(runs: Sequence[Evaluation], names: Sequence[str]) -> list[str]:
     """The headline; with the crashes, where there were any."""
-    crashed = any(run.metrics.get("crashed", np.zeros(1)).any() for run in runs)
+    crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
     return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
 
 

@@ -149,7 +149,7 @@ def _trajectories(path: Path) -> Trajectories:
             events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
     except KeyError as error:
         raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=AGAIN) from error
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
     n = len(ids)
     if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
