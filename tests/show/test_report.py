@@ -274,7 +274,7 @@ def test_other_traffic_is_said_and_not_compared(runs, tmp_path):
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
     said = "expert and policy drove in different traffic (idm and log)."
     assert said in parsed.text and "constant and policy" not in parsed.text
-    assert all(row[1] == "no pairs: drove in different traffic (idm and log)" for row in parsed.tables[2][1:])
+    assert all(row[1] == "no pairs: drove in different traffic (log and idm)" for row in parsed.tables[2][1:])
 
 
 def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
