@@ -22,7 +22,7 @@ def until_crash(
         start: The step of the log of the first action.
     """
     step = start + np.arange(actions.shape[1])
-    own = (np.asarray(crashed)[:, None] < 0) | (step < np.asarray(crashed)[:, None])
+    own = (crashed[:, None] < 0) | (step < crashed[:, None])
     return np.where(own[..., None], actions, np.nan)
 
 

@@ -237,7 +237,7 @@ class _Trial:
         """
         self._refuse_nan(episodes, names)
         found = episodes.metrics
-        actions = until_crash(np.asarray(episodes.actions), episodes.crashed, self.start_step)
+        actions = until_crash(np.asarray(episodes.actions), np.asarray(episodes.crashed), self.start_step)
         metrics = {"action_jerk": action_jerk(actions)} | {
             name: np.where(found[name].defined, found[name].value, np.nan) for name in self.metrics
         }
