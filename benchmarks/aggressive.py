@@ -30,9 +30,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results, interval_of, paired_differences
+from drivax.evaluation.results import Results, interval_of
 from drivax.evaluation.rollout import drive, judging
 from drivax.evaluation.runner import evaluate
+from drivax.evaluation.tables import paired_differences
 from drivax.learning.policies import load_policy, pack_policy
 from drivax.learning.policy_traffic import find_traffic, policy_traffic
 from drivax.planners.catalogue import make_planner

@@ -21,13 +21,13 @@ from drivax.api import find_planner
 from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate
+from drivax.evaluation.stored import EpisodeTable
 from drivax.learning.policy_traffic import find_traffic
 from drivax.scenario.assemble import assemble, windows
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.schema import Scenario
-from drivax.show.selection import FAILURES
+from drivax.show.selection import outcome
 from drivax.tracking.runs import versions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,15 +50,6 @@ def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
                 yield file.relative_to(data).parts[0], assemble(window)
 
 
-def outcome(results: Results, row: int) -> str:
-    """The gravest failure, ``success``, or ``unjudged``."""
-    values = [float(results.metrics[metric][row]) for _, metric, _ in FAILURES]
-    for (words, _, bad), value in zip(FAILURES, values, strict=True):
-        if value == bad:
-            return words
-    return "unjudged" if np.isnan(values).all() else "success"
-
-
 def measured(data: Path) -> dict[str, Any]:
     """Outcome, score and progress of every planner, scenario by scenario."""
     sources, scenarios = zip(*scenarios_of(data), strict=True)
@@ -69,9 +60,10 @@ def measured(data: Path) -> dict[str, Any]:
         driver, task = find_planner(planner, bank, False)
         for kind in TRAFFIC:
             results = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
+            table = EpisodeTable.of(results)
             found[kind][planner] = [
                 {
-                    "outcome": outcome(results, row),
+                    "outcome": outcome(table, row),
                     **{name: _number(results.metrics[name][row]) for name in ("vmax_score", "progress")},
                 }
                 for row in range(len(rows))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.evaluation.results import KEYS
+from drivax.evaluation.results import ADDED, KEYS
 from drivax.metrics.catalogue import METRICS
 from drivax.scenario.store import ScenarioSet
 from drivax.studies import bench
@@ -83,7 +83,7 @@ def evaluation(data):
 def test_episodes(evaluation, data):
     with (evaluation / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == [*KEYS, *METRICS, "crashed"]
+    assert list(rows[0]) == [*KEYS, *METRICS, *ADDED]
     assert len(ScenarioSet.open(data)) == 6 and len(rows) == 5
     assert [row["scenario_id"] for row in rows] == [one.id for one in ScenarioSet.open(data)][:5]
     assert {(row["planner"], row["traffic"], row["dataset"]) for row in rows} == {
@@ -121,6 +121,8 @@ def test_trajectories(evaluation):
     with np.load(evaluation / "trajectories.npz") as arrays:
         assert arrays["ego"].shape == (5, 81, 4) and arrays["ego"].dtype == np.float32
         assert (arrays["start"] == 10).all() and np.isfinite(arrays["ego"]).all()
+        assert arrays["action"].shape == (5, 80, 2) and arrays["action"].dtype == np.float16
+        assert not arrays["action"].any(), "a constant velocity asks for nothing"
 
 
 def test_inspect(data, capsys):

@@ -235,6 +235,10 @@ def test_plans_that_cannot_be_carried_out_are_refused(change, words):
 def test_seeds_of_several_planners_are_no_seeds():
     with pytest.raises(UsageError, match=r"several planners \(idm, one\)"):
         compare(PLAN, [table("one"), table("idm", seed=2)], [table("two", seed=3)])
+    seeds = [table("seed-0@4"), table("seed-1@4", seed=2)]
+    assert compare(PLAN, seeds, [table("two", seed=3)]).decision
+    with pytest.raises(UsageError, match=r"several planners \(one@4, one@8\)"):
+        compare(PLAN, [table("one@4"), table("one@8", seed=2)], [table("two", seed=3)])
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,11 @@ import drivax
 from drivax.api import load
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
-from drivax.evaluation.results import FAILED, KEYS, paired_differences, with_crashes
+from drivax.evaluation.results import ADDED, FAILED, KEYS, with_crashes
 from drivax.evaluation.runner import evaluate, evaluate_in, evaluate_scenarios
 from drivax.evaluation.runs import format_crashes
-from drivax.evaluation.stored import read_episodes
+from drivax.evaluation.stored import EpisodeTable, read_episodes, read_evaluation
+from drivax.evaluation.tables import paired_difference, paired_differences, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
 from drivax.scenario.assemble import assemble
@@ -95,6 +96,16 @@ def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
         assert found == {name: expected[name] for name in found} and len(found) in (COUNT, len(ids))
 
 
+def test_actions_are_what_moved_the_car(whole):
+    """The first number is a share of 6 m/s2, for a tenth of a second."""
+    assert whole.actions.shape == (COUNT, 80, 2) and np.abs(whole.actions).max() <= 1
+    before, after = whole.motion[:, :-1, 3], whole.motion[:, 1:, 3]
+    drives = after > 0.01
+    assert drives.mean() > 0.5
+    np.testing.assert_allclose((after - before)[drives], 0.6 * whole.actions[..., 0][drives], atol=1e-4)
+    assert whole.rows()[0]["action_jerk"] == f"{whole.metrics['action_jerk'][0]:.6g}" != "0"
+
+
 def test_every_planner_has_the_same_noisy_starts(scenarios, whole, driven):
     other = driven(scenarios[2:6], fragile(share=0.0))
     np.testing.assert_array_equal(other.motion[:, 0], whole.motion[2:6, 0])
@@ -116,6 +127,8 @@ def test_a_crash_is_a_failed_episode_and_no_other_changes(scenarios, whole, cras
     assert {name for name in before if before[name] != after[name]} == {scenarios[3].id}
     np.testing.assert_array_equal(crashed.motion[3, :31], whole.motion[3, :31])
     assert (crashed.motion[3, 31:] == crashed.motion[3, 30]).all(), "nobody drives it any more"
+    np.testing.assert_array_equal(crashed.actions[3, :30], whole.actions[3, :30])
+    assert np.isnan(crashed.actions[3, 30:]).all() and np.isfinite(crashed.actions[4:]).all()
     row, sound = after[scenarios[3].id][0], before[scenarios[3].id][0]
     assert row["crashed"] == "1" and sound["crashed"] == "0"
     for name in FAILED:
@@ -140,7 +153,7 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
     ]
     with (tmp_path / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == [*KEYS, *METRICS, "crashed"]
+    assert list(rows[0]) == [*KEYS, *METRICS, *ADDED]
     keys, metrics = read_episodes(tmp_path)
     assert keys["scenario_id"][3] == scenarios[3].id
     assert metrics["crashed"].tolist() == [float(row == 3) for row in range(COUNT)]
@@ -152,8 +165,26 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
     assert format_crashes(whole) == ""
     same = paired_differences(crashed, whole, "success")
     assert same.n == COUNT and same.mean <= 0
+    assert same == paired_difference(EpisodeTable.of(crashed), EpisodeTable.of(whole), "success")
+    elsewhere = [row | {"dataset": "other"} for row in whole.scenarios]
     with pytest.raises(UsageError, match="different scenarios"):
-        paired_differences(crashed, replace(whole, scenarios=whole.scenarios[::-1]), "success")
+        paired_differences(crashed, replace(whole, scenarios=elsewhere), "success")
+
+
+def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
+    """Segments of two data sets may share a name, and where none is known scenarios are their own clusters."""
+    names = [{"dataset": f"set-{row % 2}", "segment": "a" if row < 4 else ""} for row in range(COUNT)]
+    mixed = replace(whole, scenarios=[row | new for row, new in zip(whole.scenarios, names, strict=True)])
+    assert len(set(EpisodeTable.of(mixed).clusters)) == 2 + COUNT - 4
+    mixed.write(tmp_path)
+    (tmp_path / "run.json").write_text('{"kind": "evaluation", "planner": "fragile"}')
+    stored, summary = (
+        read_evaluation(tmp_path),
+        json.loads((tmp_path / "summary.json").read_text())["metrics"],
+    )
+    for name in ("success", "offroad", "progress_ratio"):
+        told = summarise(stored, name).as_dict()
+        assert summary[name] == pytest.approx(told, rel=1e-4), name
 
 
 def test_crashes_by_hand():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,9 @@ def test_kinds_of_collision_are_shares_of_all_episodes():
     kinds = [1, 1, 3, 6, 0, 0, 0, 0, 0, 0, np.nan, np.nan]
     table = collisions_table([run("a", {"collision_type": kinds}), run("old", {"success": [1] * N})])
     assert table.columns == ("a",), "a run that does not know kinds has no column"
+    assert "share of the episodes in which they are known" in table.caption
+    whole = collisions_table([run("a", {"collision_type": [*kinds[:10], 0, 2]})])
+    assert "share of all episodes" in whole.caption and {row.cells[0].interval.n for row in whole.rows} == {N}
     assert set(READINGS) == set(CollisionType) - {CollisionType.NONE}
     found = dict(zip((row.labels[0] for row in table.rows), means(table), strict=True))
     assert found["rear end"] == [0.2] and found["side"] == [0.1] and found["standing object"] == [0.1]
@@ -106,6 +110,24 @@ def test_transfer_is_training_by_evaluation():
         run("p (noisy)", {"success": [1] * N}, data="A", path="x/a", trained=[("x/a", "A")], planner="p"),
     ]
     assert [row.labels[0] for row in transfer_table(twice, "success").rows] == ["p", "p (noisy)"]
+
+
+def test_policies_of_one_name_are_told_apart(tmp_path):
+    """Every algorithm has a seed-0; what they are called on the command line differs."""
+    runs = []
+    for place, (planner, data) in enumerate(
+        [("runs/bc/seed-0", "A"), ("runs/ppo/seed-0", "A"), ("runs/bc/seed-0", "B")]
+    ):
+        one = run(
+            f"seed-0 ({place})", {"success": [place % 2] * N}, data=data, path=f"x/{data}", planner="seed-0"
+        )
+        (tmp_path / str(place)).mkdir()
+        (tmp_path / str(place) / "config.yaml").write_text(f"planner: {planner}\n")
+        runs.append(replace(one, folder=tmp_path / str(place)))
+    table = transfer_table(runs, "success")
+    assert [row.labels[0] for row in table.rows] == ["bc/seed-0", "ppo/seed-0"]
+    assert means(table) == [[0.0, 0.0], [1.0, None]]
+    assert [cell.run for cell in table.rows[0].cells] == ["seed-0 (0)", "seed-0 (2)"]
 
 
 def test_sets_of_one_name_are_told_apart():

@@ -6,7 +6,6 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,28 +22,10 @@ from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_t
 from drivax.simulator.catalogue import prepared
 from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.traffic import LogTraffic
-from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder
 from drivax.tracking.zoo import is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
-
-TINY = {
-    "task": {
-        "observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 2},
-        "metrics": "none",
-    },
-    "algorithm": {
-        "kind": "ppo", "network": {"encoder": {"rows": [4], "hidden": [8]}, "head": [4]},
-        "environments": 2, "unroll": 2, "minibatches": 1,
-    },
-    "traffic": "idm", "start": {"kind": "noisy_start"},
-}  # fmt: skip
-
-
-class Learned(NamedTuple):
-    """Of a state of training what is looked at here."""
-
-    parameters: Any
+from tiny_run import TINY, write_run
 
 
 @pytest.fixture(scope="module")
@@ -54,20 +35,7 @@ def bank():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, bank):
-    """A run folder as training leaves it, but for the training: two checkpoints, of which the older scored better."""
-    config = settings.load(TrainConfig, TINY)
-    folder = RunFolder.create(
-        tmp_path_factory.mktemp("runs") / "bold", config, kind="training", validation="c0de"
-    )
-    about = {"path": "/some/where/train", "hash": "f00d", "scenarios": 3}
-    folder = folder.note(data=[about], command="drivax train tiny")
-    learner = config.algorithm.build(replace(config, traffic="log").environment(), bank, 1)
-    shapes = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
-    for step, score in ((4, 0.5), (8, 0.4)):
-        rng = np.random.default_rng(step)
-        drawn = jax.tree.map(lambda leaf, rng=rng: rng.normal(size=leaf.shape).astype(np.float32), shapes)
-        Checkpoints(folder.checkpoints).save(step, Learned(drawn), score)
-    return folder
+    return write_run(tmp_path_factory.mktemp("runs") / "bold", bank)
 
 
 def weights(planner):
@@ -78,7 +46,7 @@ def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
     packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
     (one, task), (best, _) = load_policy(packed.path, bank), load_policy(run.path, bank, step=4)
     assert task == settings.load(TrainConfig, TINY).task and one.name == "packed"
-    assert jax.tree.structure(replace(one, name="bold")) == jax.tree.structure(best)
+    assert jax.tree.structure(replace(one, name="bold@4")) == jax.tree.structure(best)
     for mine, its in zip(weights(one), weights(best), strict=True):
         np.testing.assert_array_equal(mine, its)
     newest, _ = load_policy(run.path, bank, step=8)

@@ -151,6 +151,12 @@ def episode(planner: str, scenario: Scenario, number: int) -> dict[str, object]:
     return row
 
 
+def commands(planner: str) -> np.ndarray:
+    """Eighty actions: a wave of the policy's, others ask for nothing."""
+    wave = np.sin(np.arange(80) / 7.0) * (planner == "policy")
+    return np.stack((wave, -wave / 2), -1).astype(np.float16)
+
+
 def write_evaluation(folder: Path, planner: str, scenarios: ScenarioSet, data: Path) -> Path:
     """A run folder as ``drivax evaluate`` writes it."""
     folder.mkdir(parents=True)
@@ -168,6 +174,7 @@ def write_evaluation(folder: Path, planner: str, scenarios: ScenarioSet, data: P
         folder / "trajectories.npz",
         scenario_id=np.array([row["scenario_id"] for row in rows]),
         ego=np.stack([drive_off(scenario, sideways)[10:] for scenario in scenarios]),  # from `start` on
+        action=np.tile(commands(planner), (len(rows), 1, 1)),
         start=np.full(len(rows), 10),
         **{f"{name}_step": steps for name, steps in events.items()},
     )

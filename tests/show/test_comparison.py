@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.statistics import NOTHING, Interval, bootstrap_mean, rate
-from drivax.evaluation.stored import comparable
+from drivax.evaluation.stored import comparable, mismatch
 from drivax.evaluation.tables import summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.show.comparison import difference
@@ -70,6 +70,15 @@ def test_only_the_same_scenarios_and_traffic_are_compared(evaluations):
     other = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
     moved = dataclasses.replace(expert, about={**expert.about, "data": {"hash": "0000", "path": "x"}})
     assert not comparable(other, policy) and not comparable(moved, policy)
+    assert mismatch(other, policy) == (
+        "drove in different traffic (idm and log)", "evaluate both with the same --traffic",
+    )  # fmt: skip
+    (expert.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
+    expert, policy = (dataclasses.replace(run) for run in (expert, policy))
+    assert comparable(expert, policy), "of the policy's start nobody told anything"
+    (policy.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 10\n")
+    expert, policy = (dataclasses.replace(run) for run in (expert, policy))
+    assert mismatch(expert, policy) == ("differ in start_step (40 and 10)", "evaluate both with the same")
 
 
 def test_outcomes_and_choice(evaluations):

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.show.curves import chart, compact, curve_sections, ticks
+from drivax.show.palette import Stroke
 from drivax.show.runs import read_runs
 
 
@@ -39,7 +40,7 @@ def test_compact():
 
 def test_a_straight_line_is_drawn_straight_and_to_scale():
     points = np.array([[0.0, 0.0], [50.0, 0.5], [100.0, 1.0]])
-    html = chart("rollout/success", {"a <run>": ("#123456", points)}, share=True)
+    html = chart("rollout/success", {"a <run>": (Stroke("#123456"), points)}, share=True)
     drawn = np.array(
         [pair.split(",") for pair in re.search(r'points="([^"]+)"', html)[1].split()], dtype=np.float64
     )
@@ -53,7 +54,7 @@ def test_a_straight_line_is_drawn_straight_and_to_scale():
 
 def test_many_points_are_averaged():
     points = np.stack((np.arange(10_000.0), np.full(10_000, 2.0)), axis=-1)
-    html = chart("loss", {"a": ("#123456", points)})
+    html = chart("loss", {"a": (Stroke("#123456"), points)})
     assert len(re.search(r'points="([^"]+)"', html)[1].split()) == 150
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import given
@@ -40,3 +41,12 @@ def test_charts_are_drawn_of_what_varies(runs):
     evaluations[0].metrics["progress_ratio"][:] = np.nan
     assert distribution_charts(evaluations).count("<polyline") == 5
     assert distribution_charts(evaluations[:0]) == ""
+
+
+def test_nine_planners_are_told_apart(runs):
+    policy = read_runs(runs)[0][-1]
+    html = distribution_charts([replace(policy, name=f"planner {place}") for place in range(9)])
+    legend, *charts = html.split("<figure")
+    assert len(set(re.findall(r'style="background:([^"]+)"', legend))) == 9
+    lines = re.findall(r"<polyline (stroke.*?) points", charts[0])
+    assert len(set(lines)) == len(lines) == 9 and sum("dasharray" in line for line in lines) == 3

@@ -5,14 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from browser import acted, browse, needs_browser
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.show.report import write_report
 from drivax.show.runs import read_runs
 from drivax.show.selection import FAILURES, outcome, ranked, worst_first
+
+from .conftest import SMALL, make_scenario, write_evaluation
 
 
 def listed(html):
@@ -121,6 +125,48 @@ def test_sorting_sieving_and_one_click_to_the_episode(page, tmp_path):
     assert found["vulnerable"] == ["05"] and found["played"].startswith("hand-05")
 
 
+@pytest.fixture
+def half_tagged(tmp_path):
+    """A page of one drive; of the scenarios 6 and 7 nobody knows how hard they are."""
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        for number in range(8):
+            scenario = make_scenario(number)
+            writer.add(scenario if number < 6 else replace(scenario, tags={"dataset": "hand"}))
+    stored = ScenarioSet.open(tmp_path / "set")
+    planners = ("expert", "policy")
+    runs = [write_evaluation(tmp_path / name, name, stored, tmp_path / "set") for name in planners]
+    return write_report(runs, tmp_path / "report.html", episodes=1)
+
+
+BEHIND = """
+  const text = (selector) => document.querySelector(selector).textContent;
+  const told = (test) => {
+    const cells = [...document.querySelectorAll("td[data-behind]")];
+    cells.find((cell) => test(JSON.parse(cell.dataset.behind), cell)).querySelector("button").click();
+    const ids = [...document.querySelectorAll("#rows th")].map((head) => head.firstChild.textContent.slice(-2));
+    return [ids, text("#found"), text("[data-control=title]")];
+  };
+  const against = (cell) => cell.closest("table").className === "differences";
+  document.title = JSON.stringify({
+    difference: told((behind, cell) => against(cell) && behind.metric === "collision"),
+    unknown: told((behind) => behind.run === "policy" && behind.tags?.difficulty === "unknown"
+      && behind.metric === "success"),
+  });
+"""
+
+
+@needs_browser
+def test_cells_whose_drives_are_not_in_the_page_say_so(half_tagged, tmp_path):
+    dom = browse(acted(half_tagged, BEHIND), tmp_path, "--dump-dom", "--window-size=1280,1000")
+    assert "data-error" not in re.search(r"<html[^>]*>", dom)[0]
+    found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
+    ids, said, playing = found["difference"]
+    assert ids == ["01", "05"] and said == "2 of 8 episodes of policy" and playing.startswith("hand-01")
+    ids, said, _ = found["unknown"]
+    assert ids == ["06"], "of the two without a tag one failed"
+    assert said.startswith("1 of 8 episodes of policy. None of these plays in this page: --episodes N")
+
+
 def thousandfold(folder):
     """Make a run of eight episodes one of a thousand, the drives of the first eight kept."""
     header, *rows = (folder / "episodes.csv").read_text().splitlines()
@@ -160,6 +206,6 @@ def test_plots_follow_the_player(page, tmp_path):
         at: plots[0].querySelector(".now").getAttribute("x1") });"""
     dom = browse(acted(page, act), tmp_path, "--dump-dom", "--window-size=390,900")
     found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
-    assert len(found["words"]) == 6 and found["words"][0] == "speed [m/s]" and found["lines"] == [3] * 6
+    assert len(found["words"]) == 8 and found["words"][0] == "speed [m/s]" and found["lines"] == [3] * 8
     assert float(found["speed"].split()[-1]) == pytest.approx(float(found["shown"].split()[0]), abs=0.051)
     np.testing.assert_allclose(float(found["at"]), 44 + 60 / 90 * (380 - 44 - 8), atol=0.1)

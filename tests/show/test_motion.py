@@ -6,7 +6,7 @@ from scipy.signal import savgol_filter
 
 from drivax.metrics.comfort import judge_trip
 from drivax.show.episode import Drive, pack_episode
-from drivax.show.motion import SIGNALS, signals
+from drivax.show.motion import COMMANDS, SIGNALS, signals
 
 from .conftest import drive_off, make_scenario
 from .test_episode import shorts
@@ -73,9 +73,11 @@ def test_the_page_gets_them_in_their_own_steps():
     scenario = make_scenario(0)
     ego = drive_off(scenario, 3.0)
     ego[85:] = np.nan
-    packed = pack_episode(scenario, [Drive("x", ego, 10, {}, "success")], "t")["drives"][0]["signals"]
-    found = signals(ego)
-    for one, text in zip(SIGNALS, packed, strict=True):
+    asked = np.column_stack((np.linspace(-1, 1, 91), np.full(91, np.nan)))
+    asked[:10] = np.nan
+    packed = pack_episode(scenario, [Drive("x", ego, 10, {}, "success", asked)], "t")["drives"][0]["signals"]
+    found = signals(ego) | dict(zip((one.name for one in COMMANDS), asked.T, strict=True))
+    for one, text in zip((*SIGNALS, *COMMANDS), packed, strict=True):
         values = shorts(text, 91).astype(float)
         values[values == -32768] = np.nan
         np.testing.assert_allclose(values * one.step, found[one.name], atol=one.step / 2 + 1e-9)

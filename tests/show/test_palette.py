@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from drivax.show.palette import LEGEND, SERIES, THEMES
+from drivax.show.palette import LEGEND, SERIES, THEMES, stroke
 
 #: Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), table 1, severity 1: how linear RGB is seen.
 VISION = {
@@ -64,6 +64,13 @@ def test_everything_stands_out_from_the_ground(vision, theme):
 @pytest.mark.parametrize("vision", VISION)
 def test_lines_of_charts_differ(vision):
     assert min(distance(a, b, vision) for a, b in itertools.combinations(SERIES, 2)) > 14
+
+
+def test_lines_beyond_the_colours_are_dashed():
+    strokes = [stroke(place) for place in range(18)]
+    assert len({(one.colour, one.dash) for one in strokes}) == 18 and len({one.key for one in strokes}) == 18
+    assert [one.colour for one in strokes[:6]] == list(SERIES) and not any(one.dash for one in strokes[:6])
+    assert strokes[6].svg == f'stroke="{SERIES[0]}" stroke-dasharray="6 3"' and stroke(18) == strokes[0]
 
 
 def test_the_legend_names_every_class_and_light():

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import re
+from html import unescape
 from html.parser import HTMLParser
 
 import numpy as np
@@ -148,7 +149,7 @@ def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
     html, parsed = page
     data = [json.loads(text) for attrs, text in parsed.scripts if attrs.get("type") == "application/json"]
     themes, signals, *episodes, listed = data
-    assert set(signals) == {"signals", "colours"} and len(listed["runs"]) == 3
+    assert set(signals) == {"signals", "strokes"} and len(listed["runs"]) == 3
     assert set(themes) == {"light", "dark"} and len(episodes) == 8
     assert [d["planner"] for d in episodes[0]["drives"]] == ["expert", "constant", "policy"]
     assert episodes[0]["title"].endswith(": collision") and episodes[0]["drives"][2]["events"] == {
@@ -203,7 +204,7 @@ def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch
     before = out.read_bytes()
     with pytest.raises(UsageError, match="--overwrite"):
         write_report(runs, out)
-    with pytest.raises(UsageError, match="name an HTML file"):
+    with pytest.raises(UsageError, match="name a file in it"):
         write_report(runs, out.parent, overwrite=True)
     with pytest.raises(UsageError, match="-1 episodes"):
         write_report(runs, tmp_path / "new.html", episodes=-1)
@@ -229,12 +230,67 @@ def test_trainings_alone_and_one_planner_alone(runs, tmp_path):
     assert "Results" in single.text and "against the others" not in single.text
 
 
+def crash(folder, number, step, error):
+    """What a run says whose planner crashed in a scenario."""
+    header, *rows = (folder / "episodes.csv").read_text().splitlines()
+    rows = [f"{row},{int(place == number)}" for place, row in enumerate(rows)]
+    (folder / "episodes.csv").write_text("\n".join([f"{header},crashed", *rows]) + "\n")
+    row = {"dataset": "hand", "scenario_id": f"hand-{number:02d}", "step": step, "error": error}
+    (folder / "crashes.json").write_text(json.dumps([row]))
+
+
+def test_crashes_are_told_with_step_and_error(runs, tmp_path):
+    before = Page(write_report(runs, tmp_path / "before.html").read_text())
+    assert not any("crashed" in cell for cell in before.tables[0][0]), "nobody crashed"
+    crash(runs[2], 2, 55, "ValueError: too <fast>")
+    page = Page(write_report(runs, tmp_path / "report.html").read_text())
+    assert page.tables[0][0][1].startswith("crashed") and page.tables[0][3][1].startswith("12.5 %")
+    data = [json.loads(text) for attrs, text in page.scripts if attrs.get("type") == "application/json"]
+    *_, episode, listed = [one for one in data if one.get("id", "hand-02") == "hand-02"]
+    assert listed["runs"][2]["errors"] == {"0": [55, "ValueError: too <fast>"]}, "it is the gravest failure"
+    assert (
+        episode["drives"][2]["events"] == {"crashed": 55} and episode["title"] == "hand-02: planner crashed"
+    )
+    assert episode["drives"][0]["events"] == {}
+
+
+@needs_browser
+def test_the_error_of_a_crash_is_the_title_of_its_cell(runs, tmp_path):
+    crash(runs[2], 2, 55, "ValueError: too <fast>")
+    act = """
+      const cell = document.querySelector("#rows tr td");
+      const scrub = document.querySelector("[data-control=scrub]");
+      scrub.value = 60; scrub.dispatchEvent(new Event("input"));
+      const note = document.querySelector("figure.pane:last-child .note").textContent;
+      document.title = JSON.stringify([cell.textContent, cell.title, note]);"""
+    dom = browse(acted(write_report(runs, tmp_path / "report.html"), act), tmp_path, "--dump-dom")
+    found = json.loads(unescape(re.search(r"<title>(.*?)</title>", dom)[1]))
+    assert found == ["planner crashed", "step 55: ValueError: too <fast>", "✕ planner crashed at 5.5 s"]
+
+
 def test_other_traffic_is_said_and_not_compared(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
-    assert "different scenarios or traffic" in parsed.text
-    assert all(row[1] == "other scenarios or traffic" for row in parsed.tables[2][1:])
+    said = "expert and policy drove in different traffic (idm and log)."
+    assert said in parsed.text and "constant and policy" not in parsed.text
+    assert all(row[1] == "no pairs: drove in different traffic (log and idm)" for row in parsed.tables[2][1:])
+
+
+def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
+    """A noisy run from another step makes no pairs; one of two of the eight scenarios makes two."""
+    (runs[0] / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
+    (runs[2] / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
+    lines = (runs[1] / "episodes.csv").read_text().splitlines()
+    (runs[1] / "episodes.csv").write_text("\n".join(lines[:3]) + "\n")
+    page = Page(write_report(runs, tmp_path / "report.html").read_text())
+    assert (
+        "expert and policy differ in noisy_start (True and False); "
+        "constant and policy have 2 of 2 and 8 scenarios in common." in page.text
+    )
+    assert all("no pairs" in row[1] and "no pairs" not in row[2] for row in page.tables[2][1:])
+    drives = [json.loads(t)["drives"] for a, t in page.scripts if a.get("class") == "episode"]
+    assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 
 def test_the_command(runs, tmp_path, capsys):

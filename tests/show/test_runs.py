@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
+from drivax.show.drives import drives_of
 from drivax.show.runs import read_runs
+from drivax.show.selection import Choice
 
 
 def test_what_was_written_is_read(runs, scenarios):
@@ -45,6 +47,20 @@ def test_repeated_scenarios_keep_their_own_trajectory(runs):
     run = read_runs([folder])[0][0]
     assert run.occurrences[0] == ("hand-00", 0) and run.occurrences[8] == ("hand-00", 1)
     assert run.trajectories.rows["hand-00", 1] == 8
+
+
+def test_actions_are_read_where_a_run_tells_them(runs, scenarios):
+    run = read_runs([runs[2]])[0][0]
+    assert run.trajectories.action.shape == (8, 80, 2)
+    choice = Choice("hand", "hand-03", (3,), "offroad")
+    (drive,) = drives_of([run], choice, scenarios[3])
+    assert np.isnan(drive.action[:10]).all() and np.isnan(drive.action[90]).all()
+    np.testing.assert_allclose(drive.action[10:90, 0], np.sin(np.arange(80) / 7.0), atol=1e-3)
+    with np.load(runs[2] / "trajectories.npz") as stored:
+        arrays = {name: array for name, array in stored.items() if name != "action"}
+    np.savez(runs[2] / "trajectories.npz", **arrays)
+    (drive,) = drives_of(read_runs([runs[2]])[0], choice, scenarios[3])
+    assert np.isnan(drive.action).all(), "a run of before there were any"
 
 
 def _remove(name):
@@ -92,6 +108,7 @@ def _lacks(folder):
         (_edit("episodes.csv", "log,0", "log,inf"), "record 1: collision is infinite"),
         (_edit("episodes.csv", "log,0", "log,0,0"), "record 1: has"),
         (_cut("trajectories.npz"), "cannot be read"),
+        (_write("crashes.json", '[{"dataset": "hand"}]'), "crashes.json: cannot be read ('scenario_id')"),
         (_shapes, "disagree in shape"),
         (_lacks, "lacks an array"),
     ],

@@ -148,6 +148,7 @@ def test_what_is_refused(runs, tmp_path, capsys):
     for which, words in (
         ("worst:0", "worst:N"),
         ("worst:x", "worst:N"),
+        ("", "write worst:N, all, or an id"),
         ("hand-1", "did you mean 'hand-01'?"),
     ):
         assert main(["report", *map(str, runs), "--video", which, "--out", str(out)]) == 2

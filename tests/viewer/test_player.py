@@ -91,7 +91,7 @@ def test_what_is_refused(page, data, tmp_path):
     before = page.read_bytes()
     with pytest.raises(UsageError, match="exists already; choose another name or pass --overwrite"):
         write_player(list(data)[:1], page)
-    with pytest.raises(UsageError, match="name an HTML file"):
+    with pytest.raises(UsageError, match="name a file in it"):
         write_player(list(data), tmp_path, overwrite=True)
     with pytest.raises(UsageError, match="there is no scenario to show"):
         write_player([], tmp_path / "none.html")

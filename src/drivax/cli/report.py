@@ -43,6 +43,8 @@ class Report:
     """Colours of videos; the page follows the reader's system."""
     tables: bool = False
     """Write the tables as CSV (all digits), Markdown and LaTeX."""
+    metrics: tuple[str, ...] = ()
+    """Put these too into the files of --tables: metrics by name, or a set (training, full)."""
     overwrite: bool = False
     """Replace existing files."""
 
@@ -59,7 +61,9 @@ def run(args: Report) -> int:
         raise UsageError("no run was given", cure="drivax report RUN [RUN ...]")
     if sum((args.video is not None, args.side_by_side is not None, args.tables)) > 1:
         raise UsageError("--video, --side-by-side and --tables are one at a time", cure="run it twice")
-    which = args.video or args.side_by_side
+    if args.metrics and not args.tables:
+        raise UsageError("--metrics says what --tables holds", cure="pass --tables, or leave it out")
+    which = args.video if args.video is not None else args.side_by_side
     if which is not None:
         out = args.out or args.runs[-1] / "videos"
         with Progress("drawing", "videos") as bar:
@@ -71,7 +75,7 @@ def run(args: Report) -> int:
         return 0
     if args.tables:
         out = args.out or args.runs[-1] / "tables"
-        files = write_tables(args.runs, out, args.data, args.overwrite)
+        files = write_tables(args.runs, out, args.data, args.overwrite, args.metrics)
         print(f"{out} ({', '.join(file.name for file in files)})")
         return 0
     path = write_report(

@@ -6,6 +6,7 @@ may lie in strata (kinds of scenario), within which they are resampled or assign
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,12 @@ Labels = Int64[np.ndarray, " n"]
 #: Of each cluster: a sum, or the number of its stratum.
 Totals = Float64[np.ndarray, " cluster"]
 Strata = Int64[np.ndarray, " cluster"]
+
+
+def recordings(datasets: Iterable[str], segments: Iterable[str], scenarios: Iterable[str]) -> list[str]:
+    """The cluster of each scenario: its recording, or itself where no recording (``segment``) is known."""
+    rows = zip(datasets, segments, scenarios, strict=True)
+    return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
 
 
 def numbers(values: Any) -> Values:

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.results import NOT_SUMMARISED
-from drivax.evaluation.stored import EpisodeTable
+from drivax.evaluation.stored import EpisodeTable, mismatch
 from drivax.named import nearest
-from drivax.tracking.runs import CONFIG_FILE
-
-#: Settings of an evaluation that make other episodes.
-_ALIKE = ("noisy_start", "start_step")
 
 
 def refuse_misfits(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
@@ -34,7 +28,8 @@ def refuse_misfits(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None
     if len({table.folder.resolve() for table in tables}) < len(tables):
         raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
     for side in (a, b):
-        planners = {re.sub(r"[0-9]+$", "", table.name): table.name for table in side}
+        # The seeds of a policy are numbered at the end, before the checkpoint; two checkpoints are two planners.
+        planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
         if len(planners) > 1:
             names = ", ".join(sorted(planners.values()))
             raise UsageError(
@@ -47,31 +42,9 @@ def refuse_misfits(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None
 
 
 def _refuse_pair(one: EpisodeTable, other: EpisodeTable) -> None:
-    where = f"{one.folder} and {other.folder}"
-    hashes = [str(run.data.get("hash") or "") for run in (one, other)]
-    if all(hashes) and hashes[0] != hashes[1]:
-        raise UsageError(
-            f"{where} drove different scenario sets ({hashes[0][:12]} and {hashes[1][:12]})",
-            cure="evaluate both with the same --data",
-        )
-    if one.traffic != other.traffic:
-        raise UsageError(
-            f"{where} drove in different traffic ({one.traffic} and {other.traffic})",
-            cure="evaluate both with the same --traffic",
-        )
-    settings_of = [_settings(run) for run in (one, other)]
-    for name in _ALIKE:
-        values = [found.get(name) for found in settings_of]
-        if None not in values and values[0] != values[1]:
-            raise UsageError(
-                f"{where} differ in {name} ({values[0]} and {values[1]})", cure="evaluate both with the same"
-            )
-
-
-def _settings(run: EpisodeTable) -> dict[str, Any]:
-    file = run.folder / CONFIG_FILE
-    found = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
-    return found if isinstance(found, dict) else {}
+    if found := mismatch(one, other):
+        problem, cure = found
+        raise UsageError(f"{one.folder} and {other.folder} {problem}", cure=cure)
 
 
 def refuse_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) -> None:

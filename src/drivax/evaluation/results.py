@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from drivax.errors import DataError, UsageError
-from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap, rate
+from drivax.errors import DataError
+from drivax.evaluation.clusters import recordings
+from drivax.evaluation.statistics import Interval, bootstrap_mean, rate
 from drivax.metrics.catalogue import EVENTS, METRICS, Metric
 
 #: Columns of ``episodes.csv`` before the metrics.
@@ -40,9 +41,14 @@ class About:
     text: str
 
 
-#: The column that evaluation adds to the metrics.
+#: The columns that evaluation adds to the metrics.
 ADDED = {
-    "crashed": About("-", "low", "the planner raised an error, or its action was no number: a failed episode")
+    "crashed": About(
+        "-", "low", "the planner raised an error, or its action was no number: a failed episode"
+    ),
+    "action_jerk": About(
+        "-", "low", "standard deviation of the change of the action from step to step; 0.82 is pure chance"
+    ),
 }
 
 
@@ -71,6 +77,7 @@ class Results:
         metrics: Values by metric name, NaN where undefined.
         events: First step of each kind of failure, -1 for none.
         motion: x, y, heading, speed per step from ``start`` on.
+        actions: What was carried out from ``start`` on, NaN from a crash on.
         start: Step of the log at which the episodes began.
         offroad_steps: Steps off the road.
         own: Those of the metrics that are the user's own: unit, direction and text.
@@ -84,6 +91,7 @@ class Results:
     metrics: Mapping[str, np.ndarray[Any, Any]]
     events: Mapping[str, np.ndarray[Any, Any]]
     motion: np.ndarray[Any, Any]
+    actions: np.ndarray[Any, Any]
     start: int
     offroad_steps: np.ndarray[Any, Any]
     own: Mapping[str, Metric] = field(default_factory=dict)
@@ -95,10 +103,11 @@ class Results:
     def summary(self) -> dict[str, Any]:
         """Mean and 95 % interval of every metric, as ``summary.json`` holds them.
 
-        Rates have Wilson's interval over the effective number of segments, other means a bootstrap over segments. A
+        Rates have Wilson's interval over the effective number of recordings, other means a bootstrap over them. A
         metric that is defined nowhere has null mean and n 0.
         """
-        clusters = np.array([row["segment"] for row in self.scenarios])
+        rows = ([row[key] for row in self.scenarios] for key in ("dataset", "segment", "scenario_id"))
+        clusters = np.array(recordings(*rows))
         table = {
             name: interval_of(name, values, clusters).as_dict()
             for name, values in self.metrics.items()
@@ -156,6 +165,7 @@ class Results:
             allow_pickle=False,
             scenario_id=np.array([row["scenario_id"] for row in self.scenarios]),
             ego=self.motion.astype(np.float32),
+            action=self.actions.astype(np.float16),
             start=np.full(len(self), self.start, np.int32),
             **arrays,
         )
@@ -192,19 +202,6 @@ def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95,
     if name in RATES:
         return rate(values, clusters, confidence)
     return bootstrap_mean(values, clusters, confidence, seed=seed)
-
-
-def paired_differences(one: Results, other: Results, metric: str) -> Interval:
-    """Mean difference of a metric over the scenarios of both, ``one - other``, with its 95 % interval.
-
-    Raises:
-        UsageError: If they did not drive the same scenarios.
-    """
-    ids = [[row["scenario_id"] for row in result.scenarios] for result in (one, other)]
-    if ids[0] != ids[1]:
-        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
-    clusters = np.array([row["segment"] for row in one.scenarios])
-    return paired_bootstrap(one.metrics[metric], other.metrics[metric], clusters, seed=0)
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

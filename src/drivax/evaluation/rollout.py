@@ -34,6 +34,7 @@ class Episodes:
         metrics: Every metric by name.
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
+        actions: What was carried out in each step: within bounds, and as the actuators let it be.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was no number, -1 for none. Nothing is measured from there on; motion stays.
     """
@@ -41,6 +42,7 @@ class Episodes:
     metrics: dict[str, Value]
     events: dict[str, Int[Array, "*batch"]]
     motion: Float[Array, "*batch steps 4"]
+    actions: Float[Array, "*batch actions D"]
     offroad_steps: Int[Array, "*batch"]
     crashed: Int[Array, "*batch"]
 
@@ -94,12 +96,13 @@ def _episode(
         state, carry, step_sound = advanced(simulator, planner, bank, state, carry, key)
         sound &= step_sound
         kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
-        seen = kept.scene.history[-1], sound & state.facts.offroad, sound
+        scene = kept.scene
+        seen = scene.history[-1], scene.action, sound & state.facts.offroad, sound
         return (state, kept, carry, sound), seen
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
     first = (state, state, carry, jnp.ones((), bool))
-    (last, final, _, _), (motion, offroad, sound) = jax.lax.scan(one, first, keys)
+    (last, final, _, _), (motion, actions, offroad, sound) = jax.lax.scan(one, first, keys)
     metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
     # What a scenario defines does not depend on how soon its planner crashed.
     failed = {
@@ -109,6 +112,7 @@ def _episode(
         metrics=metrics | failed,
         events=first_steps(final.episode),
         motion=jnp.concatenate([state.scene.history[-1][None], motion]),
+        actions=actions,
         offroad_steps=offroad.sum().astype(jnp.int32),
         crashed=jnp.where(sound.all(), -1, start_step + jnp.argmin(sound)),
     )

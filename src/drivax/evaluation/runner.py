@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.evaluation.actions import action_jerk, until_crash
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_out_of_memory
 from drivax.evaluation.results import ADDED, KEYS, Crash, Results, with_crashes
@@ -248,7 +249,10 @@ class _Trial:
         """
         self._refuse_nan(episodes, names)
         found = episodes.metrics
-        metrics = {name: np.where(found[name].defined, found[name].value, np.nan) for name in self.metrics}
+        actions = until_crash(np.asarray(episodes.actions), np.asarray(episodes.crashed), self.start_step)
+        metrics = {"action_jerk": action_jerk(actions)} | {
+            name: np.where(found[name].defined, found[name].value, np.nan) for name in self.metrics
+        }
         crashes = tuple(
             Crash(row, step, errors.get((int(numbers[row]), step), "action is not finite"))
             for row, step in enumerate(episodes.crashed.tolist())
@@ -262,6 +266,7 @@ class _Trial:
             metrics=with_crashes(metrics, episodes.crashed >= 0),
             events={name: np.asarray(steps) for name, steps in episodes.events.items()},
             motion=np.asarray(episodes.motion),
+            actions=actions,
             start=self.start_step,
             offroad_steps=np.asarray(episodes.offroad_steps),
             own={name: metric for name, metric in self.metrics.items() if name not in METRICS},

@@ -5,21 +5,29 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
 
+from drivax import settings
 from drivax.errors import DataError
-from drivax.evaluation.results import ADDED, KEYS, About
+from drivax.evaluation.clusters import recordings
+from drivax.evaluation.results import ADDED, KEYS, About, Results
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.scenario.store import ScenarioSet
+from drivax.tracking.runs import CONFIG_FILE
 
 #: The cure for a run folder that is damaged.
 AGAIN = "run drivax evaluate again"
+
+#: Settings of an evaluation that make other episodes.
+ALIKE = ("noisy_start", "start_step")
 
 Array = np.ndarray[Any, Any]
 #: A scenario of a data set: ``(dataset, scenario_id)``.
@@ -44,6 +52,14 @@ class EpisodeTable:
     keys: Mapping[str, tuple[str, ...]]
     metrics: Mapping[str, Float[Array, " episode"]]
 
+    @classmethod
+    def of(cls, results: Results) -> EpisodeTable:
+        """The episodes of an evaluation that has just been made, as if read back; all digits, and no folder."""
+        rows = results.rows()
+        keys = {name: tuple(row[name] for row in rows) for name in KEYS}
+        about = {"planner": results.planner, "traffic": results.traffic, **results.notes()}
+        return cls(Path(os.devnull), results.planner, about, keys, results.metrics)
+
     @property
     def episodes(self) -> int:
         """Number of episodes."""
@@ -66,6 +82,13 @@ class EpisodeTable:
         data = self.about.get("data") or {}
         return data[0] if isinstance(data, list) and data else data if isinstance(data, dict) else {}
 
+    @cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """What ``config.yaml`` says; nothing where there is none."""
+        file = self.folder / CONFIG_FILE
+        found = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
+        return found if isinstance(found, dict) else {}
+
     @property
     def scenarios(self) -> list[ScenarioKey]:
         """The scenario of every episode."""
@@ -74,9 +97,7 @@ class EpisodeTable:
     @property
     def clusters(self) -> list[str]:
         """Cluster of every episode: its segment, or its scenario where no segment is known."""
-        keys = self.keys
-        rows = zip(keys["dataset"], keys["segment"], keys["scenario_id"], strict=True)
-        return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
+        return recordings(*(self.keys[name] for name in ("dataset", "segment", "scenario_id")))
 
     def metric(self, name: str) -> Metric | About | None:
         """Unit and direction of a metric; None where nobody told."""
@@ -121,10 +142,28 @@ class Pairs:
         return np.array([means[key] for key in self.keys], np.float64)
 
 
+def mismatch(one: EpisodeTable, other: EpisodeTable) -> tuple[str, str] | None:
+    """What makes the episodes of two runs no pairs, in words that follow their names, and its cure; None: nothing.
+
+    They have to have driven the same scenario set, in the same traffic, from the same starts.
+    """
+    hashes = [str(run.data.get("hash") or "") for run in (one, other)]
+    if all(hashes) and hashes[0] != hashes[1]:
+        sets = f"{hashes[0][:12]} and {hashes[1][:12]}"
+        return f"drove different scenario sets ({sets})", "evaluate both with the same --data"
+    if one.traffic != other.traffic:
+        traffic = f"{one.traffic} and {other.traffic}"
+        return f"drove in different traffic ({traffic})", "evaluate both with the same --traffic"
+    for name in ALIKE:
+        values = [run.settings.get(name) for run in (one, other)]
+        if None not in values and values[0] != values[1]:
+            return f"differ in {name} ({values[0]} and {values[1]})", "evaluate both with the same"
+    return None
+
+
 def comparable(one: EpisodeTable, other: EpisodeTable) -> bool:
-    """Whether two runs drove the same scenario set in the same traffic, so that their episodes can be paired."""
-    hashes = {run.data.get("hash") for run in (one, other)} - {None}
-    return len(hashes) <= 1 and one.traffic == other.traffic
+    """Whether the episodes of two runs can be paired."""
+    return mismatch(one, other) is None
 
 
 def read_evaluation(folder: Path) -> EpisodeTable:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from drivax.evaluation.results import interval_of
+from drivax.errors import UsageError
+from drivax.evaluation.results import Results, interval_of
 from drivax.evaluation.statistics import NOTHING, Interval, paired_bootstrap, rate
 from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, comparable
 from drivax.scenario.tags import TAGS
@@ -20,6 +21,8 @@ CONFIDENCE = 0.95
 SEED = 0
 #: Tags by which results are broken down.
 STRATA = ("difficulty", "type", "density")
+#: The word of a scenario that lacks a tag.
+UNKNOWN = "unknown"
 #: What a kind of collision says about the driver: name and reading.
 READINGS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
     {
@@ -36,10 +39,11 @@ READINGS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of a table: which metric, and its interval."""
+    """One number of a table: which metric, its interval, and the run behind it where row and column do not say."""
 
     metric: str
     interval: Interval
+    run: str | None = None
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,18 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
     return paired_bootstrap(mine, theirs, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
+def paired_differences(one: Results, other: Results, metric: str) -> Interval:
+    """:func:`paired_difference` of evaluations that have just been made.
+
+    Raises:
+        UsageError: If they did not drive the same scenarios.
+    """
+    tables = EpisodeTable.of(one), EpisodeTable.of(other)
+    if len({frozenset(table.scenarios) for table in tables}) > 1:
+        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
+    return paired_difference(*tables, metric)
+
+
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
     """Metrics in rows, runs in columns."""
     rows = tuple(Row((name,), tuple(Cell(name, summarise(run, name)) for run in runs)) for name in metrics)
@@ -115,8 +131,10 @@ def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metr
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
-    """Kinds of the first collision in rows, runs in columns: share of all episodes."""
+    """Kinds of the first collision in rows, runs in columns: share of the episodes in which they are known."""
     runs = [run for run in runs if "collision_type" in run.metrics]
+    known = not any(np.isnan(run.metrics["collision_type"]).any() for run in runs)
+    of = "all episodes" if known else "the episodes in which they are known (n)"
     rows = []
     for code, (words, _) in READINGS.items():
         cells = []
@@ -125,7 +143,7 @@ def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
             found = rate(np.where(np.isnan(kinds), np.nan, kinds == code), run.clusters, CONFIDENCE)
             cells.append(Cell("collision", found))
         rows.append(Row((words,), tuple(cells)))
-    caption = f"First collisions by kind: share of all episodes with {CONFIDENCE:.0%} interval"
+    caption = f"First collisions by kind: share of {of} with {CONFIDENCE:.0%} interval"
     names = tuple(run.name for run in runs)
     return Table("collisions", caption, ("first collision",), "planner", names, tuple(rows))
 
@@ -144,7 +162,7 @@ def strata_table(
         tag: By which one to break down; a scenario without it counts as ``unknown``.
         metrics: Columns.
     """
-    words = {run.name: [tags.get(key, {}).get(tag, "unknown") for key in run.scenarios] for run in runs}
+    words = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
     order = {word: place for place, word in enumerate(TAGS.get(tag, ()))}
     values = {word for found in words.values() for word in found}
     rows = []
@@ -179,20 +197,41 @@ def _set_name(entry: Mapping[str, Any]) -> str:
     return str(entry.get("name") or (Path(str(path)).name if path else _set_key(entry)[:12]))
 
 
+def _planner_key(run: EpisodeTable) -> str:
+    """Who drove: what the command called it, or else the planner's name."""
+    return str(run.settings.get("planner") or run.about.get("planner", run.name))
+
+
+def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
+    """A name for each planner by its key: its own, or where two share that, as much of their paths as it takes."""
+    own = {_planner_key(run): str(run.about.get("planner", run.name)) for run in runs}
+    named = {}
+    for key, name in own.items():
+        paths = [Path(other).parts for other in own if other != key and own[other] == name]
+        parts = Path(key).parts
+        take = next(
+            (n for n in range(1, len(parts)) if all(parts[-n:] != path[-n:] for path in paths)), len(parts)
+        )
+        named[key] = "/".join(parts[-take:]) if paths else name
+    return named
+
+
 def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
     """What was trained in rows, what was driven in columns: a metric of every pair that was evaluated.
 
-    Where the same planner drove one set more than once (from other starts, say), each run has a row of its own.
+    A planner is who the command named, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``) stay apart.
+    Where the same one drove one set more than once (from other starts, say), each run has a row of its own.
     """
+    planners = _planner_names(runs)
     names = set_names(runs)
     driven = [names[_set_key(run.data)] for run in runs]
     found: dict[tuple[str, ...], dict[str, Cell]] = {}
     for run, where in zip(runs, driven, strict=True):
         trained = ", ".join(names[_set_key(entry)] for entry in _trained_on(run)) or "–"
-        labels = (str(run.about.get("planner", run.name)), trained, run.traffic)
+        labels = (planners[_planner_key(run)], trained, run.traffic)
         if where in found.get(labels, {}):
             labels = (run.name, *labels[1:])
-        found.setdefault(labels, {})[where] = Cell(metric, summarise(run, metric))
+        found.setdefault(labels, {})[where] = Cell(metric, summarise(run, metric), run.name)
     columns = tuple(dict.fromkeys(driven))
     rows = tuple(Row(labels, tuple(cells.get(name) for name in columns)) for labels, cells in found.items())
     caption = f"By training and evaluation data: mean and {CONFIDENCE:.0%} interval"

@@ -52,7 +52,8 @@ def load_policy(
     Args:
         run: Run folder of ``drivax train``, folder of :func:`pack_policy`, or ``zoo:NAME``.
         bank: Any bank; only the shapes of its observations are looked at.
-        step: Which checkpoint; None: the best by validation score, or the newest without one.
+        step: Which checkpoint, which the planner's name then tells; None: the best by validation score, or the newest
+            without one.
         samples: Whether to act by a sample instead of the mode.
 
     Raises:
@@ -64,7 +65,9 @@ def load_policy(
     template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
     def planner(parameters: Any) -> Planner:
-        return learner.planner(parameters, folder.path.name, samples)
+        return learner.planner(
+            parameters, folder.path.name if step is None else f"{folder.path.name}@{step}", samples
+        )
 
     packed = folder.path / PACKED
     if packed.is_file():

@@ -51,8 +51,8 @@ def collision_section(runs: Sequence[Evaluation]) -> str:
     )
     return (
         f"<section><h2>Kinds of collision</h2><p>Episodes with a collision: {total}.</p>"
-        f"{table_html(table, runs, behind)}<dl class=metrics>{readings}</dl><p><small>Of the first collision of an "
-        "episode; share of all episodes, with Wilson's 95 % interval.</small></p></section>"
+        f"{table_html(table, runs, behind)}<dl class=metrics>{readings}</dl><p><small>{escape(table.caption)} "
+        "(Wilson's).</small></p></section>"
     )
 
 
@@ -95,9 +95,14 @@ def transfer_tables(runs: Sequence[Evaluation]) -> list[Table]:
 
 def transfer_section(runs: Sequence[Evaluation]) -> str:
     """What was trained where and how it drives elsewhere; empty where all runs drove one set."""
+
+    def behind(row: Row, place: int) -> dict[str, Any]:
+        cell = row.cells[place]
+        return {"run": cell.run, "metric": cell.metric} if cell else {}
+
     parts = [
         f"<h3>{escape(note(table.name.removeprefix('transfer-'), runs).label)}</h3>"
-        f"{table_html(table, runs, lambda row, place: None)}"
+        f"{table_html(table, runs, behind)}"
         for table in transfer_tables(runs)
     ]
     return (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.show.palette import SERIES
+from drivax.show.palette import Stroke, stroke
 from drivax.show.runs import Training
 
 Points = Float[np.ndarray[Any, Any], "point 2"]
@@ -44,16 +44,18 @@ def curve_sections(runs: Sequence[Training]) -> str:
     return series_legend([run.name for run in runs]) + _charts(first, runs) + more
 
 
-def chart(title: str, lines: Mapping[str, tuple[str, Points]], share: bool = False, across: str = "") -> str:
+def chart(
+    title: str, lines: Mapping[str, tuple[Stroke, Points]], share: bool = False, across: str = ""
+) -> str:
     """One chart as HTML.
 
     Args:
         title: Words above it.
-        lines: Name of a run -> its colour and points (horizontal, vertical), sorted by the former.
+        lines: Name of a run -> its stroke and points (horizontal, vertical), sorted by the former.
         share: Draw the vertical axis from 0 to 1 where all values fit.
         across: Words below it.
     """
-    drawn = {name: (colour, _thinned(points)) for name, (colour, points) in lines.items() if len(points)}
+    drawn = {name: (look, _thinned(points)) for name, (look, points) in lines.items() if len(points)}
     everything = np.concatenate([points for _, points in drawn.values()])
     x_ticks = ticks(min(0.0, float(everything[:, 0].min())), float(everything[:, 0].max()), 5)
     low, high = float(everything[:, 1].min()), float(everything[:, 1].max())
@@ -61,9 +63,9 @@ def chart(title: str, lines: Mapping[str, tuple[str, Points]], share: bool = Fal
     axes = _Axes(x_ticks[0], max(float(everything[:, 0].max()), x_ticks[0] + 1e-9), y_ticks[0], y_ticks[-1])
     shapes = [axes.horizontal(value) for value in y_ticks]
     shapes += [axes.mark(value) for value in x_ticks if value <= axes.x1 + 1e-9]
-    for name, (colour, points) in drawn.items():
+    for name, (look, points) in drawn.items():
         shapes.append(
-            f'<polyline stroke="{colour}" points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
+            f'<polyline {look.svg} points="{axes.path(points)}"><title>{escape(name)}</title></polyline>'
         )
     middle = (_LEFT + _WIDTH - _RIGHT) / 2
     shapes.append(f'<text x="{middle:.0f}" y="{_HEIGHT - 4}" text-anchor="middle">{escape(across)}</text>')
@@ -134,7 +136,7 @@ def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
     drawn = []
     for name in names:
         lines = {
-            run.name: (SERIES[place % len(SERIES)], run.curves[name])
+            run.name: (stroke(place), run.curves[name])
             for place, run in enumerate(runs)
             if name in run.curves
         }
@@ -144,9 +146,9 @@ def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
 
 
 def series_legend(names: Sequence[str]) -> str:
-    """The legend of charts: names in the order of their colours."""
+    """The legend of charts: names in the order of their strokes."""
     items = "".join(
-        f'<li><i style="background:{SERIES[place % len(SERIES)]}"></i>{escape(name)}</li>'
+        f'<li><i style="background:{stroke(place).key}"></i>{escape(name)}</li>'
         for place, name in enumerate(names)
     )
     return f"<ul class=series>{items}</ul>"

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from drivax.show.curves import chart, series_legend
 from drivax.show.glossary import note
-from drivax.show.palette import SERIES
+from drivax.show.palette import stroke
 from drivax.show.runs import Evaluation
 
 #: Metrics whose spread says more than their mean, in the order of their charts.
@@ -42,13 +42,13 @@ def spread(values: Any) -> Float[np.ndarray[Any, Any], "point 2"]:
 
 def distribution_charts(runs: Sequence[Evaluation]) -> str:
     """A chart for each metric of :data:`SPREAD` that differs between episodes; empty without any."""
-    colour = {run.name: SERIES[place % len(SERIES)] for place, run in enumerate(runs)}
+    look = {run.name: stroke(place) for place, run in enumerate(runs)}
     charts = []
     for name in SPREAD:
         lines = {run.name: spread(run.metrics[name]) for run in runs if name in run.metrics}
         values = np.concatenate([line[:, 0] for line in lines.values()]) if lines else np.zeros(0)
         if values.size and values.min() < values.max():
             entry = note(name, runs)
-            drawn = {run: (colour[run], line) for run, line in lines.items()}
+            drawn = {run: (look[run], line) for run, line in lines.items()}
             charts.append(chart(entry.label, drawn, share=True))
-    return f"{series_legend(list(colour))}<div class=charts>{''.join(charts)}</div>" if charts else ""
+    return f"{series_legend(list(look))}<div class=charts>{''.join(charts)}</div>" if charts else ""

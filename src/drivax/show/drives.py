@@ -14,6 +14,7 @@ from drivax.evaluation.stored import ScenarioKey, open_driven_set
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.show.episode import Drive
+from drivax.show.motion import COMMANDED
 from drivax.show.runs import Evaluation
 from drivax.show.selection import Choice, outcome
 
@@ -71,7 +72,10 @@ def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
     driven = stored.ego[place, : steps - start]
     ego[start : start + len(driven)] = driven
     events = {name: int(at[place]) for name, at in stored.events.items()}
-    return Drive(run.name, ego, start, events, outcome(run, row))
+    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
+    action, asked = np.full((steps, COMMANDED), np.nan), stored.action[place, : steps - start, :COMMANDED]
+    action[start : start + len(asked), : asked.shape[1]] = asked
+    return Drive(run.name, ego, start, events, outcome(run, row), action)
 
 
 def logged_drive(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from drivax.metrics.catalogue import EVENTS
 from drivax.scenario.schema import Scenario
-from drivax.show.motion import SIGNALS, signals
+from drivax.show.motion import COMMANDED, COMMANDS, SIGNALS, Signal, signals
 from drivax.show.palette import agent_colour, light_colour
 from drivax.show.roads import LAYERS, Box, light_rows, road_lines, route, stop_signs
 
@@ -38,6 +38,7 @@ class Drive:
         start: Step at which the planner took over.
         events: Step of the first event by name, -1 where there was none.
         outcome: How it ended, in words.
+        action: The first two numbers of its actions, NaN where there are none; None where nobody acted (the log).
     """
 
     planner: str
@@ -45,6 +46,7 @@ class Drive:
     start: int
     events: dict[str, int]
     outcome: str
+    action: Float[Array, "step 2"] | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def pack_episode(scenario: Scenario, drives: Sequence[Drive], title: str) -> dic
     and the points of all lines; ``agents.pose`` is ``[agent, step, 3]``; ``parked.seen`` the first and last step at
     which a parked agent was seen; ``lights.state`` ``[step, light]`` indexes (unknown, red, amber, green) and is -1
     where nobody observed the light; ``drives[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are those
-    of ``motion.SIGNALS`` in order, in units of their steps, ABSENT where there are none.
+    of ``motion.SIGNALS`` and ``motion.COMMANDS`` in order, in units of their steps, ABSENT where there are none.
     """
     box = surroundings(scenario, drives)
     scale = Scale.of(box)
@@ -197,17 +199,22 @@ def _drive(drive: Drive, scale: Scale, steps: int) -> dict[str, Any]:
         "planner": drive.planner,
         "pose": _text(scale.poses(ego[:, :2], ego[:, 2], valid)),
         "speed": _text(speed.astype(np.int16)),
-        "signals": _signals(ego),
+        "signals": _signals(ego, drive.action),
         "start": drive.start,
-        "events": {name: drive.events[name] for name in EVENTS if drive.events.get(name, -1) >= 0},
+        "events": {
+            name: drive.events[name] for name in (*EVENTS, "crashed") if drive.events.get(name, -1) >= 0
+        },
         "outcome": drive.outcome,
     }
 
 
-def _signals(ego: Float[Array, "step 4"]) -> list[str]:
+def _signals(ego: Float[Array, "step 4"], action: Float[Array, "step 2"] | None) -> list[str]:
     found = signals(ego)
-    packed = []
-    for one in SIGNALS:
-        values = np.clip(found[one.name] / one.step, -32_000, 32_000)
-        packed.append(_text(np.where(np.isnan(values), ABSENT, np.round(values)).astype(np.int16)))
-    return packed
+    asked = np.full((len(ego), COMMANDED), np.nan) if action is None else action[: len(ego)]
+    packed = [_signal(one, found[one.name]) for one in SIGNALS]
+    return packed + [_signal(one, values) for one, values in zip(COMMANDS, asked.T, strict=True)]
+
+
+def _signal(one: Signal, values: Float[Array, " step"]) -> str:
+    whole = np.clip(np.round(values / one.step), -32_000, 32_000)
+    return _text(np.where(np.isnan(whole), ABSENT, whole).astype(np.int16))

@@ -100,7 +100,7 @@
   }
 
   function drawRow(row) {
-    const { scenario, outcome, outcomes: words, values, playable } = run();
+    const { scenario, outcome, outcomes: words, values, playable, errors } = run();
     const line = make("tr", rows), head = make("th", line), number = scenario[row];
     head.scope = "row";
     const player = playable ? players[data.played[number]] : undefined;
@@ -110,8 +110,10 @@
       button.title = "play this drive";
       button.addEventListener("click", () => play(player));
     } else make("span", head, data.scenarios[number]);
-    make("small", head, data.tags.map((tag) => tag.words[tag.of[number]]).filter(Boolean).slice(0, 4).join(" · "));
-    make("td", line, words[outcome[row]], words[outcome[row]] === "success" ? "good" : "bad");
+    make("small", head, data.tags.map((tag) => tag.words[tag.of[number]])
+      .filter((word) => word !== "unknown").slice(0, 4).join(" · "));
+    const cell = make("td", line, words[outcome[row]], words[outcome[row]] === "success" ? "good" : "bad");
+    if (errors[row]) cell.title = `step ${errors[row][0]}: ${errors[row][1]}`;
     for (const i of columns()) {
       const metric = data.metrics[i], value = values[i][row];
       make("td", line, text(value, metric), metric.bad !== null && value === metric.bad ? "bad" : "");
@@ -173,8 +175,15 @@
     list();
     const first = state.matches.find((row) => run().playable && players[data.played[run().scenario[row]]]);
     if (first !== undefined) players[data.played[run().scenario[first]]].click();
+    else if (players.length && state.matches.length) found.textContent += `. ${missing()}`;
     document.getElementById("episodes").scrollIntoView();
     form.failed.focus({ preventScroll: true });
+  }
+
+  // The player goes on showing another drive, which is none of those that were asked for.
+  function missing() {
+    return run().playable ? "None of these plays in this page: --episodes N packs more drives, --video ID draws one"
+      : "None of these plays in this page: they are no pairs with the policy's episodes";
   }
 
   document.querySelectorAll("[data-behind]").forEach((node) => {

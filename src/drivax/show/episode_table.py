@@ -9,6 +9,7 @@ import numpy as np
 
 from drivax.evaluation.results import RATES
 from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.tables import UNKNOWN
 from drivax.show.breakdowns import Tags
 from drivax.show.comparison import metric_names
 from drivax.show.glossary import CODES, note, ordered
@@ -43,8 +44,9 @@ def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[Scenari
     """The data of the list as a script element.
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
-    metric with four significant digits, null where undefined, rows worst first; ``tags`` holds for each tag its words
-    and for each scenario the number of its word, -1 without.
+    metric with four significant digits, null where undefined, rows worst first, ``runs[].errors`` by row the step and
+    the words of a crash; ``tags`` holds for each tag its words and for each scenario the number of its word, which is
+    ``unknown`` where it has none.
 
     Args:
         runs: Evaluations, the policy last.
@@ -87,6 +89,11 @@ def _run(
         "scenario": [place[scenarios[row]] for row in rows],
         "outcomes": words,
         "outcome": [words.index(word) for word in outcomes],
+        "errors": {
+            str(place): run.crashes[scenarios[row]]
+            for place, row in enumerate(rows)
+            if scenarios[row] in run.crashes
+        },
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
 
@@ -106,9 +113,9 @@ def _short(value: float) -> float:
 def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     found = []
     for name in dict.fromkeys(name for words in tagged for name in words):
-        words = sorted({one[name] for one in tagged if name in one})
+        said = [one.get(name, UNKNOWN) for one in tagged]
+        words = sorted(set(said))
         if 1 < len(words) <= MOST_VALUES:
             number = {word: place for place, word in enumerate(words)}
-            of = [number.get(one.get(name, ""), -1) for one in tagged]
-            found.append({"name": name, "words": words, "of": of})
+            found.append({"name": name, "words": words, "of": [number[word] for word in said]})
     return found

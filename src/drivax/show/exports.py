@@ -10,7 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 
 from drivax.errors import UsageError
+from drivax.evaluation.results import ADDED
 from drivax.evaluation.tables import Cell, Table, collisions_table, differences_table, results_table
+from drivax.metrics.catalogue import METRICS, SETS
+from drivax.named import nearest
 from drivax.show.breakdowns import strata_tables, transfer_tables
 from drivax.show.comparison import metric_names
 from drivax.show.drives import DrivenSet
@@ -24,7 +27,11 @@ _NUMBERS = ("metric", "mean", "low", "high", "n")
 
 
 def write_tables(
-    runs: Sequence[Path], out: Path, data: Path | None = None, overwrite: bool = False
+    runs: Sequence[Path],
+    out: Path,
+    data: Path | None = None,
+    overwrite: bool = False,
+    metrics: Sequence[str] = (),
 ) -> list[Path]:
     """Write every table of a report into a folder, each as ``.csv``, ``.md`` and ``.tex``.
 
@@ -36,19 +43,20 @@ def write_tables(
         out: The folder.
         data: The scenario set that was driven, where it has moved.
         overwrite: Replace existing files.
+        metrics: In ``results`` and ``differences`` beside the usual ones: columns of ``episodes.csv``, or a set.
 
     Returns:
         The files.
 
     Raises:
         DataError: A run folder or the scenario set is missing, damaged, or not the one that was driven.
-        UsageError: A file exists, or no evaluation was given.
+        UsageError: A file exists, no evaluation was given, or none has one of the metrics.
     """
     evaluations, _ = read_runs(runs)
     if not evaluations:
         raise UsageError("no evaluation was given", cure="name run folders of drivax evaluate")
     texts = {}
-    for table in _tables(evaluations, data):
+    for table in _tables(evaluations, data, exported(evaluations, metrics)):
         texts[f"{table.name}.csv"] = csv_text(table)
         texts[f"{table.name}.md"] = markdown(table, evaluations)
         texts[f"{table.name}.tex"] = latex(table, evaluations)
@@ -59,12 +67,31 @@ def write_tables(
     return [out / name for name in texts]
 
 
-def _tables(runs: Sequence[Evaluation], data: Path | None) -> list[Table]:
-    names = metric_names(runs)
-    first = headline(names) or ordered(names)
-    tables = [results_table(runs, first)]
+def exported(runs: Sequence[Evaluation], more: Sequence[str] = ()) -> list[str]:
+    """Metrics of the files: the headline, progress in metres, those of the user's own, and what else is asked for.
+
+    Args:
+        runs: Evaluations.
+        more: Columns of ``episodes.csv``, or sets of metrics.
+
+    Raises:
+        UsageError: No run has such a column.
+    """
+    names = ordered(metric_names(runs))
+    asked = {"progress"}
+    for entry in more:
+        if entry not in SETS and entry not in names:
+            raise UsageError(f"no run has a mean of {entry!r}", cure=nearest(entry, names))
+        asked.update(SETS.get(entry, (entry,)))
+    first = headline(names)
+    rest = [name for name in names if name in asked or name not in (*METRICS, *ADDED)]
+    return [*first, *(name for name in rest if name not in first)] or names
+
+
+def _tables(runs: Sequence[Evaluation], data: Path | None, metrics: Sequence[str]) -> list[Table]:
+    tables = [results_table(runs, metrics)]
     if len(runs) > 1:
-        tables.append(differences_table(runs[-1], runs[:-1], first))
+        tables.append(differences_table(runs[-1], runs[:-1], metrics))
     if any("collision_type" in run.metrics for run in runs):
         tables.append(collisions_table(runs))
     tables += strata_tables(runs, DrivenSet(runs[-1], data).tags())
@@ -98,7 +125,7 @@ def markdown(table: Table, runs: Sequence[Evaluation]) -> str:
     for row in table.rows:
         cells = [" ".join(_parts(cell, table, runs)) for cell in row.cells]
         lines.append(_row([*_labels(row.labels, table, runs), *cells]))
-    return f"{table.caption}.\n\n" + "\n".join(lines) + "\n"
+    return f"{_marked(table.caption)}.\n\n" + "\n".join(lines) + "\n"
 
 
 def latex(table: Table, runs: Sequence[Evaluation]) -> str:
@@ -120,6 +147,7 @@ def latex(table: Table, runs: Sequence[Evaluation]) -> str:
 _TEX: Mapping[str, str] = MappingProxyType(
     {
         "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+        "[": "{[}",  # behind the end of a row it would begin an option
         "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
         "|": r"\textbar{}", '"': "''", "−": r"$-$", "–": "--", "²": "$^2$", "³": "$^3$", "±": r"$\pm$",
         "↑": r"$\uparrow$", "↓": r"$\downarrow$", "“": "``", "”": "''", "’": "'", "≥": r"$\geq$", "≤": r"$\leq$",
@@ -154,7 +182,12 @@ def _stacked(parts: Sequence[str]) -> str:
 
 
 def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+    return "| " + " | ".join(map(_marked, cells)) + " |"
+
+
+def _marked(text: str) -> str:
+    """Plain text as a cell of Markdown: nothing in it is markup, an HTML element or the end of the cell."""
+    return re.sub(r"([\\`*_~\[\]<|])", r"\\\1", text.replace("\n", " ").replace("&", "&amp;"))
 
 
 def _heading(metric: str, runs: Sequence[Evaluation]) -> str:

@@ -26,7 +26,12 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 #: Red, green, blue and an alpha that says nothing: copied whole it is copied fast.
 Picture = UInt8[Array, "_ _ 4"]
-_EVENTS = {"collision": "collision", "offroad": "off-road", "red_light": "red light"}
+_EVENTS = {
+    "collision": "collision",
+    "offroad": "off-road",
+    "red_light": "red light",
+    "crashed": "planner crashed",
+}
 _ROAD_WIDTHS = {"lane": 1.0, "bike": 1.0, "line": 1.0, "edge": 1.8}
 _LIGHT_WIDTHS = {"red": 5.0, "amber": 4.0, "green": 2.5, "unknown": 2.0}
 #: Metres from one side of the shorter edge of a picture to the other.

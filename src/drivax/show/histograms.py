@@ -16,7 +16,7 @@ from drivax.show.curves import compact, series_legend, ticks
 from drivax.show.inspection import QUANTITIES, Inspection, speeds
 from drivax.show.inspection_tables import content_rows, short
 from drivax.show.page import page, publish, refuse_page
-from drivax.show.palette import SERIES
+from drivax.show.palette import Stroke, stroke
 
 Values = Float[np.ndarray[Any, Any], "_"]
 _WIDTH, _HEIGHT = 380, 210
@@ -65,7 +65,7 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
 
     Args:
         title: Words above it.
-        series: Values by name; the colours are those of ``palette.SERIES``, in order.
+        series: Values by name; the lines are those of ``palette.STROKES``, in order.
         unit: Unit of the values, written below the axis.
     """
     everything = np.concatenate(list(series.values()))
@@ -77,7 +77,7 @@ def histogram(title: str, series: Mapping[str, Values], unit: str = "per scenari
     whole = bool((everything == np.round(everything)).all())
     shapes += [axes.mark(value) for value in _marks(edges[0], edges[-1], whole)]
     for place, share in enumerate(shares.values()):
-        shapes.append(axes.steps(edges, share, SERIES[place % len(SERIES)], filled=len(shares) == 1))
+        shapes.append(axes.steps(edges, share, stroke(place), filled=len(shares) == 1))
     shapes.append(f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2:.0f}" y="{_HEIGHT - 4}" '
                   f'text-anchor="middle">{escape(unit)}</text>')  # fmt: skip
     facts = "".join(
@@ -151,12 +151,12 @@ class _Axes:
             f"{compact(value)}</text>"
         )
 
-    def steps(self, edges: Values, shares: Values, colour: str, filled: bool) -> str:
+    def steps(self, edges: Values, shares: Values, look: Stroke, filled: bool) -> str:
         """Bars of one series, or its outline where several share the drawing."""
         if filled:
             return "".join(
                 f'<rect x="{self.x(a) + 0.5:.1f}" y="{self.y(share):.1f}" width="{self.x(b) - self.x(a) - 1:.1f}" '
-                f'height="{self.y(0) - self.y(share):.1f}" fill="{colour}">'
+                f'height="{self.y(0) - self.y(share):.1f}" fill="{look.colour}">'
                 f"<title>{compact(a)} to {compact(b)}: {100 * share:.3g} %</title></rect>"
                 for a, b, share in zip(edges[:-1], edges[1:], shares, strict=True)
                 if share > 0
@@ -166,7 +166,7 @@ class _Axes:
             corners += [(a, share), (b, share)]
         corners.append((edges[-1], 0.0))
         points = " ".join(f"{self.x(x):.1f},{self.y(y):.1f}" for x, y in corners)
-        return f'<polyline stroke="{colour}" points="{points}"/>'
+        return f'<polyline {look.svg} points="{points}"/>'
 
 
 def _lead(inspections: Sequence[Inspection]) -> str:
@@ -255,7 +255,7 @@ def _bars(title: str, counts: Counts) -> str:
     rows = []
     for value, found in counts.items():
         bars = "".join(
-            f'<i style="width:{100 * number / max(of, 1):.2f}%;background-color:{SERIES[place % len(SERIES)]}"></i>'
+            f'<i style="width:{100 * number / max(of, 1):.2f}%;background:{stroke(place).key}"></i>'
             for place, (number, of) in enumerate(found)
         )
         words = "<br>".join(f"{number:,} ({100 * number / of:.3g} %)" if of else "–" for number, of in found)

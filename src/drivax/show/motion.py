@@ -1,4 +1,4 @@
-"""What a driven path says about driving: speed, accelerations, jerk, yaw rate, curvature, for plots."""
+"""What plots show of a drive: speed, accelerations, jerk, yaw rate and curvature of its path, and the commands."""
 
 from __future__ import annotations
 
@@ -51,6 +51,12 @@ SIGNALS = (
     Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-YAW_RATE_RPS, YAW_RATE_RPS)),
     Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-LATERAL_MPS2, LATERAL_MPS2)),
 )
+#: The commands, which are not read off the path: the first two numbers of an action.
+COMMANDS = (
+    Signal("lengthwise", "command lengthwise", "1 is the most", 0.001),
+    Signal("sideways", "command sideways", "1 is the most", 0.001),
+)
+COMMANDED = len(COMMANDS)
 
 
 def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:

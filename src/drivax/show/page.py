@@ -71,7 +71,7 @@ def refuse_page(out: Path, overwrite: bool) -> None:
         UsageError: ``out`` is a folder, or exists and ``overwrite`` is not given.
     """
     if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name an HTML file" if out.is_dir() else "choose another name or pass --overwrite"
+        cure = "name a file in it" if out.is_dir() else "choose another name or pass --overwrite"
         raise UsageError("exists already", file=out, cure=cure)
 
 

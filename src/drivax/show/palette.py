@@ -6,6 +6,7 @@ matters has a shape of its own besides (the ego's arrow, crosses at failures, th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from drivax.scenario.schema import AgentKind, LightState, RoadKind
@@ -15,6 +16,42 @@ YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 
 #: Colours of lines in charts, in order.
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """How a line of a chart is drawn.
+
+    Attributes:
+        colour: Of the line.
+        dash: Lengths of dash and gap, as SVG has them; empty for an unbroken line.
+    """
+
+    colour: str
+    dash: str = ""
+
+    @property
+    def svg(self) -> str:
+        """Attributes of an element of SVG."""
+        return f'stroke="{self.colour}"' + (f' stroke-dasharray="{self.dash}"' if self.dash else "")
+
+    @property
+    def key(self) -> str:
+        """CSS of the background of its key in a legend."""
+        if not self.dash:
+            return self.colour
+        on, off = map(int, self.dash.split())
+        return f"repeating-linear-gradient(90deg,{self.colour} 0 {on}px,transparent {on}px {on + off}px)"
+
+
+#: Lines of charts, in order: where colours run out they come again dashed, then dotted.
+STROKES = tuple(Stroke(colour, dash) for dash in ("", "6 3", "2 3") for colour in SERIES)
+
+
+def stroke(place: int) -> Stroke:
+    """How the line at a place is drawn."""
+    return STROKES[place % len(STROKES)]
+
 
 LIGHT = MappingProxyType(
     {
@@ -41,7 +78,7 @@ LEGEND = (
     ("ego", "ego"), ("log", "ego as logged"), ("route", "route"), ("goal", "goal"), ("vehicle", "vehicle"),
     ("parked", "standing still"), ("pedestrian", "pedestrian"), ("cyclist", "cyclist"), ("other", "other"),
     ("red", "red light"), ("amber", "amber"), ("green", "green"), ("unknown", "light not known"), ("stop", "stop sign"),
-    ("mark", "first collision, off-road or red light"),
+    ("mark", "first collision, off-road or red light; the planner's crash"),
 )  # fmt: skip
 
 

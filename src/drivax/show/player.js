@@ -3,7 +3,7 @@
 (() => {
   const ABSENT = -32768;
   const LIGHTS = ["unknown", "red", "amber", "green"];
-  const EVENTS = { collision: "collision", offroad: "off-road", red_light: "red light" };
+  const EVENTS = { collision: "collision", offroad: "off-road", red_light: "red light", crashed: "planner crashed" };
   const page = document.documentElement;
   window.addEventListener("error", (event) => { page.dataset.error = event.message; });
 

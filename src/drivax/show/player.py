@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from drivax.show.motion import SIGNALS
+from drivax.show.motion import COMMANDS, SIGNALS
 from drivax.show.page import asset, data_element
-from drivax.show.palette import LEGEND, SERIES, THEMES
+from drivax.show.palette import LEGEND, STROKES, THEMES
 
 KEYS = (
     ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
@@ -39,8 +39,9 @@ def player_html() -> str:
         f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
         "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript>"
         "<h3>How it drove</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the filters "
-        "of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. The commands themselves "
-        "are not stored: acceleration and curvature are what came of them.</small></p>"
+        "of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are what was "
+        "carried out: acceleration (or metres ahead) and steering (or metres to the left), as shares of the most "
+        "that the action space allows.</small></p>"
     )
 
 
@@ -48,11 +49,13 @@ def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
     """Script elements with palette, signals and packed episodes (:func:`drivax.show.episode.pack_episode`)."""
     themes = {name: dict(theme) for name, theme in THEMES.items()}
     signals = [
-        {"words": one.title, "unit": one.unit, "step": one.step, "limits": one.limits} for one in SIGNALS
+        {"words": one.title, "unit": one.unit, "step": one.step, "limits": one.limits}
+        for one in (*SIGNALS, *COMMANDS)
     ]
+    strokes = [[one.colour, one.dash, one.key] for one in STROKES]
     head = [
         data_element(themes, id="palette"),
-        data_element({"signals": signals, "colours": SERIES}, id="signals"),
+        data_element({"signals": signals, "strokes": strokes}, id="signals"),
     ]
     return head + [data_element(episode, **{"class": "episode"}) for episode in episodes]
 

@@ -5,7 +5,7 @@
   const source = document.getElementById("signals"), stage = document.getElementById("stage");
   const room = document.getElementById("plots");
   if (!source || !stage || !room) return;
-  const { signals, colours } = JSON.parse(source.textContent);
+  const { signals, strokes } = JSON.parse(source.textContent);
   const SVG = new DOMParser().parseFromString("<svg></svg>", "text/html").body.firstChild.namespaceURI;
   let plots = [], episode = null;
 
@@ -70,7 +70,8 @@
         if (value !== null) path += `${down ? "L" : "M"}${x(step).toFixed(1)} ${y(value).toFixed(1)}`;
         down = value !== null;
       });
-      draw("path", svg, { d: path, stroke: colours[i % colours.length] });
+      const [stroke, dash] = strokes[i % strokes.length];
+      draw("path", svg, { d: path, stroke, "stroke-dasharray": dash });
       for (const step of Object.values(episode.drives[i].events)) {
         const value = line[step];
         if (value === null || value === undefined) continue;
@@ -92,7 +93,9 @@
     episode = event.detail;
     room.replaceChildren();
     const read = (drive, i) => values(drive.signals[i], signals[i].step);
-    plots = signals.map((signal, i) => plot(signal, episode.drives.map((drive) => read(drive, i))));
+    plots = signals.map((signal, i) => [signal, episode.drives.map((drive) => read(drive, i))])
+      .filter(([, lines]) => lines.flat().some((value) => value !== null))  // the log, for one, was given no commands
+      .map(([signal, lines]) => plot(signal, lines));
   });
 
   stage.addEventListener("moment", (event) => {
@@ -103,7 +106,7 @@
       lines.forEach((line, i) => {
         const note = caption.appendChild(document.createElement("small")), value = line[event.detail];
         const key = note.appendChild(document.createElement("i"));
-        key.style.background = colours[i % colours.length];
+        key.style.background = strokes[i % strokes.length][2];
         const text = value === null ? "–" : value.toFixed(digits(signal.step)).replace("-", "−");
         note.append(`${episode.drives[i].planner} ${text}`);
       });

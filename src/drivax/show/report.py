@@ -9,8 +9,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivax.errors import UsageError
-from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.stored import ScenarioKey, comparable, mismatch
 from drivax.evaluation.tables import CONFIDENCE, summarise
 from drivax.show.breakdowns import Tags, collision_section, strata_section, transfer_section
 from drivax.show.comparison import metric_names
@@ -118,21 +120,15 @@ def _lead(runs: Sequence[Evaluation]) -> str:
 
 def _results(runs: Sequence[Evaluation]) -> str:
     names = metric_names(runs)
-    first = headline(names)
+    first = _first(runs, names)
     rest = [name for name in ordered(names) if name not in first]
     more = (
         f"<details><summary>{len(rest)} more metrics</summary>{planner_table(runs, rest)}</details>"
         if rest
         else ""
     )
-    hashes = {run.data.get("hash") for run in runs}
-    warning = (
-        "<p><b>These runs drove different scenarios or traffic;</b> their rows are not comparable.</p>"
-        if len(hashes) > 1 or len({run.traffic for run in runs}) > 1
-        else ""
-    )
     return (
-        f"<section><h2>Results</h2>{warning}{planner_table(runs, first) if first else ''}{more}<p><small>"
+        f"<section><h2>Results</h2>{_warning(runs)}{planner_table(runs, first) if first else ''}{more}<p><small>"
         f"Mean, {CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; undefined "
         "episodes are left out. The best mean is underlined, whether or not it is clearly best. A mean "
         "leads to the episodes behind it. Intervals: Wilson's for rates (with the effective number of episodes "
@@ -140,9 +136,30 @@ def _results(runs: Sequence[Evaluation]) -> str:
     )
 
 
+def _first(runs: Sequence[Evaluation], names: Sequence[str]) -> list[str]:
+    """The headline; with the crashes, where there were any."""
+    crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
+    return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
+
+
+def _warning(runs: Sequence[Evaluation]) -> str:
+    """Which rows cannot be compared with the policy's, and why; empty where all can."""
+    policy = runs[-1]
+    reasons = []
+    for run in runs[:-1]:
+        driven, of = set(run.scenarios), set(policy.scenarios)
+        if found := mismatch(run, policy):
+            reasons.append(f"{run.name} and {policy.name} {found[0]}")
+        elif driven != of:
+            counts = f"{len(driven & of)} of {len(driven)} and {len(of)}"
+            reasons.append(f"{run.name} and {policy.name} have {counts} scenarios in common")
+    told = "; ".join(map(escape, reasons))
+    return f"<p><b>Not all rows are comparable:</b> {told}.</p>" if told else ""
+
+
 def _differences(runs: Sequence[Evaluation]) -> str:
     policy, others = runs[-1], runs[:-1]
-    names = headline(list(policy.metrics)) or ordered(list(policy.metrics))
+    names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
     if not others or not names:
         return ""
     return (
@@ -190,7 +207,7 @@ def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
     )
     return (
         f"<h3>Drives</h3><p>Chosen by rule: failures of {escape(runs[-1].name)} first, each kind in turn, then "
-        f"successes. All planners start from the same scene at the same time.</p>{caution}"
+        f"successes. All planners that are shown start from the same scene at the same time.</p>{caution}"
         f"<div class=picker role=group aria-label=Drives>{buttons}</div><h3 data-control=title></h3>{player_html()}"
     )
 

@@ -6,7 +6,7 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.stored import AGAIN, EpisodeTable, present, read_about, read_episodes
+from drivax.evaluation.stored import AGAIN, EpisodeTable, ScenarioKey, present, read_about, read_episodes
 from drivax.metrics.catalogue import EVENTS
 from drivax.tracking.runs import seed_folders
 
@@ -28,12 +28,14 @@ class Trajectories:
     Attributes:
         rows: (scenario id, how many rows of that scenario came before) -> row.
         ego: Position [m], heading [rad] and speed [m/s] at every step from ``start`` on.
+        action: What was asked of it from ``start`` on; without numbers in a run that does not tell.
         start: Step of the log at which the planner took over.
         events: Step of the first event by name (:data:`EVENTS`), -1 where there was none.
     """
 
     rows: Mapping[tuple[str, int], int]
     ego: Float32[Array, "episode step 4"]
+    action: Float32[Array, "episode action D"]
     start: Int64[Array, " episode"]
     events: Mapping[str, Int64[Array, " episode"]]
 
@@ -44,9 +46,11 @@ class Evaluation(EpisodeTable):
 
     Attributes:
         trajectories: What was driven.
+        crashes: Of the scenarios in which the planner crashed, the step and what it raised.
     """
 
     trajectories: Trajectories
+    crashes: Mapping[ScenarioKey, tuple[int, str]] = field(default_factory=dict)
 
     @property
     def occurrences(self) -> list[tuple[str, int]]:
@@ -120,7 +124,19 @@ def _unique(name: str, folder: Path, names: set[str]) -> str:
 
 def _evaluation(folder: Path, name: str, about: Mapping[str, Any]) -> Evaluation:
     columns = read_episodes(folder)
-    return Evaluation(folder, name, about, *columns, _trajectories(present(folder / "trajectories.npz")))
+    driven = _trajectories(present(folder / "trajectories.npz"))
+    return Evaluation(folder, name, about, *columns, driven, _crashes(folder / "crashes.json"))
+
+
+def _crashes(path: Path) -> dict[ScenarioKey, tuple[int, str]]:
+    """What ``crashes.json`` tells; nothing where the planner never crashed."""
+    if not path.is_file():
+        return {}
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        return {(row["dataset"], row["scenario_id"]): (int(row["step"]), str(row["error"])) for row in rows}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
 
 
 def _trajectories(path: Path) -> Trajectories:
@@ -128,14 +144,15 @@ def _trajectories(path: Path) -> Trajectories:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             ids = [_text(value) for value in stored["scenario_id"]]
             ego = stored["ego"].astype(np.float32)
+            action = (stored["action"] if "action" in stored else ego[:, 1:, :0]).astype(np.float32)
             start = stored["start"].astype(np.int64)
             events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
     except KeyError as error:
         raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=AGAIN) from error
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
     n = len(ids)
-    if ego.ndim != 3 or ego.shape[0] != n or ego.shape[2] != 4 or any(
+    if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
         array.shape != (n,) for array in (start, *events.values())
     ):  # fmt: skip
         raise DataError("its arrays disagree in shape", file=path, cure=AGAIN)
@@ -144,7 +161,7 @@ def _trajectories(path: Path) -> Trajectories:
     for row, scenario_id in enumerate(ids):
         rows[scenario_id, seen.get(scenario_id, 0)] = row
         seen[scenario_id] = seen.get(scenario_id, 0) + 1
-    return Trajectories(rows, ego, start, events)
+    return Trajectories(rows, ego, action, start, events)
 
 
 def _text(value: Any) -> str:

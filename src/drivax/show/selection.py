@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable
 from drivax.show.runs import Evaluation
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).
@@ -41,7 +41,7 @@ class Choice:
     outcome: str
 
 
-def outcome(run: Evaluation, row: int) -> str:
+def outcome(run: EpisodeTable, row: int) -> str:
     """The gravest kind of failure of an episode, ``success``, or ``unjudged`` where nothing is defined."""
     judged = False
     for words, metric, bad in FAILURES:
@@ -79,20 +79,14 @@ def choose(runs: Sequence[Evaluation], count: int) -> list[Choice]:
     Among equally bad failures those come first that another planner drove well; among successes those where
     others failed, so that the picture tells planners apart.
     """
-    choices = [_choice(runs, places) for places in _places(runs)]
     groups: dict[str, list[Choice]] = {}
-    for choice in sorted(choices, key=lambda choice: _rank(runs, choice)):
+    for choice in ranked(runs):
         groups.setdefault(choice.outcome, []).append(choice)
-    successes = groups.pop("success", [])
-    failures = _in_turn([groups[kind] for kind in _kinds(groups)])
+    successes = sorted(groups.pop("success", []), key=lambda one: (_driven_well(runs, one), one.scenario_id))
+    failures = _in_turn(list(groups.values()))
     wanted = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
     picked = failures[:wanted] + successes[: count - min(wanted, len(failures))]
     return picked[:count]
-
-
-def _kinds(groups: dict[str, list[Choice]]) -> list[str]:
-    order = [words for words, _, _ in FAILURES]
-    return sorted(groups, key=lambda kind: order.index(kind) if kind in order else len(order))
 
 
 def _in_turn(groups: list[list[Choice]]) -> list[Choice]:
@@ -101,16 +95,10 @@ def _in_turn(groups: list[list[Choice]]) -> list[Choice]:
     return [group[place] for place in range(longest) for group in groups if place < len(group)]
 
 
-def _rank(runs: Sequence[Evaluation], choice: Choice) -> tuple[float, int, str]:
-    """Order within a kind: worst score first, then where the others did the opposite, then by scenario id."""
-    succeeded = choice.outcome == "success"
-    score = 0.0 if succeeded else _value(runs[-1], "vmax_score", choice.rows[-1] or 0)
-    others = [
-        outcome(run, row) == "success"
-        for run, row in zip(runs[:-1], choice.rows[:-1], strict=True)
-        if row is not None
-    ]
-    return (1.0 if np.isnan(score) else score), sum(good == succeeded for good in others), choice.scenario_id
+def _driven_well(runs: Sequence[Evaluation], choice: Choice) -> int:
+    """How many of the runs drove it without failure."""
+    rows = zip(runs, choice.rows, strict=True)
+    return sum(outcome(run, row) == "success" for run, row in rows if row is not None)
 
 
 def ranked(runs: Sequence[Evaluation]) -> list[Choice]:
@@ -141,6 +129,6 @@ def _first_rows(run: Evaluation) -> dict[tuple[str, str], int]:
     return rows
 
 
-def _value(run: Evaluation, metric: str, row: int) -> float:
+def _value(run: EpisodeTable, metric: str, row: int) -> float:
     """A metric of an episode; NaN where it is undefined or missing."""
     return float(run.metrics[metric][row]) if metric in run.metrics else float("nan")

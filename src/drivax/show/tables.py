@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from drivax.evaluation.statistics import Interval
-from drivax.evaluation.stored import comparable
+from drivax.evaluation.stored import mismatch
 from drivax.evaluation.tables import Row, Table, summarise
 from drivax.show.comparison import Difference, difference
 from drivax.show.glossary import ARROWS, Note, note
@@ -52,14 +52,14 @@ def difference_table(policy: Evaluation, others: Sequence[Evaluation], metrics: 
 
 
 def table_html(
-    table: Table, runs: Sequence[Evaluation], behind: Callable[[Row, int], Mapping[str, Any] | None]
+    table: Table, runs: Sequence[Evaluation], behind: Callable[[Row, int], Mapping[str, Any]]
 ) -> str:
     """A table of ``evaluation.tables``.
 
     Args:
         table: The table; metrics, where it has any, stand in its columns.
         runs: Evaluations, which say what metrics of the user's own are.
-        behind: From a row and the number of a column to what the page's list of episodes is asked for; None: nothing.
+        behind: From a row and the number of a column to what the page's list of episodes is asked for.
     """
     keys = "".join(f"<th scope=col>{escape(key)}</th>" for key in table.keys)
     named = table.across == "metric"
@@ -144,9 +144,14 @@ def _cell(
     if interval.mean is None:
         return '<td class=undefined title="undefined in every episode">–<small>n 0</small></td>'
     mark = " class=best" if best is not None and interval.mean == best else ""
-    mark += f' data-behind="{escape(json.dumps(behind))}"' if behind else ""
+    mark += _behind(behind) if behind else ""
     mean = number(interval.mean, entry.unit) + percent(entry.unit)
     return f"<td{mark}><b>{mean}</b><small>{bounds(interval, entry.unit)}</small><small>n {interval.n}</small></td>"
+
+
+def _behind(asked: Mapping[str, Any]) -> str:
+    """The attribute that leads from a cell to the page's list of episodes."""
+    return f' data-behind="{escape(json.dumps(asked))}"'
 
 
 def _best(intervals: Sequence[Interval], entry: Note) -> float | None:
@@ -158,17 +163,20 @@ def _best(intervals: Sequence[Interval], entry: Note) -> float | None:
 
 
 def _difference_cell(policy: Evaluation, other: Evaluation, metric: str) -> str:
-    if not comparable(policy, other):
-        return "<td class=undefined>other scenarios or traffic</td>"
-    found: Difference = difference(policy, other, metric)
-    if found.interval.mean is None:
+    if found := mismatch(policy, other):
+        return f"<td class=undefined>no pairs: {escape(found[0])}</td>"
+    compared: Difference = difference(policy, other, metric)
+    if compared.interval.mean is None:
         return '<td class=undefined title="no scenario where both are defined">–<small>n 0</small></td>'
     unit = note(metric, [policy]).unit
     points = " points" if unit == "rate" else ""
-    sign, words = _VERDICTS[found.verdict]
+    sign, words = _VERDICTS[compared.verdict]
+    mean = number(compared.interval.mean, unit, signed=True) + points
+    between = bounds(compared.interval, unit, signed=True)
+    behind = _behind({"run": policy.name, "metric": metric})
     return (
-        f"<td class={found.verdict}><b>{number(found.interval.mean, unit, signed=True)}{points}</b>"
-        f"<em>{sign} {words}</em><small>{bounds(found.interval, unit, signed=True)}, n {found.interval.n}</small></td>"
+        f"<td class={compared.verdict}{behind}><b>{mean}</b><em>{sign} {words}</em>"
+        f"<small>{between}, n {compared.interval.n}</small></td>"
     )
 
 

@@ -12,8 +12,8 @@ from typing import Any
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.evaluation.results import paired_differences
 from drivax.evaluation.runs import EvaluationConfig, format_summary, run_evaluation
+from drivax.evaluation.tables import paired_differences
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy

@@ -1,0 +1,63 @@
+"""The modes of an evaluation, all at once, through the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from drivax import settings
+from drivax.api import load
+from drivax.cli import main
+from drivax.evaluation.runs import EvaluationConfig
+from drivax.scenario.store import ScenarioSet
+from drivax.synthetic.generate import Generation, generate
+from tiny_run import write_run
+
+START = 60
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("modes") / "set"
+    generate(path, 2, 21, Generation(workers=1))
+    return path
+
+
+def evaluate(data, planner, out, *more):
+    """Status of the command; from a late step, after a noisy start."""
+    call = ["evaluate", "--planner", planner, "--data", str(data), "--out", str(out), "--noisy-start"]
+    return main([*call, "--start-step", str(START), "--seed", "7", *more])
+
+
+def driven(out):
+    with np.load(out / "trajectories.npz") as stored:
+        return dict(stored)
+
+
+def test_a_sampling_checkpoint_from_noisy_starts_over_an_old_run(data, tmp_path, capsys):
+    run = write_run(tmp_path / "bold", load(data).bank)
+    out, planner = tmp_path / "run", f"{run.path}@4"
+    assert evaluate(data, planner, out, "--sample") == 0
+    config = settings.load(EvaluationConfig, out / "config.yaml")
+    assert config == EvaluationConfig(
+        planner=planner, noisy_start=True, start_step=START, seed=7, sample=True
+    )
+    assert json.loads((out / "run.json").read_text())["planner"] == "bold@4"
+    sampled, scenarios = driven(out), ScenarioSet.open(data)
+    assert (sampled["start"] == START).all()
+    assert sampled["ego"].shape == (2, 91 - START, 4) and sampled["action"].shape == (2, 90 - START, 2)
+    logged = np.stack([one.agent_xy[START, 0] for one in scenarios])
+    away = np.linalg.norm(sampled["ego"][:, 0, :2] - logged, axis=1)
+    assert (away > 0.01).all(), "a second of wrong driving leads elsewhere than the log"
+    (out / "crashes.json").write_text("[]")
+    capsys.readouterr()
+    assert evaluate(data, planner, out) == 2 and "exists already" in capsys.readouterr().err
+    assert (out / "crashes.json").exists(), "a run that was not to be replaced is whole"
+    assert evaluate(data, planner, out, "--overwrite") == 0
+    modes = driven(out)
+    assert not (out / "crashes.json").exists(), "nothing of the old run stays"
+    assert not settings.load(EvaluationConfig, out / "config.yaml").sample
+    np.testing.assert_array_equal(modes["ego"][:, 0], sampled["ego"][:, 0])
+    assert (np.abs(modes["action"] - sampled["action"]).max(axis=(1, 2)) > 0.05).all()
