@@ -48,4 +48,5 @@ def test_published_numbers():
     assert (learner.value_coefficient, learner.entropy_coefficient, learner.gradient_norm) == (0.5, 0.01, 0.5)
     both = settings.load(TrainConfig, "published/bc_sac")
     for config in (sac, ppo, both):
+        assert config.earliest_start == config.latest_start == 0, "episodes of 90 steps"
         assert config.task.observation == PRESETS["published"] and config.task.rewards.preset == "published"
