@@ -36,6 +36,8 @@ class TrainConfig:
         start: How episodes begin while learning; validation begins as logged.
         earliest_start, latest_start: Episodes of learning begin at a random step of the log between the two; those of
             validation at step 10.
+        begin_from: Another run (``RUN``, its best checkpoint, or ``RUN@STEP``) whose networks this one begins with; the
+            rest of the state is fresh, and every other setting free as long as the networks fit.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
         checkpoint_rule: What makes one checkpoint better than another in validation: the ``score``, or
@@ -53,6 +55,7 @@ class TrainConfig:
     start: LogStart | NoisyStart = field(default_factory=LogStart)
     earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
+    begin_from: str | None = None
     evaluate_every: int = 0
     checkpoint_every: int = 20
     checkpoint_rule: Rule = "score"

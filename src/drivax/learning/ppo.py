@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -79,6 +79,8 @@ class PpoState:
 
     parameters: Any
     optimiser: Any
+    networks: ClassVar[tuple[str, ...]] = ("parameters",)
+
     environments: Environments
     key: Array
     iteration: Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -107,6 +107,8 @@ class Trained:
 @record
 class SacState:
     """Everything that a run needs to continue; ``parameters`` are the policy's."""
+
+    networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
 
     parameters: Any
     critic: Any

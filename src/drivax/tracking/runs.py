@@ -14,7 +14,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -140,11 +140,36 @@ def seed_folders(path: str | Path) -> list[Path]:
     return sorted((file.parent for file in found), key=lambda folder: int(folder.name.removeprefix("seed-")))
 
 
+def run_and_step(name: str) -> tuple[str, int | None]:
+    """What ``RUN@STEP`` names, or ``RUN``, which leaves the step open.
+
+    Raises:
+        UsageError: The step is no number.
+    """
+    run, at, step = name.partition("@")
+    if at and not step.isdecimal():
+        raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")
+    return run, int(step) if at else None
+
+
 def training_data(planner: str) -> list[dict[str, Any]]:
-    """The data sets of the training run that a planner is (``RUN`` or ``RUN@STEP``); none of any other planner."""
+    """The data sets of the training run that a planner is (``RUN`` or ``RUN@STEP``); none of any other planner.
+
+    Those of the runs that its networks come from are among them.
+    """
     path = Path(planner.partition("@")[0])
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
-    return list(info.get("data", ())) if info.get("kind") == "training" else []
+    if info.get("kind") != "training":
+        return []
+    return trained_on(info)
+
+
+def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The data sets that a training's ``run.json`` names, its own first, each once."""
+    known: dict[str, dict[str, Any]] = {}
+    for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
+        known.setdefault(entry["hash"], entry)
+    return list(known.values())
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
