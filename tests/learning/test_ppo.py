@@ -7,6 +7,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+from drivax.learning.imitation import Cloning
 import optax
 import pytest
 
@@ -89,6 +90,29 @@ def run(seeds, devices):
     for _ in range(3):
         state, logs = program.step(state)
     spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.environments)}
+
+
+@pytest.mark.parametrize("last", [0.1, 1.0])
+def test_settings_of_rate_and_norm_reach_the_optimisers(last):
+    """Without clipping, Adam's second step tells how large gradients were; at the end the rate is ``last``."""
+    cloning = Cloning(learning_rate=0.5, last_rate=last, gradient_norm=None, updates=2).optimiser(2)
+    ppo = PpoConfig(
+        network=NETWORK, environments=2, unroll=2, epochs=1, minibatches=2, learning_rate=0.5, last_rate=last,
+        gradient_norm=None,
+    ).build(Pendulum(), (), 1).optimiser  # fmt: skip
+    for optimiser in (cloning, ppo):
+        weights, state = {"w": jnp.zeros(1)}, optimiser.init({"w": jnp.zeros(1)})
+        sizes = []
+        for gradient in (100.0, 300.0, 300.0):
+            change, state = optimiser.update({"w": jnp.array([gradient])}, state, weights)
+            sizes.append(-float(change["w"][0]))
+        # Adam by hand: moments of 100, 300, 300 with their biases taken out.
+        first, second, wanted = 0.0, 0.0, []
+        for step, gradient in enumerate((100.0, 300.0, 300.0), 1):
+            first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+            rate = 0.5 * (1.0 + (last - 1.0) * min(step - 1, 2) / 2)
+            wanted.append(rate * first / (1 - 0.9**step) / np.sqrt(second / (1 - 0.999**step)))
+        np.testing.assert_allclose(sizes, wanted, rtol=1e-4)
     assert spread == {len(program.devices)}, spread
     shard = state.environments.observation["pendulum"].sharding.shard_shape((8, 3) if len(seeds) == 1 else (2, 8, 3))
     return jax.device_get((state.parameters, logs)), shard, program.account().parts["environments"]
