@@ -80,7 +80,7 @@ def compare(seed):
         log = np.column_stack([ego.xy[0], ego.heading[0], np.hypot(*ego.velocity[0].T)])
         # What the package was given: the same motion in float32.
         oracle = Judge(road, drive(log).astype(np.float32).astype(np.float64), two_way)
-        expected, ttc = oracle.episode(got["min_ttc"])
+        expected, ttc = oracle.episode(got["series"]["ttc"])
         if oracle.ambiguous:
             continue
         compared += 1
