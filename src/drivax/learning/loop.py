@@ -52,8 +52,7 @@ def train(
         overwrite: Replace an existing run folder.
         seeds: How many agents to train in one program, with ``config.seed`` and the following ones; of several each
             has a run folder of its own inside ``out``: ``seed-0``, ``seed-1``, ...
-        say: Called with a line about memory before the start, one about the networks of another run that it begins
-            with, and one about every agent that stops early.
+        say: Called with a line about memory, one about networks of another run, and one when an agent stops early.
 
     Raises:
         UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on
