@@ -90,7 +90,7 @@ def test_reactive_vehicles_give_way_to_what_is_told_to_stop(bank):
 
 def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
     """At 10 m/s the 5.2 m to its rear end take 0.52 s: the sixth step overlaps, is at fault, and ends the episode."""
-    bank = bank_of(straight_road([car(0, 0, 0, 10), car(10, 3.7, 0, 0)]))
+    bank = bank_of(straight_road([car(0, 0, 0, 10), car(10, 3.7, 0, 5)]))
     task = Task(observation=GLIMPSE, metrics=("collision", "at_fault_collision", "collision_type"))
     simulator = Simulator(task, OverrideTraffic())
 
@@ -112,7 +112,7 @@ def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
     }  # fmt: skip
     np.testing.assert_array_equal(over, np.arange(8) >= 5)
     np.testing.assert_array_equal(reward, np.where(np.arange(8) >= 5, -1.0, 0.0))
-    # Told to stay where its log has it, in the lane beside, it is passed.
+    # Told to stand in the lane beside, it is passed.
     metrics, reward, over = driven_past(3.7)
     assert float(metrics["collision"].value) == 0.0 and not over.any() and not reward.any()
 
