@@ -255,9 +255,10 @@ class Judge:
             self.ambiguous = True
         return (excess <= 1).mean(), magnitude[START:].max(), lat[START:].max()
 
-    def episode(self, min_ttc):
+    def episode(self, times):
         """Metrics by name, and times to collision at every eighth step.
 
+        Of all 80 steps they would take too long: those at the others are ``times``, of whoever is to be compared.
         Beyond the ends of lanes and route, lines are no longer straight on: what depends on them is left out there.
         """
         steps = range(START + 1, END + 1)
@@ -272,6 +273,7 @@ class Judge:
         comfort, jerk, lateral = self.comfort()
         gained, whole = max(self.motion[START:, 0].max(), 0.0), log[END, 0]
         ttc = {t: self.ttc(t, blameless[t]) for t in steps if self.motion[t, 3] >= 0.05 and t % 8 == 3}
+        moving = [times[t - START - 1] for t in steps if self.motion[t, 3] >= 0.05]
         goal = np.hypot(*(self.motion[END, :2] - log[END]))
         ratio = 1.0 if whole < 0.5 else np.clip(gained / whole, 0, 1)
         result = {
@@ -284,13 +286,16 @@ class Judge:
             "off_route": any(places[t][6] for t in steps), "route_deviation_mean": ways.mean(),
             "route_deviation_max": ways.max(), "ade": apart.mean(), "fde": apart[-1], "distance": moved.sum(),
             "progress": gained, "progress_ratio": ratio, "goal_distance": goal, "comfort": comfort, "max_jerk": jerk,
-            "max_lateral_acceleration": lateral,
+            "max_lateral_acceleration": lateral, "comfortable": comfort == 1.0,
+            "min_ttc": min(moving, default=None), "average_ttc": np.mean(moving) if moving else None,
+            "ttc_ok": all(value >= 0.95 for value in moving),
         }  # fmt: skip
         for value, threshold in ((ratio, 0.2), (ratio, 0.95), (goal, 3.0)):
             self.near(value, threshold)
         if self.motion[:, 0].max() > min(self.ring.bounds[2] - 5, log[END, 0] + 45):
             return {name: value for name, value in result.items() if name not in LINES}, ttc
-        return result | scores(result | {"min_ttc": min_ttc}), ttc
+        result |= scores(result)
+        return result | {"success_moving": result["success"] if whole - log[START, 0] > 5 else None}, ttc
 
 
 def scores(found):
@@ -313,6 +318,7 @@ def scores(found):
     lawful = not (found["at_fault_collision"] or found["offroad"] or found["red_light"])
     reached = found["goal_distance"] <= 3 or found["progress_ratio"] >= 0.95
     result = {
+        "making_progress": found["progress_ratio"] >= 0.2,
         "accuracy": clean, "accuracy_at_fault": lawful, "reached_goal": reached, "success": clean and reached,
         "direction": direction, "lane_keeping": lanes, "speed_compliance": speed,
     }  # fmt: skip

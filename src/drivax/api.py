@@ -25,6 +25,7 @@ from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
+from drivax.tracking.runs import run_and_step
 from drivax.tracking.zoo import is_policy, zoo
 
 
@@ -128,10 +129,8 @@ def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[P
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
         return make_planner(name), Task()
-    folder, _, step = name.partition("@")
+    folder, step = run_and_step(name)
     if not is_policy(folder):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
         raise UsageError(f"there is no planner {name!r}", cure=f"use {', '.join(kinds)}")
-    if step and not step.isdecimal():
-        raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")
-    return load_policy(folder, bank, step=int(step) if step else None, samples=sample)
+    return load_policy(folder, bank, step=step, samples=sample)

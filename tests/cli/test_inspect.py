@@ -182,6 +182,21 @@ def test_observations(sets, inspect, tmp_path):
     assert length["count"] == (0 + 1 + 2 + 2) * 2 * 8 and length["mean"] == pytest.approx(4.8 / 5)
 
 
+@pytest.mark.slow
+def test_what_matters_to_a_trained_policy(sets, inspect):
+    """The policy of the zoo brings its own task; permuting what it sees changes what it does."""
+    found = json.loads(inspect(sets[0], "--observations", "--planner", "zoo:aggressive", "--json"))
+    assert found["permuted"] == found["states"] == 32 and found["planner"] == "aggressive"
+    known = {
+        (row["group"], row["name"]): row["importance"]
+        for row in found["features"]
+        if row["importance"] is not None
+    }
+    assert {group for group, _ in known} >= {"ego", "agents", "road"} and "route" not in dict(known)
+    assert all(np.isfinite(value) and 0.0 <= value < 10.0 for value in known.values())
+    assert known["ego", "velocity ahead"] > 0.0 and found["groups"]["road"] > 0.0
+
+
 @pytest.mark.parametrize(
     ("words", "said", "status"),
     [

@@ -1,5 +1,7 @@
 """Driving as an environment: what rows of experience hold, and what the expert did."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +9,9 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.learning.collector import collect
-from drivax.learning.driving import Driving
+from drivax.learning.driving import Driving, _draw
 from drivax.learning.environment import Environment
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, ScenarioBank
+from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Discrete
@@ -24,7 +26,7 @@ def moment(bank, scene, frames):
 
 
 OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2, own=(OwnGroup(moment),))
-LATEST = 30
+EARLIEST, LATEST = 4, 30
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ def bank(data):
 
 @pytest.fixture(scope="module")
 def driving():
-    return Driving(Simulator(Task(observation=OBSERVATION, metrics=("steps", "red_light"))), LATEST)
+    return Driving(Simulator(Task(observation=OBSERVATION, metrics=("steps", "red_light"))), LATEST, EARLIEST)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +59,7 @@ def test_it_is_an_environment(bank, driving):
     grid = Driving(Simulator(Task(actions=Discrete(accelerations=3, curvatures=5))))
     assert grid.levels == ((-1.0, 0.0, 1.0), (-1.0, -0.25, 0.0, 0.25, 1.0))
     for step in (9, 89):
-        with pytest.raises(UsageError, match="use 10 to 88"):
+        with pytest.raises(UsageError, match=r"use 10 \(earliest_start\) to 88"):
             Driving(driving.simulator, step)
 
 
@@ -77,7 +79,7 @@ def test_the_row_behind_an_end_holds_the_final_state(experience):
     np.testing.assert_array_equal(scene.history[1:][lived][:, :-1], scene.history[:-1][lived][:, 1:])
     # Nothing of that reaches the episode that begins behind it.
     begun = scene.step[1:][~lived]
-    assert (begun >= 10).all() and (begun <= LATEST).all() and len(np.unique(begun)) > 2
+    assert (begun >= EARLIEST).all() and (begun <= LATEST).all() and len(np.unique(begun)) > 2
     assert (scene.action[1:][~lived] == 0).all() and (scene.route_m[1:][~lived] >= 0).all()
 
 
@@ -86,8 +88,19 @@ def test_new_episodes_begin_as_logged(experience, bank):
     rows = np.argwhere(~alive[:-1]) + np.array([1, 0])
     for time, number in rows:
         step, history = scene.step[time, number], scene.history[time, number]
-        logged = np.asarray(bank.agents)[scene.index[time, number], step - 9 : step + 1, 0]
-        np.testing.assert_allclose(history[-10:, :2], logged[:, :2], atol=1e-4)
+        logged = np.asarray(bank.agents)[scene.index[time, number], max(step - 9, 0) : step + 1, 0]
+        np.testing.assert_allclose(history[-len(logged) :, :2], logged[:, :2], atol=1e-4)
+
+
+def test_episodes_begin_at_the_steps_asked_for(bank):
+    late = replace(bank, agents=bank.agents.at[1, :3, 0, AGENT_VALID].set(0.0))
+    index, step, _ = _draw(late, jax.random.key(2), 64, 0, 0)
+    np.testing.assert_array_equal(step, np.where(index == 1, 10, 0))
+    step = _draw(bank, jax.random.key(2), 256, 0, LATEST)[1]
+    assert set(np.asarray(step)) == set(range(LATEST + 1))
+    for earliest, latest, words in ((-1, 0, "use 0 or more"), (5, 4, r"use 5 \(earliest_start\) to 88")):
+        with pytest.raises(UsageError, match=words):
+            Driving(Simulator(Task()), latest, earliest)
 
 
 def test_stored_states_are_observed_as_they_were_seen(experience, bank, driving):

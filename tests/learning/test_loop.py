@@ -10,7 +10,7 @@ import pytest
 
 from drivax import settings
 from drivax.cli import main
-from drivax.errors import UsageError
+from drivax.errors import DrivaxError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -21,7 +21,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.show.runs import read_runs
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.runs import seed_folders
+from drivax.tracking.runs import seed_folders, training_data
 from drivax.tracking.sinks import read_rows
 from toy_learner import Toy, ToyConfig, ToyState
 
@@ -34,14 +34,16 @@ VALUES = {
 }
 
 
+KEY = jax.random.key(0)
+
+
 @pytest.fixture(scope="module")
 def config():
     return settings.load(TrainConfig, VALUES)
 
 
 def last_state(folder):
-    key = jax.random.key(0)
-    return Checkpoints(folder / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, key))
+    return Checkpoints(folder / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, KEY))
 
 
 def numbers(state: ToyState):
@@ -85,6 +87,50 @@ def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_
             np.testing.assert_array_equal(one, again)
     with pytest.raises(UsageError, match="holds 2 agents, not 3; resume without --seeds"):
         train(config, data, tmp_path / "cut", resume=True, seeds=3)
+
+
+def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
+    """The toy adds random numbers of its key to its parameters, so what it began with is what a fresh one lacks."""
+    former = train(config, data, tmp_path / "former").path
+    plain = train(replace(config, total_steps=10), data, tmp_path / "plain", seeds=2).path
+    lines = []
+    onward = replace(config, total_steps=10, begin_from=f"{former}@40")
+    run = train(onward, data, tmp_path / "run", seeds=2, say=lines.append)
+    assert lines[1:] == [f"begins with parameters of {former}@40"]
+    began = Checkpoints(former / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, KEY), 40)
+    pairs = list(zip(seed_folders(run.path), seed_folders(plain), strict=True))
+    for path, fresh in pairs:
+        parameters, key, iteration = numbers(last_state(path))
+        lacks = parameters - numbers(last_state(fresh))[0]
+        np.testing.assert_allclose(lacks, began.parameters, rtol=1e-5)
+        assert iteration == 1 and (key == numbers(last_state(fresh))[1]).all()
+        assert training_data(str(path)) == training_data(str(former)), "each set once"
+    # Without a step it is the best; whoever resumes from the very beginning finds the same.
+    run = train(replace(onward, begin_from=str(former)), data, tmp_path / "best", validation=data)
+    assert run.config(TrainConfig).begin_from == f"{former}@60" and run.info["networks_from"]["step"] == 60
+    before = numbers(last_state(run.path))
+    shutil.rmtree(run.checkpoints)
+    train(config, data, run.path, validation=data, resume=True)
+    for one, again in zip(before, numbers(last_state(run.path)), strict=True):
+        np.testing.assert_array_equal(one, again)
+    # What does not fit is told before a folder is made.
+    wide = replace(onward, algorithm=ToyConfig(size=4))
+    for wrong, words in (
+        (
+            wide,
+            r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; begin from a run with the same net",
+        ),
+        (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 agents; name one of them"),
+        (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
+        (replace(onward, begin_from=f"{former}@7"), "there is no checkpoint of step 7"),
+        (replace(onward, begin_from="zoo:aggressive"), "is packed, and has no networks to learn on from"),
+    ):
+        with pytest.raises(DrivaxError, match=words):
+            train(wrong, data, tmp_path / "never")
+    assert not (tmp_path / "never").exists()
+    # Where it came from is not asked for any more once there is a checkpoint.
+    shutil.rmtree(former)
+    train(config, data, run.path, validation=data, resume=True)
 
 
 def test_learning_stops_when_patience_is_up(data, config, tmp_path):
@@ -152,5 +198,10 @@ def test_the_command_trains_several(data, tmp_path, capsys):
     assert main([*arguments, "--seeds", "2", "--total_steps", "20"]) == 0
     told = capsys.readouterr()
     assert "wrote" in told.out and "memory: " in told.err and (out / "seed-5" / "metrics.jsonl").is_file()
+    more = ["--from", str(out / "seed-4"), "--total_steps", "10"]
+    assert main([*arguments[:-1], str(tmp_path / "onward"), *more]) == 0
+    assert f"begins with parameters of {out / 'seed-4'}@20" in capsys.readouterr().err
+    assert main([*arguments, "--resume", *more[:2]]) == 2
+    assert "a resumed run keeps its configuration; leave out --from" in capsys.readouterr().err
     assert main([*arguments[:1], "demo", *arguments[2:], "--seeds", "0", "--overwrite"]) == 2
     assert "0 seeds; use 1 or more" in capsys.readouterr().err

@@ -1,8 +1,4 @@
-"""PPO on the pendulum: what it bootstraps, heads, several devices, seeds side by side; its optimiser."""
-
-import os
-import subprocess
-import sys
+"""PPO on the pendulum: what it bootstraps, heads; its optimiser."""
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +7,7 @@ import optax
 import pytest
 
 from drivax.learning.collector import Rollout
+from drivax.learning.imitation import Cloning
 from drivax.learning.optimisers import clip_apart, clipped_adam
 from drivax.learning.ppo import PpoConfig
 from drivax.networks.actor_critic import NetworkConfig
@@ -71,66 +68,6 @@ def test_heads(network):
     assert network.distribution != "grid" or float(action[0]) in (-1.0, 0.0, 1.0)
 
 
-MESH = """
-import sys
-import jax, numpy as np
-from drivax.errors import UsageError
-from drivax.learning.agents import Agents
-from drivax.learning.program import Program
-from pendulum import Pendulum
-from test_ppo import CONFIG
-
-learner = CONFIG.build(Pendulum(), (), 3)
-
-def run(seeds, devices):
-    program = Program(Agents(learner, seeds), (), devices)
-    assert len(program.devices) == (devices or 4), program.devices
-    state = program.first_state()
-    for _ in range(3):
-        state, logs = program.step(state)
-    spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state.environments)}
-    assert spread == {len(program.devices)}, spread
-    shard = state.environments.observation["pendulum"].sharding.shard_shape((8, 3) if len(seeds) == 1 else (2, 8, 3))
-    return jax.device_get((state.parameters, logs)), shard, program.account().parts["environments"]
-
-def same(one, other):
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5), one, other)
-
-one, whole, size = run((3,), 1)
-for devices in (2,) if sys.argv[1] == "two" else (2, None):
-    several, shard, part = run((3,), devices)
-    same(one, several)
-    assert shard == (8 // (devices or 4), 3) and part == size // (devices or 4), (shard, part, size)
-if sys.argv[1] == "two":
-    print("same")
-    sys.exit()
-# Two agents on two devices, one each: the first learns what it learns alone, the second something else.
-pair, shard, _ = run((3, 4), 2)
-first, second = (jax.tree.map(lambda leaf: leaf[number], pair) for number in (0, 1))
-same(one, first)
-apart = jax.tree.map(lambda a, b: np.abs(a - b).max(), first[0], second[0])
-assert max(jax.tree.leaves(apart)) > 0.1, apart
-assert shard == (1, 8, 3), shard
-try:
-    Program(Agents(learner, (3,)), (), 3)
-except UsageError as error:
-    assert "8 environments cannot be divided among 3 devices" in str(error), error
-else:
-    raise AssertionError("3 devices")
-print("same")
-"""
-
-
-@pytest.mark.parametrize("extent", ["two", pytest.param("four_and_seeds", marks=pytest.mark.slow)])
-def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(extent, repository, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
-    monkeypatch.setenv(
-        "PYTHONPATH", f"{repository / 'src'}:{repository / 'tests'}:{repository / 'tests/learning'}"
-    )
-    result = subprocess.run([sys.executable, "-c", MESH, extent], capture_output=True, text=True, check=False)
-    assert result.stdout == "same\n", result.stderr
-
-
 def test_parts_are_clipped_by_their_own_norms():
     gradient = {
         "policy": {"w": jnp.array([0.3, 0.4])},
@@ -153,3 +90,26 @@ def test_the_rate_falls_to_a_tenth():
         sizes.append(-float(change["w"][0]))
     wanted = [0.5 - 0.045 * min(step, 10) for step in range(12)]
     np.testing.assert_allclose(sizes, wanted, rtol=1e-4)
+
+
+@pytest.mark.parametrize("last", [0.1, 1.0])
+def test_settings_of_rate_and_norm_reach_the_optimisers(last):
+    """Without clipping, Adam's second step tells how large gradients were; at the end the rate is ``last``."""
+    cloning = Cloning(learning_rate=0.5, last_rate=last, gradient_norm=None, updates=2).optimiser(2)
+    ppo = PpoConfig(
+        network=NETWORK, environments=2, unroll=2, epochs=1, minibatches=2, learning_rate=0.5, last_rate=last,
+        gradient_norm=None,
+    ).build(Pendulum(), (), 1).optimiser  # fmt: skip
+    for optimiser in (cloning, ppo):
+        weights, state = {"w": jnp.zeros(1)}, optimiser.init({"w": jnp.zeros(1)})
+        sizes = []
+        for gradient in (100.0, 300.0, 300.0):
+            change, state = optimiser.update({"w": jnp.array([gradient])}, state, weights)
+            sizes.append(-float(change["w"][0]))
+        # Adam by hand: moments of 100, 300, 300 with their biases taken out.
+        first, second, wanted = 0.0, 0.0, []
+        for step, gradient in enumerate((100.0, 300.0, 300.0), 1):
+            first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+            rate = 0.5 * (1.0 + (last - 1.0) * min(step - 1, 2) / 2)
+            wanted.append(rate * first / (1 - 0.9**step) / np.sqrt(second / (1 - 0.999**step)))
+        np.testing.assert_allclose(sizes, wanted, rtol=1e-4)

@@ -47,5 +47,9 @@ def test_published_numbers():
     assert learner.steps_per_iteration // learner.minibatches == 512
     assert (learner.value_coefficient, learner.entropy_coefficient, learner.gradient_norm) == (0.5, 0.01, 0.5)
     both = settings.load(TrainConfig, "published/bc_sac")
+    cloning = (settings.load(TrainConfig, "published/bc").algorithm, both.algorithm.warm_start.cloning)
+    assert {part.last_rate for part in (learner, *cloning)} == {1.0}, "rates stay"
+    assert {part.gradient_norm for part in (sac.algorithm, both.algorithm.sac, *cloning)} == {None}
     for config in (sac, ppo, both):
+        assert config.earliest_start == config.latest_start == 0, "episodes of 90 steps"
         assert config.task.observation == PRESETS["published"] and config.task.rewards.preset == "published"

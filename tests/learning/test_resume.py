@@ -1,6 +1,6 @@
 """Every algorithm goes on from a checkpoint bit for bit, keeps to the rules, and goes through its phases."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import jax
@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivax.errors import DataError
+from drivax.learning.first_state import Origin, with_networks
 from drivax.learning.imitation import BcConfig, Cloning
 from drivax.learning.loop import logged
 from drivax.learning.ppo import PpoConfig
@@ -43,6 +45,13 @@ ALGORITHMS = {
 }
 
 
+#: Which networks SAC takes over from a run of each.
+TAKEN = {
+    "ppo": None,
+    "bc": [".parameters"],
+    "sac": [".parameters", ".critic", ".target"],
+    "bc_sac": [".parameters", ".critic", ".target"],
+}
 #: This one goes through cloning, and through SAC with its replay.
 FAST = "bc_sac"
 PARAMETERS = [name if name == FAST else pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS]
@@ -107,6 +116,39 @@ def test_a_warm_start_clones_and_then_learns(run):
     assert not all(map(same, *values))
     moved = jax.tree.leaves(begun.learner.environments), jax.tree.leaves(learned.learner.environments)
     assert not all(map(same, *moved))
+
+
+def test_networks_go_over_to_another_run(tmp_path):
+    """SAC, hotter, from each of them: it gets all the networks that there are, and nothing else."""
+    hot = replace(SAC, temperature=0.5).build(Pendulum(), SHOWN, 6)
+    fresh = jax.jit(hot.init)(SHOWN, jax.random.key(5))
+    for number, (name, wanted) in enumerate(TAKEN.items()):
+        former = jax.jit(ALGORITHMS[name].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(6))
+        Checkpoints(tmp_path / "checkpoints").save(number, former)
+        origin = Origin(tmp_path, number, [])
+        if name == "ppo":
+            with pytest.raises(DataError, match=r"no \.parameters.*; begin from a run with the same network"):
+                origin.networks(fresh)
+            continue
+        found = origin.networks(jax.eval_shape(lambda: fresh))
+        assert list(found) == wanted
+        state = with_networks(fresh, found)
+        inner = former.learner if name == "bc_sac" else former
+        same = {"parameters": former.parameters} | {
+            path: getattr(inner, path) for path in ("critic", "target") if f".{path}" in wanted
+        }
+        for field in fields(fresh):
+            expected = same.get(field.name, getattr(fresh, field.name))
+            pairs = (jax.tree.map(_plain, part) for part in (getattr(state, field.name), expected))
+            jax.tree.map(np.testing.assert_array_equal, *pairs)
+        assert float(state.log_temperature) == pytest.approx(np.log(0.5))
+    # And back into a warm start, where they lie one level deeper.
+    both = jax.jit(ALGORITHMS["bc_sac"].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(7))
+    found = Origin(tmp_path, list(TAKEN).index("sac"), []).networks(both)
+    assert list(found) == [".parameters", ".learner.critic", ".learner.target"]
+    jax.tree.map(
+        np.testing.assert_array_equal, with_networks(both, found).learner.critic, found[".learner.critic"]
+    )
 
 
 def _plain(leaf):

@@ -12,6 +12,7 @@ from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
 from drivax.simulator import situation
 from drivax.simulator.catalogue import make_traffic, prepared
+from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.simulator import Simulator
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
@@ -93,20 +94,39 @@ def test_what_is_measured_on_request_costs_nothing_where_nobody_asks(bank, monke
     assert asked == {"lane_passage", "nearest_gap"}
 
 
-@pytest.mark.parametrize(("traffic", "most"), [("log", 4096), ("idm", 16384)])
+#: Kinds of traffic with the most bytes that a state may take.
+KINDS = [
+    (make_traffic("log"), 4096),
+    (make_traffic("idm"), 16384),
+    (OverrideTraffic(), 16384),
+    (OverrideTraffic(make_traffic("idm")), 16384),
+]
+every_traffic = pytest.mark.parametrize(
+    ("traffic", "most"), KINDS, ids=lambda kind: getattr(kind, "name", "")
+)
+
+
+def told(bank):
+    """The bank, with four agents that are told to stand at the origin."""
+    return with_given(bank, jnp.arange(1, 5)[None], jnp.zeros((1, bank.steps, 4, 4)))
+
+
+@every_traffic
 def test_states_are_small(bank, traffic, most):
-    chosen = make_traffic(traffic)
+    simulator = Simulator(Task(observation=GLIMPSE), traffic)
     state = jax.eval_shape(
-        Simulator(Task(observation=GLIMPSE), chosen).reset, prepared(chosen, bank), jnp.zeros((), jnp.int32)
+        lambda bank: simulator.reset(told(bank), jnp.zeros((), jnp.int32)), prepared(traffic, bank)
     )
     assert sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) <= most
 
 
-@pytest.mark.parametrize("traffic", ["log", "idm"])
-def test_a_state_has_the_same_types_after_a_reset_and_after_a_step(bank, traffic):
+@every_traffic
+def test_a_state_has_the_same_types_after_a_reset_and_after_a_step(bank, traffic, most):
     """Else whoever steps compiles twice, and every loop over steps is traced twice."""
-    model = make_traffic(traffic)
-    simulator, bank = Simulator(Task(observation=GLIMPSE), model), prepared(model, bank)
+    simulator, bank = (
+        Simulator(Task(observation=GLIMPSE), traffic),
+        jax.eval_shape(told, prepared(traffic, bank)),
+    )
 
     def types(state):
         return [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(state)]

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
+from drivax.metrics.episode import episode_metrics
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.catalogue import make_traffic, prepared
+from drivax.simulator.contact import CollisionType
 from drivax.simulator.override import OverrideTraffic, motions_of_actions, with_given
 from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic import LogTraffic, alone
 from drivax.tasks.task import Task
-from scenes import bank_of, car, straight_road
+from scenes import GLIMPSE, bank_of, car, straight_road
 
 TASK = Task()
 SIMULATOR = Simulator(TASK, OverrideTraffic(IdmTraffic()))
@@ -84,6 +86,35 @@ def test_reactive_vehicles_give_way_to_what_is_told_to_stop(bank):
     x, speed = np.asarray(frames.box)[:, 1:3, 0], np.asarray(frames.velocity)[:, 2, 0]
     assert (x[:, 0] - x[:, 1] - 4.8 > 1.0).all()
     assert x[-1, 0] - x[-1, 1] - 4.8 == pytest.approx(2.0, abs=1.0) and speed[-1] < 0.8
+
+
+def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
+    """At 10 m/s the 5.2 m to its rear end take 0.52 s: the sixth step overlaps, is at fault, and ends the episode."""
+    bank = bank_of(straight_road([car(0, 0, 0, 10), car(10, 3.7, 0, 5)]))
+    task = Task(observation=GLIMPSE, metrics=("collision", "at_fault_collision", "collision_type"))
+    simulator = Simulator(task, OverrideTraffic())
+
+    @jax.jit
+    def driven_past(y):
+        pose = jnp.stack([bank.agents[0, 10, 1, 0], y, 0.0, 0.0])
+        told = with_given(bank, jnp.asarray([[1]]), jnp.broadcast_to(pose, (1, 91, 1, 4)))
+
+        def step(state, _):
+            after, done = simulator.step(told, state, jnp.zeros(2))
+            return after, (done.reward_terms["collision"], done.terminated)
+
+        state, (reward, over) = jax.lax.scan(step, simulator.reset(told, 0), None, length=8)
+        return episode_metrics(told, state), reward, over
+
+    metrics, reward, over = driven_past(0.0)
+    assert {name: float(found.value) for name, found in metrics.items()} == {
+        "collision": 1.0, "at_fault_collision": 1.0, "collision_type": float(CollisionType.STOPPED_OBJECT)
+    }  # fmt: skip
+    np.testing.assert_array_equal(over, np.arange(8) >= 5)
+    np.testing.assert_array_equal(reward, np.where(np.arange(8) >= 5, -1.0, 0.0))
+    # Told to stand in the lane beside, it is passed.
+    metrics, reward, over = driven_past(3.7)
+    assert float(metrics["collision"].value) == 0.0 and not over.any() and not reward.any()
 
 
 @pytest.mark.slow

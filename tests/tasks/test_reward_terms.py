@@ -164,6 +164,22 @@ def test_margins():
     assert [float(terms["close"]) for terms in found.values()] == pytest.approx([-0.1, -0.1, 0])
 
 
+def test_scale_brings_a_step_into_another_range():
+    """The worst step of ``published`` is -3.3 and the best 0.4, by the weights; scaled they are in [-1, 1]."""
+    failures = dict.fromkeys(("collision", "offroad", "red_light", "off_route"), True)
+    worst = facts(**failures, speed_mps=20.0, jerk_mps3=20.0, progress_m=19.0)
+    published = RewardConfig(preset="published")
+    for scale in (1.0, 0.3):
+        scaled = replace(published, scale=scale)
+        for now, whole in ((worst, -3.3), (facts(), 0.4)):
+            terms = scaled.weigh(BEFORE, now, around())
+            assert float(sum(terms.values())) == pytest.approx(scale * whole, abs=1e-6)
+            plain = published.weigh(BEFORE, now, around())
+            assert {name: float(term) for name, term in terms.items()} == pytest.approx(
+                {name: scale * float(term) for name, term in plain.items()}, abs=1e-6
+            )
+
+
 def in_numpy(before, now, near):
     """All terms once more, row by row from their definitions: NumPy, float64, shares no code with the package."""
     rows = {}
@@ -322,6 +338,12 @@ def test_configurations():
     rewards = {"preset": "published", "collision_margin_m": 0.5, "ttc": -0.3, "ttc_s": 0.95}
     made = settings.load(TrainConfig, {"task": {"rewards": rewards}}).task.rewards
     assert made.weights() == PUBLISHED | {"ttc": -0.3} and made.ttc_s == 0.95
-    for wrong in ({"preset": "publishd"}, {"collision_margin_m": -1.0}, {"ttc_s": 9.0}, {"close_m": 99.0}):
+    for wrong in (
+        {"preset": "publishd"},
+        {"collision_margin_m": -1.0},
+        {"ttc_s": 9.0},
+        {"close_m": 99.0},
+        {"scale": 0},
+    ):
         with pytest.raises(UsageError, match=r"task\.rewards"):
             settings.load(TrainConfig, {"task": {"rewards": wrong}})

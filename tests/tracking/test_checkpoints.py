@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError
-from drivax.tracking.checkpoints import Checkpoints, pack, unpack
+from drivax.tracking.checkpoints import Checkpoints, is_part, pack, unpack
 
 
 class State(NamedTuple):
@@ -72,6 +72,21 @@ def test_bit_for_bit(tmp_path: Path):
     assert isinstance(again.host, np.ndarray)
     assert path.name == "step-000000100"
     assert [item.name for item in (tmp_path / "checkpoints").iterdir()] == [path.name]
+
+
+def test_parts_by_their_paths(tmp_path: Path):
+    checkpoints = Checkpoints(tmp_path)
+    state = {"critic": jnp.arange(3.0), "critics": jnp.zeros(2), "policy": {"w": jnp.ones(2)}}
+    checkpoints.save(5, state)
+    found = checkpoints.restore_parts(
+        {"['policy']": {"w": jnp.zeros(2)}, "['critic']": jax.ShapeDtypeStruct((3,), jnp.float32)}
+    )
+    np.testing.assert_array_equal(found["['critic']"], [0, 1, 2])
+    np.testing.assert_array_equal(found["['policy']"]["w"], [1, 1])
+    named = [".critic['w']", ".critics", ".critic"]
+    assert [is_part(leaf, [".critic"]) for leaf in named] == [True, False, True]
+    with pytest.raises(DataError, match=r"no \['policy'\]\['v'\]; begin elsewhere"):
+        checkpoints.restore_parts({"['policy']": {"v": jnp.zeros(2)}}, cure="begin elsewhere")
 
 
 def test_shapes_are_template_enough(tmp_path: Path):

@@ -129,3 +129,16 @@ def test_where_a_planner_was_trained(tmp_path):
     assert runs.training_data(trained) == runs.training_data(f"{trained}@1000") == data
     assert runs.training_data(str(tmp_path / "judged")) == runs.training_data("idm") == []
     assert [entry["scenarios"] for entry in runs.training_data("zoo:aggressive")] == [4096]
+    # What the run learned from whose networks it began with counts too, each set once.
+    former = [{"hash": "abc"}, {"path": "sets/b", "hash": "def", "scenarios": 2}]
+    RunFolder.open(trained).note(networks_from={"run": "runs/a", "step": 10, "data": former})
+    assert runs.training_data(trained) == [*data, former[1]]
+
+
+def test_steps_of_runs():
+    assert runs.run_and_step("runs/a") == ("runs/a", None) and runs.run_and_step("runs/a@20") == (
+        "runs/a",
+        20,
+    )
+    with pytest.raises(UsageError, match="'best' is no step of a checkpoint; write RUN@STEP"):
+        runs.run_and_step("runs/a@best")

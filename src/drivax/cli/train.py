@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -38,6 +39,8 @@ class Train:
     """Scenario set that chooses the best checkpoint."""
     seeds: int = 1
     """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
+    begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
+    """Begin with the networks of another run; replay, optimisers and environments are fresh, settings free."""
     resume: bool = False
     """Continue the run in OUT from its newest checkpoint."""
     overwrite: bool = False
@@ -46,11 +49,14 @@ class Train:
 
 def run(args: Train, overrides: Sequence[str] = ()) -> int:
     """Train, then say where the run is."""
-    if args.resume and overrides:
-        raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(overrides))
+    given = [*overrides, *([] if args.begin_from is None else ["--from", args.begin_from])]
+    if args.resume and given:
+        raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(given))
     if args.seeds > 1 or args.resume:
         widen_pool()
     config = settings.load(TrainConfig, args.config, list(overrides))
+    if args.begin_from is not None:
+        config = replace(config, begin_from=args.begin_from)
     validation = None if args.validation is None else ScenarioSet.open(args.validation)
     folder = train(
         config,

@@ -16,7 +16,11 @@ Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 @runtime_checkable
 class LearnerState(Protocol):
-    """A pytree with all that a run needs to continue; a frozen ``scenario.record.record``, so that it has names."""
+    """A pytree with all that a run needs to continue; a frozen ``scenario.record.record``, so that it has names.
+
+    A class attribute ``networks`` names the fields that a run which begins from another one takes over (only
+    ``parameters`` where there is none); one of them may be such a state itself.
+    """
 
     @property
     def parameters(self) -> Any:

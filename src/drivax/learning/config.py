@@ -34,7 +34,10 @@ class TrainConfig:
         traffic: How the others move, while learning and in validation: ``log``, ``idm``, ``package.module:name``, or a
             trained policy (its run folder or ``zoo:NAME``).
         start: How episodes begin while learning; validation begins as logged.
-        latest_start: Episodes of learning begin at a random step of the log between 10 and this one.
+        earliest_start, latest_start: Episodes of learning begin at a random step of the log between the two; those of
+            validation at step 10.
+        begin_from: Another run (``RUN``, its best checkpoint, or ``RUN@STEP``) whose networks this one begins with; the
+            rest of the state is fresh, and every other setting free as long as the networks fit.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
         checkpoint_rule: What makes one checkpoint better than another in validation: the ``score``, or
@@ -50,7 +53,9 @@ class TrainConfig:
     algorithm: Algorithm = field(default_factory=PpoConfig)
     traffic: str = "log"
     start: LogStart | NoisyStart = field(default_factory=LogStart)
+    earliest_start: int = CURRENT_STEP
     latest_start: int = CURRENT_STEP
+    begin_from: str | None = None
     evaluate_every: int = 0
     checkpoint_every: int = 20
     checkpoint_rule: Rule = "score"
@@ -75,7 +80,8 @@ class TrainConfig:
         # Here, because a policy that drives the others was trained with such a configuration itself.
         from drivax.learning.policy_traffic import find_traffic
 
-        return Driving(Simulator(self.task, find_traffic(self.traffic), self.start), self.latest_start)
+        simulator = Simulator(self.task, find_traffic(self.traffic), self.start)
+        return Driving(simulator, self.latest_start, self.earliest_start)
 
     @property
     def iterations(self) -> int:

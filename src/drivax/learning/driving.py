@@ -32,16 +32,21 @@ class Driving:
 
     Attributes:
         simulator: Task, traffic and kind of start.
-        latest_start: Episodes begin at a random step of the log between 10 and this one.
+        latest_start: Episodes begin at a random step of the log between ``earliest_start`` and this one.
+        earliest_start: See ``latest_start``; where the ego is not in the log yet, they begin at step 10.
     """
 
     simulator: Simulator
     latest_start: int = CURRENT_STEP
+    earliest_start: int = CURRENT_STEP
 
     def __post_init__(self) -> None:
-        if not CURRENT_STEP <= self.latest_start < STEPS - 2:
+        if self.earliest_start < 0:
+            raise UsageError(f"earliest_start is {self.earliest_start}", cure="use 0 or more")
+        if not self.earliest_start <= self.latest_start < STEPS - 2:
             raise UsageError(
-                f"latest_start is {self.latest_start}", cure=f"use {CURRENT_STEP} to {STEPS - 3}"
+                f"latest_start is {self.latest_start}",
+                cure=f"use {self.earliest_start} (earliest_start) to {STEPS - 3}",
             )
 
     @property
@@ -81,7 +86,7 @@ class Driving:
 
     def start(self, data: ScenarioBank, key: Array, count: int) -> Environments:
         """Environments at random steps of the log, so that their ends are staggered."""
-        index, step, keys = _draw(data, key, count, data.steps - 3)
+        index, step, keys = _draw(data, key, count, self.earliest_start, data.steps - 3)
         state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
         observation = self.observe_all(data, state.scene)
         return Environments(state, jnp.zeros(count, bool), observation)
@@ -107,7 +112,7 @@ class Driving:
     ) -> tuple[Environments, Outcome]:
         """One step of every environment; those that are over begin with another scenario instead."""
         count = now.over.shape[0]
-        index, step, keys = _draw(data, key, count, self.latest_start)
+        index, step, keys = _draw(data, key, count, self.earliest_start, self.latest_start)
         fresh = map_where(now.over, partial(self._beginning, data), index, step, keys)
         step_all = jax.vmap(self.simulator.step_or_begin, (None, 0, 0, 0, 0, 0))
         state, made = step_all(data, now.state, action, now.over, fresh, looked)
@@ -136,7 +141,7 @@ class Driving:
         Returns:
             Observations, the expert's actions within the bounds, and whether it took clipping to get them there.
         """
-        index, step, _ = _draw(data, key, count, data.steps - 3)
+        index, step, _ = _draw(data, key, count, CURRENT_STEP, data.steps - 3)
         return jax.vmap(self._demonstration, (None, 0, 0))(data, index, step)
 
     def _demonstration(
@@ -153,12 +158,12 @@ class Driving:
 
 
 def _draw(
-    bank: ScenarioBank, key: Array, count: int, latest: int
+    bank: ScenarioBank, key: Array, count: int, earliest: int, latest: int
 ) -> tuple[Int[Array, " B"], Int[Array, " B"], Array]:
-    """Scenarios, steps from the current one to ``latest`` at which the ego is in the log, and keys for starts."""
+    """Scenarios, steps at which the ego is in the log (or the current one), and keys for starts."""
     index_key, step_key = jax.random.split(key)
     index = jax.random.randint(index_key, (count,), 0, len(bank))
-    step = jax.random.randint(step_key, (count,), CURRENT_STEP, latest + 1)
+    step = jax.random.randint(step_key, (count,), earliest, latest + 1)
     # The ego is always there at the current step.
     step = jnp.where(bank.agents[index, step, 0, AGENT_VALID] > 0, step, CURRENT_STEP)
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)  # not computed where starts are logged

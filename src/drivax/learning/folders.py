@@ -8,6 +8,7 @@ from typing import Any
 
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
+from drivax.learning.first_state import Origin
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.runs import RunFolder, seed_folders
 
@@ -26,6 +27,8 @@ def create_folders(
         UsageError: ``out`` exists and ``overwrite`` is not given.
     """
     notes: dict[str, Any] = {"validation": None if validation is None else validation.hash}
+    if config.begin_from is not None:
+        notes["networks_from"] = Origin.of(config.begin_from).notes()
     if len(seeds) == 1:
         return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
     RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)

@@ -44,8 +44,9 @@ class Cloning:
             of the expert's action, which also fits the spread.
         batch: Moments per update, drawn anew from the logs each time.
         updates: Updates per iteration.
-        learning_rate: Of Adam, falling linearly to a tenth over the run.
-        gradient_norm: Gradients are clipped to this global norm.
+        learning_rate: Of Adam, falling linearly over the run to ``last_rate`` times itself.
+        last_rate: See ``learning_rate``; 1: it stays.
+        gradient_norm: Gradients are clipped to this global norm; None: not at all.
         mask_clipped: Whether moments at which the expert did what no action does are left out.
     """
 
@@ -53,7 +54,8 @@ class Cloning:
     batch: int = 256
     updates: int = 50
     learning_rate: float = 1e-3
-    gradient_norm: float = 1.0
+    last_rate: float = 0.1
+    gradient_norm: float | None = 1.0
     mask_clipped: bool = True
 
     def __post_init__(self) -> None:
@@ -62,7 +64,9 @@ class Cloning:
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:
         """The optimiser of a run of so many updates."""
-        return clipped_adam(self.learning_rate, self.gradient_norm, updates=max(updates, 1))
+        return clipped_adam(
+            self.learning_rate, self.gradient_norm, updates=max(updates, 1), last=self.last_rate
+        )
 
     def of_batch(
         self, act: Act, parameters: Any, environment: Demonstrated, data: Any, key: Array

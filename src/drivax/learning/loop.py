@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from drivax.errors import UsageError
 from drivax.learning.agents import Agents
 from drivax.learning.algorithm import LearnerState
 from drivax.learning.config import TrainConfig
+from drivax.learning.first_state import Origin, first_state, inherited
 from drivax.learning.folders import create_folders, resumed_folders
 from drivax.learning.journal import Journal
 from drivax.learning.policy_traffic import find_traffic
@@ -51,11 +52,12 @@ def train(
         overwrite: Replace an existing run folder.
         seeds: How many agents to train in one program, with ``config.seed`` and the following ones; of several each
             has a run folder of its own inside ``out``: ``seed-0``, ``seed-1``, ...
-        say: Called with a line about memory before the start, and one about every agent that stops early.
+        say: Called with a line about memory, one about networks of another run, and one when an agent stops early.
 
     Raises:
         UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on
             other data, or it does not fit the device's memory.
+        DataError: What it is to begin from is no training run, or its networks do not fit.
         Preempted: If SIGTERM stopped it, after a checkpoint.
     """
     out = Path(out)
@@ -64,6 +66,9 @@ def train(
         config, folders = resumed_folders(data, validation, out, seeds)
     else:
         refuse_existing(out, overwrite, "training")
+        if config.begin_from is not None:
+            # Whoever resumes finds the same step.
+            config = replace(config, begin_from=str(Origin.of(config.begin_from)))
     if config.patience and validation is None:
         raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
     if seeds < 1:
@@ -77,10 +82,12 @@ def train(
     memory = program.account(None if held_out is None else held_out.bank)
     memory.refuse_too_much()
     say(memory.text())
+    # Before any folder is made: they may not fit.
+    networks = None if resume else inherited(config.begin_from, program, say)
     folders = folders or create_folders(config, data, validation, out, numbers, overwrite)
     with contextlib.ExitStack() as stack:
         journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
-        _learn(_Run(config, program, journals, held_out, say))
+        _learn(_Run(config, program, journals, held_out, networks, say))
     return RunFolder.open(out)
 
 
@@ -90,6 +97,8 @@ class _Run:
     program: Program
     journals: Sequence[Journal]
     validation: Validation | None
+    #: Of the run that it begins from; None: not looked for, since a resumed run rarely begins.
+    networks: Mapping[str, Any] | None
     say: Callable[[str], None]
 
     def steps(self, iteration: int) -> int:
@@ -136,7 +145,10 @@ def _begin(run: _Run) -> tuple[int, Any]:
     if step is None:
         for journal in journals:
             journal.begin(None)
-        return 0, program.first_state()
+        networks = run.networks
+        if networks is None:
+            networks = inherited(run.config.begin_from, program, run.say)
+        return 0, first_state(program, networks)
     template = program.agents.shapes_of_one(program.shapes)
     states = []
     for journal in journals:

@@ -10,13 +10,19 @@ import optax
 
 
 def clipped_adam(
-    rate: float, norm: float, *, updates: int = 0, last: float = 0.1, eps: float = 1e-8, apart: bool = False
+    rate: float,
+    norm: float | None,
+    *,
+    updates: int = 0,
+    last: float = 0.1,
+    eps: float = 1e-8,
+    apart: bool = False,
 ) -> optax.GradientTransformation:
     """Adam (Kingma and Ba 2015) of clipped gradients.
 
     Args:
         rate: The learning rate, of the first update.
-        norm: Gradients are scaled down to this global norm.
+        norm: Gradients are scaled down to this global norm; None: they are taken as they are.
         updates: Updates of the whole run, over which the rate falls linearly to ``last`` times the first; 0: it stays.
         last: See ``updates``.
         eps: Of Adam.
@@ -25,9 +31,10 @@ def clipped_adam(
             both would shrink the policy's steps with it.
     """
     schedule = optax.linear_schedule(rate, last * rate, updates) if updates else rate
-    return optax.chain(
-        clip_apart(norm) if apart else optax.clip_by_global_norm(norm), optax.adam(schedule, eps=eps)
-    )
+    adam = optax.adam(schedule, eps=eps)
+    if norm is None:
+        return optax.chain(optax.identity(), adam)
+    return optax.chain(clip_apart(norm) if apart else optax.clip_by_global_norm(norm), adam)
 
 
 def clip_apart(norm: float) -> optax.GradientTransformation:

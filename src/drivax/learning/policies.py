@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
-from drivax.tracking.runs import RunFolder, seed_folders
+from drivax.tracking.runs import RunFolder, seed_folders, trained_on
 from drivax.tracking.zoo import policy_folder
 
 #: What a packed policy has in the place of checkpoints.
@@ -108,10 +109,11 @@ def pack_policy(
     step = checkpoints.best() or max(checkpoints.steps(), default=None)
     planner, _ = load_policy(run, bank, step=step)
     about = {name: folder.info.get(name) for name in _PROVENANCE}
-    data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in folder.info.get("data", [])]
+    data = [{name: entry[name] for name in ("hash", "scenarios")} for entry in trained_on(folder.info)]
     about |= {"kind": "policy", "data": data, "machine": None, **(notes or {})}
     if step is not None:
         about["step"] = step
-    packed = RunFolder.create(out, folder.config(TrainConfig), overwrite=overwrite).note(**about)
+    config = replace(folder.config(TrainConfig), begin_from=None)
+    packed = RunFolder.create(out, config, overwrite=overwrite).note(**about)
     pack(packed.path / PACKED, planner)
     return packed

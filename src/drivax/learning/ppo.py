@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -33,12 +33,13 @@ class PpoConfig:
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
         epochs, minibatches: Passes over the experience, and updates per pass.
-        learning_rate: Of Adam, falling linearly to a tenth over the run.
+        learning_rate: Of Adam, falling linearly over the run to ``last_rate`` times itself.
+        last_rate: See ``learning_rate``; 1: it stays.
         gamma, lambda_: Discount, and mixing of advantages.
         clip: Of the probability ratio.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        gradient_norm: Gradients are clipped to this global norm; those of policy and value apart, unless they share an
-            encoder.
+        gradient_norm: Gradients are clipped to this global norm (None: not at all); those of policy and value apart,
+            unless they share an encoder.
     """
 
     kind: Literal["ppo"] = "ppo"
@@ -48,12 +49,13 @@ class PpoConfig:
     epochs: int = 4
     minibatches: int = 8
     learning_rate: float = 3e-4
+    last_rate: float = 0.1
     gamma: float = 0.99
     lambda_: float = 0.95
     clip: float = 0.2
     value_coefficient: float = 0.5
     entropy_coefficient: float = 0.01
-    gradient_norm: float = 0.5
+    gradient_norm: float | None = 0.5
 
     def __post_init__(self) -> None:
         if self.environments < 1 or self.unroll < 1 or self.minibatches < 1:
@@ -77,6 +79,8 @@ class PpoConfig:
 class PpoState:
     """Everything that a run needs to continue: networks, optimiser, environments, key and step."""
 
+    networks: ClassVar[tuple[str, ...]] = ("parameters",)
+
     parameters: Any
     optimiser: Any
     environments: Environments
@@ -94,6 +98,7 @@ class Ppo:
             config.learning_rate,
             config.gradient_norm,
             updates=max(iterations * config.epochs * config.minibatches, 1),
+            last=config.last_rate,
             eps=1e-5,
             apart=not config.network.shared_encoder,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ class SacConfig:
         tau: How far target critics move toward the critics per update.
         temperature: The first one.
         target_entropy: Of the policy; by default minus the numbers in an action.
-        gradient_norm: Gradients of the policy and of the critics are clipped to this global norm.
+        gradient_norm: Gradients of the policy and of the critics are clipped to this global norm; None: not at all.
     """
 
     kind: Literal["sac"] = "sac"
@@ -65,7 +65,7 @@ class SacConfig:
     tau: float = 0.005
     temperature: float = 0.1
     target_entropy: float | None = None
-    gradient_norm: float = 10.0
+    gradient_norm: float | None = 10.0
 
     def __post_init__(self) -> None:
         if min(self.environments, self.unroll, self.updates_per_step, self.batch) < 1:
@@ -107,6 +107,8 @@ class Trained:
 @record
 class SacState:
     """Everything that a run needs to continue; ``parameters`` are the policy's."""
+
+    networks: ClassVar[tuple[str, ...]] = ("parameters", "critic", "target")
 
     parameters: Any
     critic: Any

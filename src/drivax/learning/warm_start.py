@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -156,6 +156,8 @@ class WarmStartState:
         optimiser: Of cloning.
         iteration: Iterations done, cloning included.
     """
+
+    networks: ClassVar[tuple[str, ...]] = ("parameters", "learner")
 
     parameters: Any
     learner: Any

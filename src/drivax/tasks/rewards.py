@@ -6,6 +6,7 @@ limit known, no lanes, no route) is 0.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -273,6 +274,7 @@ class RewardConfig:
         collision_margin_m: ``collision`` counts from this gap on (published as a margin of safety: 0.5).
         ttc_s: ``ttc`` counts below this (published as a margin of safety: 0.95).
         close_m: ``close`` counts below this gap.
+        scale: What every weighted term is multiplied by, to bring returns into another range.
         own: Terms beside those of this module.
     """
 
@@ -301,6 +303,7 @@ class RewardConfig:
     collision_margin_m: float = 0.0
     ttc_s: float = 1.5
     close_m: float = 1.0
+    scale: float = 1.0
     own: tuple[OwnTerm, ...] = ()
 
     def __post_init__(self) -> None:
@@ -312,9 +315,11 @@ class RewardConfig:
         ):
             if not 0.0 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} is {getattr(self, name)}; choose 0 to {most:g}")
+        if not 0.0 < self.scale < math.inf:
+            raise ValueError(f"scale is {self.scale}; choose a number above 0")
 
     def weights(self) -> dict[str, float]:
-        """The weight of every term that counts."""
+        """The weight of every term that counts, before ``scale``."""
         changed = {name: getattr(self, name) for name in TERMS}
         given = {name: weight for name, weight in changed.items() if weight is not None}
         every = PRESETS[self.preset] | given | {term.name: term.weight for term in self.own}
@@ -330,9 +335,10 @@ class RewardConfig:
         return frozenset[str]().union(*(reads[name] for name in weights))
 
     def weigh(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
-        """Weighted terms by name."""
+        """Weighted and scaled terms by name."""
         terms = TERMS | {"ttc": ShortTtc(self.ttc_s), "close": Close(self.close_m)}
         if self.collision_margin_m:
             terms["collision"] = Touching(self.collision_margin_m)
         terms |= {term.name: term.term for term in self.own}
-        return {name: weight * terms[name](before, now, around) for name, weight in self.weights().items()}
+        weights = {name: self.scale * weight for name, weight in self.weights().items()}
+        return {name: weight * terms[name](before, now, around) for name, weight in weights.items()}

@@ -13,7 +13,7 @@ import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +26,7 @@ from drivax.tracking.runs import write_text
 
 ABOUT = "about.json"
 _ARRAYS = "arrays"
+_CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)
 
 State = TypeVar("State")
@@ -124,6 +125,15 @@ class Checkpoints:
         Raises:
             DataError: No such checkpoint, it is damaged, or it does not fit the template; names the first leaf.
         """
+        return self.restore_parts({part: template}, step)[part]
+
+    def restore_parts(
+        self, templates: Mapping[str, State], step: int | None = None, cure: str = _CURE
+    ) -> dict[str, State]:
+        """Several parts of a stored state, by their paths, read at once; otherwise as :meth:`restore`.
+
+        ``cure`` is what an error says of a template that does not fit.
+        """
         steps = self.steps()
         if step is None:
             if not steps:
@@ -131,17 +141,16 @@ class Checkpoints:
             step = steps[-1]
         stored = self.about(step)["leaves"]
         path = self._path(step)
-        wanted, structure = jax.tree_util.tree_flatten_with_path(template)
-        numbered = [(n, leaf) for n, leaf in enumerate(stored) if leaf["name"].startswith(part)]
-        _compare(
-            path,
-            [leaf for _, leaf in numbered],
-            [(part + jax.tree_util.keystr(key), leaf) for key, leaf in wanted],
-        )
-        everything = _load_arrays(path, stored)
-        arrays = [everything[number] for number, _ in numbered]
-        values = [_rebuild(array, leaf) for array, (_, leaf) in zip(arrays, wanted, strict=True)]
-        return jax.tree_util.tree_unflatten(structure, values)
+        wanted = {
+            part + jax.tree_util.keystr(key): leaf
+            for part, template in templates.items()
+            for key, leaf in jax.tree_util.tree_flatten_with_path(template)[0]
+        }
+        numbers = {leaf["name"]: n for n, leaf in enumerate(stored) if is_part(leaf["name"], templates)}
+        _compare(path, [stored[number] for number in numbers.values()], list(wanted.items()), cure)
+        arrays = _load_arrays(path, stored)
+        values = iter([_rebuild(arrays[numbers[name]], leaf) for name, leaf in wanted.items()])
+        return {part: jax.tree.map(lambda _: next(values), template) for part, template in templates.items()}
 
     def _path(self, step: int) -> Path:
         return self.folder / f"step-{step:09d}"
@@ -160,6 +169,11 @@ class Checkpoints:
         doomed = self.folder / f".step-{step}.old-{os.getpid()}"
         self._path(step).rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
+
+
+def is_part(leaf: str, parts: Iterable[str]) -> bool:
+    """Whether the name of a leaf lies within one of these parts of a state (``.critic`` holds no ``.critics``)."""
+    return any(leaf.startswith(part) and (leaf + ".")[len(part)] in ".[" for part in parts)
 
 
 def pack(file: Path, tree: Any) -> None:
@@ -200,7 +214,7 @@ def unpack(file: Path, template: State) -> State:
     stored = [
         {"name": name, "type": str(array.dtype), "shape": list(array.shape)} for name, array in arrays.items()
     ]
-    _compare(file, stored, named)
+    _compare(file, stored, named, _CURE)
     return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[name]) for name, _ in named])
 
 
@@ -238,8 +252,7 @@ def _type_name(leaf: Any) -> str:
     return type(leaf).__name__ if type(leaf) in _SCALARS else str(leaf.dtype)
 
 
-def _compare(path: Path, stored: list[dict[str, Any]], wanted: list[tuple[str, Any]]) -> None:
-    cure = "use the configuration that the checkpoint was trained with"
+def _compare(path: Path, stored: list[dict[str, Any]], wanted: list[tuple[str, Any]], cure: str) -> None:
     have = {leaf["name"]: (leaf["type"], tuple(leaf["shape"])) for leaf in stored}
     need = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in wanted}
     for name in [*need, *have]:

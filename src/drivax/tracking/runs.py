@@ -14,7 +14,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -138,12 +138,35 @@ def _kind(path: Path) -> str | None:
     return info.get("kind") if isinstance(info, dict) else None
 
 
+def run_and_step(name: str) -> tuple[str, int | None]:
+    """What ``RUN@STEP`` names, or ``RUN``, which leaves the step open.
+
+    Raises:
+        UsageError: The step is no number.
+    """
+    run, at, step = name.partition("@")
+    if at and not step.isdecimal():
+        raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")
+    return run, int(step) if at else None
+
+
 def training_data(planner: str) -> list[dict[str, Any]]:
-    """The data sets that a trained policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``) learned from; none of any other."""
+    """The data sets that a trained policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``) learned from; none of any other.
+
+    Those of the runs that its networks come from are among them.
+    """
     folder = planner.partition("@")[0]
     path = policy_folder(folder) if is_policy(folder) else Path(folder)
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
-    return list(info.get("data", ())) if info.get("kind") in ("training", "policy") else []
+    return trained_on(info) if info.get("kind") in ("training", "policy") else []
+
+
+def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The data sets that a training's ``run.json`` names, its own first, each once."""
+    known: dict[str, dict[str, Any]] = {}
+    for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
+        known.setdefault(entry["hash"], entry)
+    return list(known.values())
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:

@@ -1,0 +1,103 @@
+"""Learns on one device and on several, in a process that simulates four: run by ``test_devices.py``."""
+
+import sys
+
+import jax
+import numpy as np
+from test_resume import ALGORITHMS, SHOWN
+
+from drivax.errors import UsageError
+from drivax.learning.agents import Agents
+from drivax.learning.driving import Driving
+from drivax.learning.program import Program
+from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.synthetic.world import generate_recording
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from pendulum import Pendulum
+
+SEEN = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2)
+
+
+def problem(name):
+    """The learner of a name, and its data: the pendulum's, or for ``driving_*`` a scenario."""
+    if not name.startswith("driving_"):
+        return ALGORITHMS[name].build(Pendulum(), SHOWN, 6), SHOWN
+    bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
+    environment = Driving(Simulator(Task(observation=SEEN, metrics=("steps",))), latest_start=60)
+    return ALGORITHMS[name.removeprefix("driving_")].build(environment, bank, 6), bank
+
+
+def run(learner, data, seeds, devices):
+    """Parameters and logs after three iterations; shapes of what each device holds; bytes by part."""
+    program = Program(Agents(learner, seeds), data, devices)
+    assert len(program.devices) == (devices or 4), program.devices
+    state = program.first_state()
+    for _ in range(3):
+        state, logs = program.step(state)
+    inner = getattr(state, "learner", state)
+    held = {
+        "over": inner.environments.over,
+        "reward": getattr(getattr(inner, "replay", None), "reward", None),
+    }
+    shards = {name: leaf.sharding.shard_shape(leaf.shape) for name, leaf in held.items() if leaf is not None}
+    spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(inner.environments)}
+    assert spread == {len(program.devices)}, spread
+    return jax.device_get((state.parameters, logs)), shards, program.account().parts
+
+
+def same(one, other):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5), one, other)
+
+
+def divides(learner, data, counts):
+    """The result of one device, by several that hold their share of the environments and of the replay."""
+    one, whole, sizes = run(learner, data, (3,), 1)
+    for devices in counts:
+        several, shards, parts = run(learner, data, (3,), devices)
+        same(one, several)
+        count = devices or 4
+        assert shards == {name: (*shape[:-1], shape[-1] // count) for name, shape in whole.items()}, shards
+        assert parts["environments"] == sizes["environments"] // count, parts
+        # The replay's place in the ring is on every device.
+        assert sizes["replay"] // count <= parts["replay"] <= sizes["replay"] // count + 8, parts
+    return one
+
+
+def divides_agents(learner, data, one):
+    """Two agents on two devices, one each: the first learns what it learns alone, the second something else."""
+    pair, shards, _ = run(learner, data, (3, 4), 2)
+    first, second = (Agents(learner, (3, 4)).one(pair, number) for number in (0, 1))
+    same(one, first)
+    apart = jax.tree.map(lambda a, b: np.abs(a - b).max(), first[0], second[0])
+    assert max(jax.tree.leaves(apart)) > 0.1, apart
+    assert shards["over"] == (1, 4), shards
+
+
+def refuses(learner, data, devices, words):
+    try:
+        Program(Agents(learner, (3,)), data, devices)
+    except UsageError as error:
+        assert words in str(error), error
+    else:
+        raise AssertionError(f"{devices} devices")
+
+
+def main(name, extent):
+    learner, data = problem(name)
+    if name == "bc":
+        refuses(learner, data, 2, "an algorithm without environments cannot be divided among 2 devices")
+        assert len(Program(Agents(learner, (3,)), data, None).devices) == 1
+    elif extent == "two":
+        divides(learner, data, (2,))
+    else:
+        one = divides(learner, data, (2, None))
+        divides_agents(learner, data, one)
+        refuses(learner, data, 3, "4 environments cannot be divided among 3 devices")
+    print("same")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,36 @@
+"""Several devices learn what one learns, but for the order of sums: every kind of state that is divided among them."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+CASES = [
+    ("ppo", "two"),
+    ("sac", "two"),
+    ("bc", "none"),
+    *(
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (
+            ("ppo", "four_and_seeds"),
+            ("sac", "four_and_seeds"),
+            ("sac_observations", "two"),
+            ("bc_sac", "two"),
+            ("driving_ppo", "two"),
+            ("driving_sac", "two"),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "extent"), CASES)
+def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(
+    name, extent, repository, monkeypatch
+):
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
+    folders = ("src", "tests", "tests/learning")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(repository / folder) for folder in folders))
+    command = [sys.executable, str(repository / "tests" / "learning" / "several_devices.py"), name, extent]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.stdout == "same\n", result.stderr
