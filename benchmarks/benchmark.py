@@ -22,7 +22,7 @@ import numpy as np
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results
+from drivax.evaluation.results import Results, interval_of
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.statistics import Interval, crossed_bootstrap
 from drivax.learning.policies import load_policy
@@ -147,7 +147,9 @@ def episodes(name: str, kind: str) -> Driven | None:
 
 
 def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval:
-    """Mean, or mean difference scenario by scenario; seeds and segments are drawn."""
+    """Mean, or mean difference scenario by scenario; several seeds are drawn like segments."""
+    if against is None and len(driven.values[metric]) == 1:
+        return interval_of(metric, driven.values[metric][0], driven.segments)
     other = None if against is None else against.values[metric]
     return crossed_bootstrap(driven.values[metric], driven.segments, against=other, seed=0)
 
