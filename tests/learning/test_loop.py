@@ -154,3 +154,12 @@ def test_the_command_trains_several(data, tmp_path, capsys):
     assert "wrote" in told.out and "memory: " in told.err and (out / "seed-5" / "metrics.jsonl").is_file()
     assert main([*arguments[:1], "demo", *arguments[2:], "--seeds", "0", "--overwrite"]) == 2
     assert "0 seeds; use 1 or more" in capsys.readouterr().err
+
+
+def test_weights_are_for_algorithms_that_learn_from_records(data, config, tmp_path):
+    with pytest.raises(UsageError, match="ToyConfig learns from no recorded steps"):
+        train(config, data, tmp_path / "run", weights=np.ones((3, 91)))
+    assert not (tmp_path / "run").exists()
+    train(config, data, tmp_path / "run")
+    with pytest.raises(UsageError, match="was trained with other weights"):
+        train(config, data, tmp_path / "run", weights=np.ones((3, 91)), resume=True)

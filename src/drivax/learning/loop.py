@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
-from drivax.learning.algorithm import LearnerState
+from drivax.learning.algorithm import LearnerState, training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.folders import create_folders, resumed_folders
+from drivax.learning.folders import create_folders, hashes, resumed_folders
 from drivax.learning.journal import Journal
 from drivax.learning.policy_traffic import find_traffic
 from drivax.learning.program import Program
@@ -33,6 +34,7 @@ def train(
     data: ScenarioSet,
     out: str | Path,
     *,
+    weights: np.ndarray | None = None,
     validation: ScenarioSet | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -45,6 +47,8 @@ def train(
         config: What to train.
         data: Scenarios to train on; all of them are held on the device.
         out: Run folder.
+        weights: ``[scenario, step]``, at least 0: how often an offline algorithm draws each recorded step of ``data``,
+            in proportion; by default all that can be learned from alike.
         validation: Scenarios that choose the best checkpoint.
         resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device; with the
             configuration and the seeds that it began with.
@@ -55,13 +59,14 @@ def train(
 
     Raises:
         UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on
-            other data, or it does not fit the device's memory.
+            other data or with other weights, weights do not fit the data or the algorithm, or it does not fit the
+            device's memory.
         Preempted: If SIGTERM stopped it, after a checkpoint.
     """
     out = Path(out)
     folders: list[RunFolder] = []
     if resume:
-        config, folders = resumed_folders(data, validation, out, seeds)
+        config, folders = resumed_folders(data, validation, weights, out, seeds)
     else:
         refuse_existing(out, overwrite)
     if config.patience and validation is None:
@@ -73,11 +78,12 @@ def train(
     bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     held_out = None if validation is None else Validation.of(validation)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    program = Program(Agents(learner, numbers), bank, config.devices)
+    experience = training_data(config.algorithm, environment, bank, weights)
+    program = Program(Agents(learner, numbers), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.refuse_too_much()
     say(memory.text())
-    folders = folders or create_folders(config, data, validation, out, numbers, overwrite)
+    folders = folders or create_folders(config, data, out, numbers, overwrite, hashes(validation, weights))
     with contextlib.ExitStack() as stack:
         journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
         _learn(_Run(config, program, journals, held_out, say))
