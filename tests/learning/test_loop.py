@@ -12,6 +12,7 @@ from drivax import settings
 from drivax.cli import main
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
+from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.stopping import patience_is_up
@@ -157,9 +158,10 @@ def test_the_command_trains_several(data, tmp_path, capsys):
 
 
 def test_weights_are_for_algorithms_that_learn_from_records(data, config, tmp_path):
+    weighted = WeightedSet(data, np.ones((3, 91)))
     with pytest.raises(UsageError, match="ToyConfig learns from no recorded steps"):
-        train(config, data, tmp_path / "run", weights=np.ones((3, 91)))
+        train(config, weighted, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     train(config, data, tmp_path / "run")
     with pytest.raises(UsageError, match="was trained with other weights"):
-        train(config, data, tmp_path / "run", weights=np.ones((3, 91)), resume=True)
+        train(config, weighted, tmp_path / "run", resume=True)

@@ -75,6 +75,15 @@ class LearnsFromRecords(Protocol):
         ...
 
 
+@runtime_checkable
+class Judges(Protocol):
+    """A learner that has something to say of held-out data, beside how its policy drives there."""
+
+    def judge(self, data: Any, state: Any) -> dict[str, float]:
+        """Numbers to log as ``validation/<name>``; ``data`` are :func:`training_data` of what is held out."""
+        ...
+
+
 def training_data(
     config: AlgorithmConfig, environment: Environment, data: Any, weights: np.ndarray | None = None
 ) -> Any:

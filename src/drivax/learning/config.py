@@ -6,10 +6,13 @@ from dataclasses import dataclass, field
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
+from drivax.learning.cql import CqlConfig
 from drivax.learning.driving import Driving
 from drivax.learning.imitation import BcConfig
+from drivax.learning.iql import IqlConfig
 from drivax.learning.ppo import PpoConfig
 from drivax.learning.sac import SacConfig
+from drivax.learning.td3_bc import Td3BcConfig
 from drivax.learning.validation import Rule
 from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.scenario.schema import CURRENT_STEP
@@ -18,8 +21,19 @@ from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
 
-#: What ``algorithm`` can be: ``kind: ppo``, ``sac``, ``bc``, ``bc_ppo``, ``bc_sac``, or one's own.
-Algorithm = PpoConfig | SacConfig | BcConfig | BcPpoConfig | BcSacConfig | AlgorithmConfig
+#: What ``algorithm`` can be: ``kind: ppo``, ``sac``, ``bc``, ``bc_ppo``, ``bc_sac``, offline ``cql``, ``iql`` and
+#: ``td3_bc``, or one's own.
+Algorithm = (
+    PpoConfig
+    | SacConfig
+    | BcConfig
+    | BcPpoConfig
+    | BcSacConfig
+    | CqlConfig
+    | IqlConfig
+    | Td3BcConfig
+    | AlgorithmConfig
+)
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,24 @@ from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.learning.sampler import Places, Sampler, checked_weights
 from drivax.scenario.record import record
+from drivax.scenario.store import ScenarioSet
 
 #: What follows the weights: everything, or only the steps that the policy is improved at, while values are learned from
 #: all steps alike.
 Weighted = Literal["all", "policy"]
+
+
+@dataclass(frozen=True)
+class WeightedSet:
+    """Scenarios to train on, with a weight of every step.
+
+    Attributes:
+        scenarios: The scenarios.
+        weights: ``[scenario, step]``, at least 0: how often offline algorithms draw each recorded step, in proportion.
+    """
+
+    scenarios: ScenarioSet
+    weights: np.ndarray
 
 
 @record

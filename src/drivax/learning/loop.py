@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
-from drivax.learning.algorithm import LearnerState, training_data
+from drivax.learning.algorithm import Judges, LearnerState, training_data
 from drivax.learning.config import TrainConfig
+from drivax.learning.experience import WeightedSet
 from drivax.learning.folders import create_folders, hashes, resumed_folders
 from drivax.learning.journal import Journal
 from drivax.learning.policy_traffic import find_traffic
@@ -31,10 +31,9 @@ from drivax.tracking.runs import RunFolder, refuse_existing
 
 def train(
     config: TrainConfig,
-    data: ScenarioSet,
+    data: ScenarioSet | WeightedSet,
     out: str | Path,
     *,
-    weights: np.ndarray | None = None,
     validation: ScenarioSet | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -45,10 +44,9 @@ def train(
 
     Args:
         config: What to train.
-        data: Scenarios to train on; all of them are held on the device.
+        data: Scenarios to train on; all of them are held on the device. Offline algorithms draw their recorded steps
+            by weight where they are a :class:`WeightedSet`, otherwise all that can be learned from alike.
         out: Run folder.
-        weights: ``[scenario, step]``, at least 0: how often an offline algorithm draws each recorded step of ``data``,
-            in proportion; by default all that can be learned from alike.
         validation: Scenarios that choose the best checkpoint.
         resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device; with the
             configuration and the seeds that it began with.
@@ -63,6 +61,7 @@ def train(
             device's memory.
         Preempted: If SIGTERM stopped it, after a checkpoint.
     """
+    data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
     out = Path(out)
     folders: list[RunFolder] = []
     if resume:
@@ -77,6 +76,7 @@ def train(
     environment = config.environment()
     bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     held_out = None if validation is None else Validation.of(validation)
+    recorded = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
     learner = config.algorithm.build(environment, bank, config.iterations)
     experience = training_data(config.algorithm, environment, bank, weights)
     program = Program(Agents(learner, numbers), experience, config.devices)
@@ -86,7 +86,7 @@ def train(
     folders = folders or create_folders(config, data, out, numbers, overwrite, hashes(validation, weights))
     with contextlib.ExitStack() as stack:
         journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
-        _learn(_Run(config, program, journals, held_out, say))
+        _learn(_Run(config, program, journals, held_out, recorded, say))
     return RunFolder.open(out)
 
 
@@ -96,6 +96,7 @@ class _Run:
     program: Program
     journals: Sequence[Journal]
     validation: Validation | None
+    held_out: Any
     say: Callable[[str], None]
 
     def steps(self, iteration: int) -> int:
@@ -169,6 +170,10 @@ def _record(
             parameters = jax.device_put(agents.one(state.parameters, number), run.program.devices[0])
             planner = agents.learner.planner(parameters, "policy", samples=False)
             row |= validate(planner, run.validation, config.task, find_traffic(config.traffic))
+            if isinstance(agents.learner, Judges):
+                one = jax.device_put(agents.one(state, number), run.program.devices[0])
+                judged = agents.learner.judge(run.held_out, one)
+                row |= {f"validation/{name}": value for name, value in judged.items()}
         found = journal.write(done, row)
         if last or due or stops or iteration % config.checkpoint_every == 0:
             journal.save(done, agents.one(state, number), found)
