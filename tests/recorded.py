@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from drivax.learning.experience import Recording
+from drivax.learning.experience import ExpertSteps
 from drivax.scenario.record import record
 from pendulum import MAX_TORQUE, STEPS, Pendulum, Swing, swing
 
@@ -29,11 +29,11 @@ class Table:
 class Told(Pendulum):
     """An environment that is only told of; its observations are three numbers."""
 
-    def recording(self, data: Table) -> Recording:
+    def expert_steps(self, data: Table) -> ExpertSteps:
         fields = {
             name: getattr(data, name) for name in ("action", "reward", "terminated", "truncated", "usable")
         }
-        return Recording(**fields, clipped=jnp.zeros_like(data.usable))
+        return ExpertSteps(**fields, clipped=jnp.zeros_like(data.usable))
 
     def observe_recorded(self, data: Table, places: Any) -> dict[str, jax.Array]:
         return {"pendulum": data.seen[places]}

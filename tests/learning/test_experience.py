@@ -57,8 +57,8 @@ def drive(bank, index):
 
 def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, experience):
     online = jax.device_get(jax.jit(jax.vmap(drive, (None, 0)))(bank, jnp.arange(3)))
-    recording = jax.device_get(experience.recording)
-    index, step = np.nonzero(recording.usable)
+    expert = jax.device_get(experience.expert)
+    index, step = np.nonzero(expert.usable)
     places = jnp.asarray(index), jnp.asarray(step)
     found = jax.device_get(jax.jit(lambda e, p: transitions(DRIVING, e, p))(experience, places))
     seen, action, reward, terminated, following, truncated = jax.tree.map(
@@ -75,35 +75,35 @@ def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, 
     np.testing.assert_allclose(found.action, action, atol=1e-4)
     np.testing.assert_allclose(found.reward, reward, atol=1e-4, rtol=1e-4)
     np.testing.assert_array_equal(found.terminated, terminated)
-    np.testing.assert_array_equal(recording.truncated[index, step], truncated)
+    np.testing.assert_array_equal(expert.truncated[index, step], truncated)
     assert np.abs(reward).max() > 0
 
 
 def test_nothing_is_learned_behind_an_end_nor_without_the_expert(experience):
-    recording = jax.device_get(experience.recording)
+    expert = jax.device_get(experience.expert)
     assert isinstance(DRIVING, Recorded)
-    end = int(np.argmax(recording.terminated[0]))
-    assert 10 <= end < 16 and recording.terminated[0, end]
-    np.testing.assert_array_equal(np.nonzero(recording.usable[0])[0], np.arange(10, end + 1))
+    end = int(np.argmax(expert.terminated[0]))
+    assert 10 <= end < 16 and expert.terminated[0, end]
+    np.testing.assert_array_equal(np.nonzero(expert.usable[0])[0], np.arange(10, end + 1))
     # An action looks two steps ahead; the last one that is known of is that of step 88.
-    whole, lost = recording.usable[1], recording.usable[2]
+    whole, lost = expert.usable[1], expert.usable[2]
     assert whole[10:89].all() and not whole[:10].any() and not whole[89:].any()
     assert lost[10:68].all() and not lost[68:].any()
 
 
 def test_clipped_steps_are_left_out_unless_they_are_asked_for(bank, experience):
-    recording = jax.device_get(experience.recording)
-    index, step = np.nonzero(recording.clipped & recording.usable)
+    expert = jax.device_get(experience.expert)
+    index, step = np.nonzero(expert.clipped & expert.usable)
     assert {JUMP - 1} <= {s for i, s in zip(index, step, strict=True) if i == 1}
-    assert (np.abs(recording.action) <= 1.0).all()
+    assert (np.abs(expert.action) <= 1.0).all()
     taken = ExperienceConfig(mask_clipped=False).of(DRIVING, bank)
     for made, drawn in ((experience, False), (taken, True)):
         chances = np.diff(np.asarray(made.critic.cumulative).astype(np.int64), prepend=0)
-        assert ((chances.reshape(recording.usable.shape)[index, step] > 0) == drawn).all()
+        assert ((chances.reshape(expert.usable.shape)[index, step] > 0) == drawn).all()
 
 
 def test_what_follows_the_weights(bank, experience):
-    usable = np.asarray(experience.recording.usable & ~experience.recording.clipped)
+    usable = np.asarray(experience.expert.usable & ~experience.expert.clipped)
     weights = np.zeros(usable.shape)
     weights[1, 20], weights[1, 30], weights[0, 3] = 3.0, 1.0, 100.0
     both = ExperienceConfig().of(DRIVING, bank, weights)

@@ -9,15 +9,24 @@ import numpy as np
 import pytest
 from scipy import special
 
+from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
+from drivax.learning.config import TrainConfig
 from drivax.learning.cql import CqlConfig
-from drivax.learning.experience import ExperienceConfig
+from drivax.learning.experience import ExperienceConfig, WeightedSet
 from drivax.learning.iql import IqlConfig
+from drivax.learning.loop import train
+from drivax.learning.policies import load_policy
 from drivax.learning.replay import Transitions
 from drivax.learning.td3_bc import Td3BcConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.testing import check_algorithm
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.sinks import read_rows
 from recorded import Table, Told, arms
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
@@ -274,13 +283,14 @@ def bandit():
 @pytest.mark.parametrize(
     ("config", "stays"),
     [
-        (CqlConfig(network=NETWORK, penalty=0.0, **FAST), False),
-        (CqlConfig(network=NETWORK, penalty=1.0, **FAST), True),
-        (IqlConfig(network=NETWORK, inverse_temperature=10.0, **FAST), True),
-        (Td3BcConfig(network=NETWORK, q_weight=100.0, **FAST), False),
-        (Td3BcConfig(network=NETWORK, q_weight=0.2, **FAST), True),
+        pytest.param(
+            CqlConfig(network=NETWORK, penalty=0.0, **FAST), False, id="sac", marks=pytest.mark.slow
+        ),
+        pytest.param(CqlConfig(network=NETWORK, penalty=1.0, **FAST), True, id="cql"),
+        pytest.param(IqlConfig(network=NETWORK, inverse_temperature=10.0, **FAST), True, id="iql"),
+        pytest.param(Td3BcConfig(network=NETWORK, q_weight=100.0, **FAST), False, id="td3"),
+        pytest.param(Td3BcConfig(network=NETWORK, q_weight=0.2, **FAST), True, id="td3_bc"),
     ],
-    ids=["sac", "cql", "iql", "td3", "td3_bc"],
 )
 def test_arms_that_nobody_pulled(bandit, config, stays):
     """Without a term that keeps them there, actions go where the critic makes up values."""
@@ -337,3 +347,76 @@ def test_what_cannot_be_learned_is_refused():
     ):
         with pytest.raises(UsageError, match=words):
             config()
+
+
+RESUMED = {
+    "td3_bc": replace(TD3_BC, updates=3, normalise=True),
+    "cql": replace(CQL, updates=3, gap=1.0, imitation=1.0),
+    "iql": replace(IQL, updates=3, records=ExperienceConfig(weighted="policy")),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "td3_bc" else pytest.param(name, marks=pytest.mark.slow) for name in RESUMED]
+)
+def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
+    """Stopped in the middle, with an odd number of updates behind it, and restored from disk."""
+    config, weights = RESUMED[name], np.random.default_rng(0).uniform(size=(500, 2))
+    learner = config.build(Told(), bandit, 4)
+    data = training_data(config, Told(), bandit, weights)
+    iterate, states = jax.jit(learner.iterate), [jax.jit(learner.init)(data, jax.random.key(5))]
+    for _ in range(4):
+        states.append(iterate(data, states[-1])[0])
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, states[1])
+    # Restored into shapes alone, and for the environment's bare data, as a fresh process does.
+    state = checkpoints.restore(jax.eval_shape(learner.init, bandit, jax.random.key(0)))
+    again = training_data(config, Told(), bandit, weights)
+    for _ in range(3):
+        state = iterate(again, state)[0]
+    one, other = ([_plain(leaf) for leaf in jax.tree.leaves(part)] for part in (state, states[-1]))
+    for mine, theirs in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    if name == "td3_bc":
+        # Six updates with a delay of two: the policy moved in three of them.
+        counts = {
+            int(leaf)
+            for leaf in jax.tree.leaves(states[2].optimiser)
+            if jnp.issubdtype(leaf.dtype, jnp.integer)
+        }
+        assert counts == {3, 6}
+
+
+def _plain(leaf):
+    key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if key else leaf)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RESUMED)
+def test_algorithms_keep_to_the_rules(name):
+    check_algorithm(RESUMED[name])
+
+
+@pytest.mark.slow
+def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
+    """Of one run: validation in closed loop beside the mean Q, and a policy that drives."""
+    network = {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]}
+    values = {
+        "task": {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 3}},
+        "algorithm": {"kind": "td3_bc", "network": network, "batch": 8, "updates": 2},
+        "total_steps": 64,
+        "evaluate_every": 2,
+    }
+    config = settings.load(TrainConfig, values)
+    run = train(config, WeightedSet(data, np.ones((3, 91))), tmp_path / "run", validation=data)
+    rows = [row for row in read_rows(run.metrics) if "validation/mean_q" in row]
+    assert len(rows) == 2 and all("validation/vmax_score" in row for row in rows)
+    assert rows[0]["sampler/policy_effective"] > 100
+    bank = ScenarioBank.from_scenarios(data)
+    planner, _ = load_policy(run.path, bank)
+    learner = config.algorithm.build(config.environment(), bank, config.iterations)
+    held_out = training_data(config.algorithm, config.environment(), bank)
+    state = Checkpoints(run.checkpoints).restore(jax.eval_shape(learner.init, bank, jax.random.key(0)))
+    assert rows[-1]["validation/mean_q"] == pytest.approx(learner.judge(held_out, state)["mean_q"], rel=1e-5)
+    assert isinstance(planner, Planner)

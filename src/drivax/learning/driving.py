@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.learning.branches import in_any
 from drivax.learning.environment import Environments, Outcome
-from drivax.learning.experience import Recording
+from drivax.learning.experience import ExpertSteps
 from drivax.learning.sampler import Places
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
@@ -157,7 +157,7 @@ class Driving:
 
         return jax.vmap(one)(*places)
 
-    def recording(self, data: ScenarioBank) -> Recording:
+    def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
         """The log as a rollout of its expert from the current step on: rewards and ends as the simulator gives them.
 
         Everyone goes where the log goes, whatever traffic the simulator has: what happened is known for that only.
@@ -170,7 +170,7 @@ class Driving:
         )
         ends = terminated | truncated
         over = jnp.cumsum(ends, axis=1) > ends
-        return Recording(action, reward, terminated, truncated, _told(data) & ~over, clipped)
+        return ExpertSteps(action, reward, terminated, truncated, _told(data) & ~over, clipped)
 
     @property
     def _logged(self) -> Simulator:

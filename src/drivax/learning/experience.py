@@ -42,7 +42,7 @@ class WeightedSet:
 
 
 @record
-class Recording:
+class ExpertSteps:
     """What an expert did at each of T steps of N scenarios, and what came of it.
 
     Attributes:
@@ -50,7 +50,7 @@ class Recording:
         reward: What they earned.
         terminated: The episode ended for good there: bootstrap zero.
         truncated: It was cut off there: bootstrap the value of what the step led to.
-        usable: Whether a step can be learned from; see :meth:`Recorded.recording`. Where not, the rest means nothing.
+        usable: Whether a step can be learned from (:meth:`Recorded.expert_steps`); where not, the rest means nothing.
         clipped: The expert did what no action does, so that its action does not lead to where it went.
     """
 
@@ -66,7 +66,7 @@ class Recording:
 class Recorded(Environment, Protocol):
     """An environment whose data hold episodes of an expert."""
 
-    def recording(self, data: Any) -> Recording:
+    def expert_steps(self, data: Any) -> ExpertSteps:
         """What the expert did; a step is usable if the expert was there, and no episode ended at an earlier step."""
         ...
 
@@ -81,13 +81,13 @@ class Experience:
 
     Attributes:
         data: The environment's data.
-        recording: What the expert did.
+        expert: What the expert did.
         critic: How steps are drawn that values are learned from.
         policy: How steps are drawn that the policy is improved at; None: the same steps as the critic's.
     """
 
     data: Any
-    recording: Recording
+    expert: ExpertSteps
     critic: Sampler
     policy: Sampler | None = None
 
@@ -127,42 +127,42 @@ class ExperienceConfig:
         """
         if not isinstance(environment, Recorded):
             raise UsageError(
-                f"{type(environment).__name__} holds no recorded episodes", cure="give it `recording`"
+                f"{type(environment).__name__} holds no recorded episodes", cure="give it `expert_steps`"
             )
-        recording = _recording(environment, data)
-        usable = np.asarray(recording.usable & ~(recording.clipped & self.mask_clipped))
+        expert = _expert_steps(environment, data)
+        usable = np.asarray(expert.usable & ~(expert.clipped & self.mask_clipped))
         alike = usable.astype(np.float64)
         if weights is None:
-            return Experience(data, recording, sampler.sampler(alike))
+            return Experience(data, expert, sampler.sampler(alike))
         weighted = sampler.sampler(usable * checked_weights(weights, usable.shape))
         if self.weighted == "all":
-            return Experience(data, recording, weighted)
-        return Experience(data, recording, sampler.sampler(alike), weighted)
+            return Experience(data, expert, weighted)
+        return Experience(data, expert, sampler.sampler(alike), weighted)
 
 
 @partial(jax.jit, static_argnums=0)
-def _recording(environment: Recorded, data: Any) -> Recording:
-    return environment.recording(data)
+def _expert_steps(environment: Recorded, data: Any) -> ExpertSteps:
+    return environment.expert_steps(data)
 
 
 def moments(
     environment: Recorded, experience: Experience, places: Places
 ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
     """Observations of the steps at these places, what the expert did there, and whether that was clipped."""
-    recording = experience.recording
+    expert = experience.expert
     observation = environment.observe_recorded(experience.data, places)
-    return observation, recording.action[places], recording.clipped[places]
+    return observation, expert.action[places], expert.clipped[places]
 
 
 def transitions(environment: Recorded, experience: Experience, places: Places) -> Transitions:
     """The steps at these places, observed before and after."""
-    (index, step), recording = places, experience.recording
+    (index, step), expert = places, experience.expert
     observation, action, _ = moments(environment, experience, places)
     return Transitions(
         observation=observation,
         action=action,
-        reward=recording.reward[places],
-        terminated=recording.terminated[places],
+        reward=expert.reward[places],
+        terminated=expert.terminated[places],
         # What can be learned from is never the last step of the log.
         following=environment.observe_recorded(experience.data, (index, step + 1)),
     )

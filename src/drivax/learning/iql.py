@@ -63,7 +63,7 @@ class Iql(Offline):
     def networks(self, key: Array) -> dict[str, nnx.Module]:
         """A value beside policy and critics."""
         key, value_key = jax.random.split(key)
-        return super().networks(key) | {"value": Value(self.config.network, self.spec, nnx.Rngs(value_key))}
+        return super().networks(key) | {"value": Value(self.config.networks, self.spec, nnx.Rngs(value_key))}
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
         """The value learns as the critics do."""

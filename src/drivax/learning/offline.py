@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -17,17 +17,24 @@ from jaxtyping import Array, Float
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment
 from drivax.learning.experience import Experience, ExperienceConfig, Recorded, moments, transitions
+from drivax.learning.fitted_q import FittedQ, FittedQConfig
 from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Transitions
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
 from drivax.networks.distributions import Actions, Distribution
+from drivax.networks.normalised import (
+    NormalisedConfig,
+    Statistics,
+    feature_statistics,
+    tell_statistics,
+)
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.temporal_difference import polyak
 from drivax.scenario.record import record
 
-#: Held-out steps that the mean Q is taken over.
-_JUDGED = 2048
+#: Held-out steps that the mean Q is taken over, and recorded ones that features are normalised by; how many at once.
+_JUDGED, _AT_ONCE = 2048, 256
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,9 @@ class OfflineConfig:
         tau: How far targets move toward what they follow per update.
         policy_rate, critic_rate: Learning rates of Adam; a value learns as fast as the critics.
         gradient_norm: Gradients of each network are clipped to this global norm.
+        normalise: Whether every feature of an observation is shifted and scaled by its mean and deviation over recorded
+            steps, in front of every encoder.
+        fitted_q: How the policy is evaluated on held-out steps, for ``checkpoint_rule: fitted_q``.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -54,6 +64,8 @@ class OfflineConfig:
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     gradient_norm: float = 10.0
+    normalise: bool = False
+    fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
 
     def __post_init__(self) -> None:
         if self.batch < 1 or self.updates < 1:
@@ -67,6 +79,14 @@ class OfflineConfig:
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Experience:
         """What is learned from; see :class:`ExperienceConfig`."""
         return self.records.of(environment, data, weights)
+
+    @property
+    def networks(self) -> NetworkConfig:
+        """The networks, with normalisation if there is to be any."""
+        network = self.network
+        return (
+            replace(network, encoder=NormalisedConfig(encoder=network.encoder)) if self.normalise else network
+        )
 
     def refuse_grid(self) -> None:
         """Refuses a policy whose actions have no gradient.
@@ -129,7 +149,7 @@ class Offline:
         """All networks, with fresh parameters."""
         actions = Actions(self.environment.action_size, self.environment.levels)
         policy_key, critic_key = jax.random.split(key)
-        network = self.settings.network
+        network = self.settings.networks
         return {
             "policy": Policy(network, self.spec, nnx.Rngs(policy_key), actions),
             "critic": TwinCritic(network, self.spec, nnx.Rngs(critic_key), actions),
@@ -164,7 +184,13 @@ class Offline:
     def init(self, data: Any, key: Array) -> OfflineState:
         """The state before the first iteration."""
         network_key, key = jax.random.split(key)
-        trained = {name: nnx.state(made, nnx.Param) for name, made in self.networks(network_key).items()}
+        networks = self.networks(network_key)
+        # A policy that is loaded is given the shapes of its parameters only, without experience.
+        if self.settings.normalise and isinstance(data, Experience):
+            statistics = self._statistics(data)
+            for network in networks.values():
+                tell_statistics(network, statistics)
+        trained = {name: nnx.state(made, nnx.Param) for name, made in networks.items()}
         trained |= {name: jnp.asarray(number, jnp.float32) for name, number in self.numbers().items()}
         return OfflineState(
             parameters=trained["policy"],
@@ -211,10 +237,16 @@ class Offline:
         observation, action, _ = moments(environment, data, draw(data.policy, policy_key, count))
         return part, (observation, action)
 
+    def _statistics(self, data: Experience) -> Statistics:
+        """Of recorded steps, drawn as values are learned from; the same for every seed."""
+        index, step = draw(data.critic, jax.random.key(0), (_JUDGED // _AT_ONCE, _AT_ONCE))
+        observe = partial(self._recorded().observe_recorded, data.data)
+        return feature_statistics(jax.lax.map(observe, (index, step)))
+
     def _recorded(self) -> Recorded:
         if not isinstance(self.environment, Recorded):
             raise UsageError(
-                f"{type(self.environment).__name__} holds no recorded episodes", cure="give it `recording`"
+                f"{type(self.environment).__name__} holds no recorded episodes", cure="give it `expert_steps`"
             )
         return self.environment
 
@@ -232,8 +264,12 @@ class Offline:
         """``mean_q``: of held-out steps, what the smaller critic expects of the policy's mode.
 
         Always of the same steps. It compares neither algorithms nor checkpoints: overestimation raises it, too.
+        ``fitted_q``, where it is configured, is what a critic that knows the policy expects from the beginnings.
         """
-        return {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
+        found = {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
+        if self.settings.fitted_q.updates:
+            found["fitted_q"] = float(self._fitted_q(data, state.parameters))
+        return found
 
     @partial(jax.jit, static_argnums=0)
     def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
@@ -241,6 +277,12 @@ class Offline:
         observation = self._recorded().observe_recorded(data.data, places)
         action = self.distribution(policy, observation).mode()
         return jnp.mean(jnp.min(self.q(critic, observation, action), axis=0))
+
+    @partial(jax.jit, static_argnums=0)
+    def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:
+        config = self.settings
+        judge = FittedQ(config.fitted_q, config.network, self._recorded(), config.gamma)
+        return judge.value(data, lambda observation: self.distribution(policy, observation).mode())
 
     def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
         """The policy as a planner."""
