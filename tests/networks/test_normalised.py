@@ -50,7 +50,7 @@ def test_what_encoders_see_has_no_mean_and_unit_deviation(groups):
     made = NormalisedConfig(MlpConfig(rows=(8,), hidden=(8,))).build(SPEC, nnx.Rngs(0))
     plain = made.encoder
     # Without statistics it changes nothing but what is very far.
-    near = {**groups, "agents": groups["agents"] / 100}
+    near = {**groups, "agents": groups["agents"] / 100, "ego": groups["ego"] / 10}
     np.testing.assert_allclose(made(near), plain(near), rtol=1e-5)
     tell_statistics(made, feature_statistics(groups))
     rows = np.asarray(made._scaled("agents", groups["agents"]))[np.asarray(groups["agents_mask"])]

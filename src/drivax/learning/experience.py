@@ -75,6 +75,19 @@ class Recorded(Environment, Protocol):
         ...
 
 
+def recorded(environment: Environment) -> Recorded:
+    """The environment, if it knows an expert's episodes.
+
+    Raises:
+        UsageError: It knows none.
+    """
+    if not isinstance(environment, Recorded):
+        raise UsageError(
+            f"{type(environment).__name__} holds no recorded episodes", cure="give it `expert_steps`"
+        )
+    return environment
+
+
 @record
 class Experience:
     """What offline algorithms learn from.
@@ -125,11 +138,7 @@ class ExperienceConfig:
             UsageError: Nobody's episodes are in the data, or weights do not fit them.
             DataError: No step can be learned from.
         """
-        if not isinstance(environment, Recorded):
-            raise UsageError(
-                f"{type(environment).__name__} holds no recorded episodes", cure="give it `expert_steps`"
-            )
-        expert = _expert_steps(environment, data)
+        expert = _expert_steps(recorded(environment), data)
         usable = np.asarray(expert.usable & ~(expert.clipped & self.mask_clipped))
         alike = usable.astype(np.float64)
         if weights is None:

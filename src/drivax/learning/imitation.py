@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment
-from drivax.learning.experience import Experience, ExperienceConfig, Recorded, moments
+from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
 from drivax.learning.optimisers import clipped_adam
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy
@@ -191,8 +191,8 @@ def _moments(
     environment: Demonstrated, data: Any, key: Array, count: int
 ) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
     """Random moments: all alike, or where experience has weights, by those."""
-    if isinstance(data, Experience) and isinstance(environment, Recorded):
-        return moments(environment, data, draw(data.policy or data.critic, key, (count,)))
+    if isinstance(data, Experience):
+        return moments(recorded(environment), data, draw(data.policy or data.critic, key, (count,)))
     return environment.demonstrations(data, key, count)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment
-from drivax.learning.experience import Experience, ExperienceConfig, Recorded, moments, transitions
+from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded, transitions
 from drivax.learning.fitted_q import FittedQ, FittedQConfig
 from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Transitions
@@ -229,7 +229,7 @@ class Offline:
 
     def _drawn(self, data: Experience, key: Array) -> tuple[Transitions, Improved]:
         """Steps to learn values from, and where to improve the policy."""
-        environment, count = self._recorded(), (self.settings.batch,)
+        environment, count = recorded(self.environment), (self.settings.batch,)
         critic_key, policy_key = jax.random.split(key)
         part = transitions(environment, data, draw(data.critic, critic_key, count))
         if data.policy is None:
@@ -240,15 +240,8 @@ class Offline:
     def _statistics(self, data: Experience) -> Statistics:
         """Of recorded steps, drawn as values are learned from; the same for every seed."""
         index, step = draw(data.critic, jax.random.key(0), (_JUDGED // _AT_ONCE, _AT_ONCE))
-        observe = partial(self._recorded().observe_recorded, data.data)
+        observe = partial(recorded(self.environment).observe_recorded, data.data)
         return feature_statistics(jax.lax.map(observe, (index, step)))
-
-    def _recorded(self) -> Recorded:
-        if not isinstance(self.environment, Recorded):
-            raise UsageError(
-                f"{type(self.environment).__name__} holds no recorded episodes", cure="give it `expert_steps`"
-            )
-        return self.environment
 
     def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
         """The policy with these parameters."""
@@ -274,14 +267,14 @@ class Offline:
     @partial(jax.jit, static_argnums=0)
     def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
         places = draw(data.critic, jax.random.key(0), (_JUDGED,))
-        observation = self._recorded().observe_recorded(data.data, places)
+        observation = recorded(self.environment).observe_recorded(data.data, places)
         action = self.distribution(policy, observation).mode()
         return jnp.mean(jnp.min(self.q(critic, observation, action), axis=0))
 
     @partial(jax.jit, static_argnums=0)
     def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:
         config = self.settings
-        judge = FittedQ(config.fitted_q, config.network, self._recorded(), config.gamma)
+        judge = FittedQ(config.fitted_q, config.network, recorded(self.environment), config.gamma)
         return judge.value(data, lambda observation: self.distribution(policy, observation).mode())
 
     def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
