@@ -29,6 +29,9 @@ ALGORITHMS = {
     "bc": {"network": NETWORK, "batch": 8, "updates": 2},
     "bc_ppo": {"warm_start": START, "ppo": PPO},
     "bc_sac": {"warm_start": START, "sac": SAC | {"explore": "policy"}},
+    "cql": {"network": NETWORK, "batch": 8, "updates": 2, "actions": 2, "gap": 1.0},
+    "iql": {"network": NETWORK, "batch": 8, "updates": 2, "records": {"weighted": "policy"}},
+    "td3_bc": {"network": NETWORK, "batch": 8, "updates": 3},
     "toy_learner:ToyConfig": {},
 }
 SMALL = {

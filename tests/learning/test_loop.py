@@ -12,6 +12,7 @@ from drivax import settings
 from drivax.cli import main
 from drivax.errors import DrivaxError, UsageError
 from drivax.learning.config import TrainConfig
+from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.stopping import patience_is_up
@@ -205,3 +206,13 @@ def test_the_command_trains_several(data, tmp_path, capsys):
     assert "a resumed run keeps its configuration; leave out --from" in capsys.readouterr().err
     assert main([*arguments[:1], "demo", *arguments[2:], "--seeds", "0", "--overwrite"]) == 2
     assert "0 seeds; use 1 or more" in capsys.readouterr().err
+
+
+def test_weights_are_for_algorithms_that_learn_from_records(data, config, tmp_path):
+    weighted = WeightedSet(data, np.ones((3, 91)))
+    with pytest.raises(UsageError, match="ToyConfig learns from no recorded steps"):
+        train(config, weighted, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    train(config, data, tmp_path / "run")
+    with pytest.raises(UsageError, match="was trained with other weights"):
+        train(config, weighted, tmp_path / "run", resume=True)

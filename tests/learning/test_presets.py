@@ -1,15 +1,21 @@
 """Every preset is a training run that can be built, and the published ones have the published numbers."""
 
+from dataclasses import replace
+
 import pytest
 
 from drivax import settings
 from drivax.learning.config import TrainConfig
+from drivax.learning.cql import CqlConfig
 from drivax.learning.imitation import BcConfig
+from drivax.learning.iql import IqlConfig
 from drivax.learning.ppo import PpoConfig
 from drivax.learning.sac import SacConfig
+from drivax.learning.td3_bc import Td3BcConfig
 from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.tasks.observations import PRESETS
 
+OFFLINE = {"bc": BcConfig, "cql": CqlConfig, "cql_bc": CqlConfig, "iql": IqlConfig, "td3_bc": Td3BcConfig}
 KINDS = {"bc": BcConfig, "sac": SacConfig, "ppo": PpoConfig, "bc_sac": BcSacConfig, "bc_ppo": BcPpoConfig}
 
 
@@ -20,6 +26,8 @@ def test_presets_load_and_round_trip(name):
     kind = name.removeprefix("published/")
     if kind in KINDS:
         assert type(config.algorithm) is KINDS[kind]
+    if name.startswith("offline/"):
+        assert type(config.algorithm) is OFFLINE[name.removeprefix("offline/")]
     # More than warming up or cloning.
     if hasattr(config.algorithm, "warm_start"):
         assert 0 < config.algorithm.warm_start.iterations < config.iterations
@@ -29,6 +37,8 @@ def test_every_algorithm_has_its_presets():
     names = set(settings.presets())
     assert set(KINDS) <= names
     assert {f"published/{kind}" for kind in KINDS if kind != "bc_ppo"} <= names
+    assert {f"offline/{name}" for name in OFFLINE} <= names
+    assert {f"published/{name}" for name in OFFLINE if name != "cql_bc"} <= names
 
 
 def test_published_numbers():
@@ -53,3 +63,31 @@ def test_published_numbers():
     for config in (sac, ppo, both):
         assert config.earliest_start == config.latest_start == 0, "episodes of 90 steps"
         assert config.task.observation == PRESETS["published"] and config.task.rewards.preset == "published"
+
+
+def test_published_numbers_of_offline_algorithms():
+    """CQL's as the long-tail study has them, the others' as their papers."""
+    cql = settings.load(TrainConfig, "published/cql").algorithm
+    assert (cql.penalty, cql.gamma, cql.tau, cql.batch, cql.actions) == (2.0, 0.9, 0.005, 512, 10)
+    assert (cql.policy_rate, cql.critic_rate, cql.gradient_norm) == (1e-5, 3e-5, 1.0)
+    assert not cql.importance and not cql.next_actions and cql.temperature_rate == 0.0
+    assert settings.load(TrainConfig, "published/cql").total_steps == 510_000 * 512
+    iql = settings.load(TrainConfig, "published/iql").algorithm
+    assert (iql.expectile, iql.inverse_temperature, iql.largest_weight, iql.loss) == (
+        0.7,
+        3.0,
+        100.0,
+        "likelihood",
+    )
+    td3_bc = settings.load(TrainConfig, "published/td3_bc").algorithm
+    assert (td3_bc.q_weight, td3_bc.noise, td3_bc.noise_bound, td3_bc.delay) == (2.5, 0.2, 0.5, 2)
+    for other in (iql, td3_bc):
+        assert (other.batch, other.gamma, other.tau, other.critic_rate) == (256, 0.99, 0.005, 3e-4)
+
+
+def test_offline_presets_differ_in_the_algorithm_alone():
+    found = [settings.load(TrainConfig, f"offline/{name}") for name in OFFLINE]
+    for config in found[1:]:
+        assert replace(config, algorithm=found[0].algorithm) == found[0]
+        assert config.algorithm.network == found[0].algorithm.network
+        assert config.algorithm.steps_per_iteration == found[0].algorithm.steps_per_iteration

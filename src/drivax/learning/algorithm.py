@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Array
 
+from drivax.errors import UsageError
 from drivax.learning.environment import Environment
 from drivax.planners.planner import Planner
 
@@ -66,3 +68,45 @@ class AlgorithmConfig(Protocol):
     def build(self, environment: Environment, data: Any, iterations: int) -> Learner:
         """The learner; of the data only shapes may be looked at, ``iterations`` is the length of the whole run."""
         ...
+
+
+@runtime_checkable
+class LearnsFromRecords(Protocol):
+    """Settings of an algorithm that learns from recorded steps: what its learner is given is prepared once."""
+
+    def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
+        """The ``data`` of :meth:`Learner.iterate`, made of the environment's, with steps drawn by these weights."""
+        ...
+
+
+@runtime_checkable
+class Judges(Protocol):
+    """A learner that has something to say of held-out data, beside how its policy drives there."""
+
+    def judge(self, data: Any, state: Any) -> dict[str, float]:
+        """Numbers to log as ``validation/<name>``; ``data`` are :func:`training_data` of what is held out."""
+        ...
+
+
+def training_data(
+    config: AlgorithmConfig, environment: Environment, data: Any, weights: np.ndarray | None = None
+) -> Any:
+    """What a learner's iterations are given: the environment's data, or what the algorithm makes of them.
+
+    Args:
+        config: The algorithm.
+        environment: What it learns in.
+        data: The environment's data.
+        weights: ``[N, T]`` of every recorded step, at least 0; None: all alike.
+
+    Raises:
+        UsageError: There are weights, but the algorithm learns from what it drives itself.
+    """
+    if isinstance(config, LearnsFromRecords):
+        return config.experience(environment, data, weights)
+    if weights is not None:
+        raise UsageError(
+            f"{type(config).__name__} learns from no recorded steps that weights could choose",
+            cure="leave out the weights, or use bc, cql, iql or td3_bc",
+        )
+    return data

@@ -6,10 +6,14 @@ from dataclasses import dataclass, field
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
+from drivax.learning.cql import CqlConfig
 from drivax.learning.driving import Driving
 from drivax.learning.imitation import BcConfig
+from drivax.learning.iql import IqlConfig
+from drivax.learning.offline import OfflineConfig
 from drivax.learning.ppo import PpoConfig
 from drivax.learning.sac import SacConfig
+from drivax.learning.td3_bc import Td3BcConfig
 from drivax.learning.validation import Rule
 from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.scenario.schema import CURRENT_STEP
@@ -18,8 +22,19 @@ from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.tasks.actions import DirectState
 from drivax.tasks.task import Task
 
-#: What ``algorithm`` can be: ``kind: ppo``, ``sac``, ``bc``, ``bc_ppo``, ``bc_sac``, or one's own.
-Algorithm = PpoConfig | SacConfig | BcConfig | BcPpoConfig | BcSacConfig | AlgorithmConfig
+#: What ``algorithm`` can be: ``kind: ppo``, ``sac``, ``bc``, ``bc_ppo``, ``bc_sac``, offline ``cql``, ``iql`` and
+#: ``td3_bc``, or one's own.
+Algorithm = (
+    PpoConfig
+    | SacConfig
+    | BcConfig
+    | BcPpoConfig
+    | BcSacConfig
+    | CqlConfig
+    | IqlConfig
+    | Td3BcConfig
+    | AlgorithmConfig
+)
 
 
 @dataclass(frozen=True)
@@ -41,7 +56,8 @@ class TrainConfig:
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
         checkpoint_rule: What makes one checkpoint better than another in validation: the ``score``, or
-            ``lexicographic``: fewest failures, then progress, then comfort.
+            ``lexicographic``: fewest failures, then progress, then comfort; ``fitted_q``, for offline algorithms that
+            have updates of it: what it expects of the policy on held-out steps.
         patience: Learning stops early after so many validations that were no better than the best; 0: never.
         devices: How many of this machine's devices to use; None: all of them, as far as agents or their environments
             divide.
@@ -72,6 +88,11 @@ class TrainConfig:
             )
         if self.patience and not self.evaluate_every:
             raise UsageError("patience needs validations", cure="set evaluate_every")
+        if self.checkpoint_rule == "fitted_q" and not _fits_q(self.algorithm):
+            raise UsageError(
+                "the algorithm evaluates by no fitted Q",
+                cure="set algorithm.fitted_q.updates of cql, iql or td3_bc",
+            )
         # Refuses a traffic or a step that does not exist before any work is done.
         self.environment()
 
@@ -87,3 +108,7 @@ class TrainConfig:
     def iterations(self) -> int:
         """Iterations of the whole run."""
         return -(-self.total_steps // self.algorithm.steps_per_iteration)
+
+
+def _fits_q(algorithm: Algorithm) -> bool:
+    return isinstance(algorithm, OfflineConfig) and algorithm.fitted_q.updates > 0

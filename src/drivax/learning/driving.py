@@ -13,9 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.learning.branches import in_any
 from drivax.learning.environment import Environments, Outcome
+from drivax.learning.experience import ExpertSteps
+from drivax.learning.sampler import Places
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
-from drivax.planners.simple import expert_action
+from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
@@ -24,6 +26,9 @@ from drivax.simulator.starts import LogStart
 from drivax.simulator.types import Beginning, Frame, Scene, SimState
 from drivax.tasks.actions import Discrete
 from drivax.tasks.task import Task
+
+#: Scenarios that are replayed at once.
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -142,19 +147,64 @@ class Driving:
             Observations, the expert's actions within the bounds, and whether it took clipping to get them there.
         """
         index, step, _ = _draw(data, key, count, CURRENT_STEP, data.steps - 3)
-        return jax.vmap(self._demonstration, (None, 0, 0))(data, index, step)
 
-    def _demonstration(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]
-    ) -> tuple[dict[str, Array], Float[Array, " D"], Bool[Array, ""]]:
+        def one(index: Array, step: Array) -> tuple[dict[str, Array], Array, Array]:
+            scene = self._moment(data, index, step)
+            return (dict(self._logged.observe(data, scene)), *self._did(data, scene))
+
+        return jax.vmap(one)(index, step)
+
+    def observe_recorded(self, data: ScenarioBank, places: Places) -> dict[str, Array]:
+        """Observations of logged moments; see :meth:`demonstrations`."""
+
+        def one(index: Array, step: Array) -> dict[str, Array]:
+            return dict(self._logged.observe(data, self._moment(data, index, step)))
+
+        return jax.vmap(one)(*places)
+
+    def expert_steps(self, data: ScenarioBank) -> ExpertSteps:
+        """The log as a rollout of its expert from the current step on: rewards and ends as the simulator gives them.
+
+        Everyone goes where the log goes, whatever traffic the simulator has: what happened is known for that only.
+        """
+        rows = jnp.arange(len(data))
+        found = jax.lax.map(partial(self._rollout, data), rows, batch_size=min(len(data), _AT_ONCE))
+        # Nothing happens before the first step, and nothing at the last, which only ends what was before.
+        action, reward, terminated, truncated, clipped = (
+            jnp.pad(part, ((0, 0), (CURRENT_STEP, 1), *((0, 0),) * (part.ndim - 2))) for part in found
+        )
+        ends = terminated | truncated
+        over = jnp.cumsum(ends, axis=1) > ends
+        return ExpertSteps(action, reward, terminated, truncated, _told(data) & ~over, clipped)
+
+    @property
+    def _logged(self) -> Simulator:
+        """The simulator with everyone as logged, without metrics, which nobody looks at here."""
+        return Simulator(replace(self.task, metrics="none"))
+
+    def _moment(self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]) -> Scene:
+        """A logged moment as if the expert had driven there."""
+        scene, before = (self._logged.scene(bank, index, at) for at in (step, step - 1))
+        return replace(scene, action=self._did(bank, before)[0])
+
+    def _did(self, bank: ScenarioBank, scene: Scene) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
+        """What the expert does, as carried out, and whether it took clipping."""
         space = self.task.actions
-        simulator = replace(self.simulator, start=LogStart())
-        scene, before = simulator.scene(bank, index, step), simulator.scene(bank, index, step - 1)
-        did = space.actuated(before.history[-1], expert_action(bank, before, space), before.action)
-        scene = replace(scene, action=did)
         action = expert_action(bank, scene, space)
-        bounded = space.actuated(scene.history[-1], action, scene.action)
-        return self.observe(bank, scene), bounded, space.clipped(action)
+        return space.actuated(scene.history[-1], action, scene.action), space.clipped(action)
+
+    def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
+        """What the expert did in one scenario from the current step on: action, reward, both ends, whether clipped."""
+        simulator = self._logged
+        begun = simulator.reset(bank, index)
+        begun = replace(begun, scene=self._moment(bank, index, begun.start))
+
+        def step(state: SimState, _: None) -> tuple[SimState, tuple[Array, ...]]:
+            action, clipped = self._did(bank, state.scene)
+            after, made = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
+            return after, (action, made.reward, made.terminated, made.truncated, clipped)
+
+        return jax.lax.scan(step, begun, None, bank.steps - 1 - CURRENT_STEP)[1]
 
 
 def _draw(
@@ -168,6 +218,13 @@ def _draw(
     step = jnp.where(bank.agents[index, step, 0, AGENT_VALID] > 0, step, CURRENT_STEP)
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)  # not computed where starts are logged
     return index, step, keys
+
+
+def _told(bank: ScenarioBank) -> Bool[Array, "N T"]:
+    """Steps from the current one on at which the log tells what the expert did: ego is there, and for two steps on."""
+    there = bank.agents[:, :, 0, AGENT_VALID] > 0
+    goes_on = jnp.pad(there[:, :-2] & there[:, 1:-1] & there[:, 2:], ((0, 0), (0, 2)))
+    return goes_on & (jnp.arange(bank.steps) >= CURRENT_STEP)
 
 
 def _totals(

@@ -8,13 +8,16 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment
+from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
 from drivax.learning.optimisers import clipped_adam
+from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network import NetworkPlanner
@@ -72,7 +75,7 @@ class Cloning:
         self, act: Act, parameters: Any, environment: Demonstrated, data: Any, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """The loss on random moments, and what to log: it, the mean error of the mode, the share left out."""
-        observation, action, clipped = environment.demonstrations(data, key, self.batch)
+        observation, action, clipped = _moments(environment, data, key, self.batch)
         policy = act(parameters, observation)
         error = policy.mode() - action
         squared = self.loss == "mse"
@@ -122,6 +125,13 @@ class BcConfig(Cloning):
     def steps_per_iteration(self) -> int:
         """Moments of one iteration; each counts as a step."""
         return self.batch * self.updates
+
+    def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
+        """The data as they are, whose moments are all alike; or their recorded steps, drawn by weight."""
+        if weights is None:
+            return data
+        # Clipped steps have their place in what is logged, and no part in the loss.
+        return ExperienceConfig(mask_clipped=False).of(environment, data, weights)
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Bc:
         """Cloning of the expert of an environment."""
@@ -176,7 +186,18 @@ class Bc:
 
         trained = (state.parameters, state.optimiser)
         trained, logs = self.config.improve(trained, self.optimiser, loss, update_key)
+        if isinstance(data, Experience):
+            logs |= data.sizes()
         return BcState(*trained, key, state.iteration + 1), logs
+
+
+def _moments(
+    environment: Demonstrated, data: Any, key: Array, count: int
+) -> tuple[dict[str, Array], Float[Array, "B D"], Bool[Array, " B"]]:
+    """Random moments: all alike, or where experience has weights, by those."""
+    if isinstance(data, Experience):
+        return moments(recorded(environment), data, draw(data.policy or data.critic, key, (count,)))
+    return environment.demonstrations(data, key, count)
 
 
 def demonstrated(environment: Environment) -> Demonstrated:

@@ -13,10 +13,11 @@ import jax
 
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
-from drivax.learning.algorithm import LearnerState
+from drivax.learning.algorithm import Judges, LearnerState, training_data
 from drivax.learning.config import TrainConfig
+from drivax.learning.experience import WeightedSet
 from drivax.learning.first_state import Origin, first_state, inherited
-from drivax.learning.folders import create_folders, resumed_folders
+from drivax.learning.folders import create_folders, facts, resumed_folders
 from drivax.learning.journal import Journal
 from drivax.learning.policy_traffic import find_traffic
 from drivax.learning.program import Program
@@ -31,7 +32,7 @@ from drivax.tracking.runs import RunFolder, refuse_existing
 
 def train(
     config: TrainConfig,
-    data: ScenarioSet,
+    data: ScenarioSet | WeightedSet,
     out: str | Path,
     *,
     validation: ScenarioSet | None = None,
@@ -44,7 +45,8 @@ def train(
 
     Args:
         config: What to train.
-        data: Scenarios to train on; all of them are held on the device.
+        data: Scenarios to train on; all of them are held on the device. Offline algorithms draw their recorded steps
+            by weight where they are a :class:`WeightedSet`, otherwise all that can be learned from alike.
         out: Run folder.
         validation: Scenarios that choose the best checkpoint.
         resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device; with the
@@ -56,14 +58,16 @@ def train(
 
     Raises:
         UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on
-            other data, or it does not fit the device's memory.
+            other data or with other weights, weights do not fit the data or the algorithm, or it does not fit the
+            device's memory.
         DataError: What it is to begin from is no training run, or its networks do not fit.
         Preempted: If SIGTERM stopped it, after a checkpoint.
     """
+    data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
     out = Path(out)
     folders: list[RunFolder] = []
     if resume:
-        config, folders = resumed_folders(data, validation, out, seeds)
+        config, folders = resumed_folders(data, validation, weights, out, seeds)
     else:
         refuse_existing(out, overwrite, "training")
         if config.begin_from is not None:
@@ -77,17 +81,21 @@ def train(
     environment = config.environment()
     bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     held_out = None if validation is None else Validation.of(validation)
+    recorded = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
     learner = config.algorithm.build(environment, bank, config.iterations)
-    program = Program(Agents(learner, numbers), bank, config.devices)
+    experience = training_data(config.algorithm, environment, bank, weights)
+    program = Program(Agents(learner, numbers), experience, config.devices)
     memory = program.account(None if held_out is None else held_out.bank)
     memory.refuse_too_much()
     say(memory.text())
     # Before any folder is made: they may not fit.
     networks = None if resume else inherited(config.begin_from, program, say)
-    folders = folders or create_folders(config, data, validation, out, numbers, overwrite)
+    folders = folders or create_folders(
+        config, data, out, numbers, overwrite, facts(config, validation, weights)
+    )
     with contextlib.ExitStack() as stack:
         journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
-        _learn(_Run(config, program, journals, held_out, networks, say))
+        _learn(_Run(config, program, journals, held_out, recorded, networks, say))
     return RunFolder.open(out)
 
 
@@ -97,6 +105,7 @@ class _Run:
     program: Program
     journals: Sequence[Journal]
     validation: Validation | None
+    held_out: Any
     #: Of the run that it begins from; None: not looked for, since a resumed run rarely begins.
     networks: Mapping[str, Any] | None
     say: Callable[[str], None]
@@ -175,6 +184,10 @@ def _record(
             parameters = jax.device_put(agents.one(state.parameters, number), run.program.devices[0])
             planner = agents.learner.planner(parameters, "policy", samples=False)
             row |= validate(planner, run.validation, config.task, find_traffic(config.traffic))
+            if isinstance(agents.learner, Judges):
+                one = jax.device_put(agents.one(state, number), run.program.devices[0])
+                judged = agents.learner.judge(run.held_out, one)
+                row |= {f"validation/{name}": value for name, value in judged.items()}
         found = journal.write(done, row)
         if last or due or stops or iteration % config.checkpoint_every == 0:
             journal.save(done, agents.one(state, number), found)

@@ -18,8 +18,9 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 
-#: ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then comfort.
-Rule = Literal["score", "lexicographic"]
+#: ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then comfort. ``fitted_q``: what
+#: fitted-Q evaluation expects of the policy, without driving.
+Rule = Literal["score", "lexicographic", "fitted_q"]
 
 _SCORES = ("vmax_score", "vmax_score_partial")
 _METRICS = (
@@ -80,10 +81,12 @@ def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
     }
     if not seen:
         return None
+    if rule == "fitted_q":
+        return (_or_last(seen["fitted_q"], -math.inf),)
     if rule == "score":
         return (float(next(seen[name] for name in _SCORES if name in seen)),)
     return tuple(_or_last(seen.get(name)) for name in _ORDER)
 
 
-def _or_last(value: float | None) -> float:
-    return -1.0 if value is None or math.isnan(value) else float(value)
+def _or_last(value: float | None, last: float = -1.0) -> float:
+    return last if value is None or math.isnan(value) else float(value)

@@ -68,10 +68,21 @@ class _Head(nnx.Module):
         width = config.head[-1] if config.head else width
         self.out = nnx.Linear(width, out, kernel_init=nnx.initializers.orthogonal(scale), rngs=rngs)
 
-    def __call__(self, x: Array) -> Array:
-        for layer in self.hidden:
-            x = ACTIVATIONS[self.activation](layer(x))
-        return self.out(x)
+    def __call__(self, x: Array, beside: Array | None = None) -> Array:
+        """Of ``x``, or of ``x`` and what stands beside it, which may have leading axes that ``x`` lacks."""
+        layers = [*self.hidden, self.out]
+        for number, layer in enumerate(layers):
+            x = layer(x) if number or beside is None else _side_by_side(layer, x, beside)
+            if number < len(self.hidden):
+                x = ACTIVATIONS[self.activation](x)
+        return x
+
+
+def _side_by_side(layer: nnx.Linear, x: Array, beside: Array) -> Array:
+    """The layer of both, concatenated: what it makes of ``x`` is computed once for everything beside it."""
+    kernel, bias = layer.kernel[...], 0.0 if layer.bias is None else layer.bias[...]
+    width = x.shape[-1]
+    return x @ kernel[:width] + beside @ kernel[width:] + bias
 
 
 class Policy(nnx.Module):
@@ -142,9 +153,12 @@ class Critic(nnx.Module):
         width = self.encoder.width + (actions or Actions()).size
         self.head = _Head(config, width, 1, 1.0, rngs)
 
-    def __call__(self, groups: Groups, action: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
-        """Expected discounted return of an action in [-1, 1]."""
-        return self.head(jnp.concatenate([self.encoder(groups), action], axis=-1))[..., 0]
+    def __call__(self, groups: Groups, action: Float[Array, "*actions D"]) -> Float[Array, "*actions"]:
+        """Expected discounted return of an action in [-1, 1].
+
+        Several actions of an observation stand in leading axes; it is encoded once.
+        """
+        return self.head(self.encoder(groups), action)[..., 0]
 
 
 class TwinCritic(nnx.Module):
@@ -155,6 +169,6 @@ class TwinCritic(nnx.Module):
     ) -> None:
         self.critics = nnx.List([Critic(config, spec, rngs, actions) for _ in range(2)])
 
-    def __call__(self, groups: Groups, action: Float[Array, "*batch action"]) -> Float[Array, "2 *batch"]:
-        """Both values."""
+    def __call__(self, groups: Groups, action: Float[Array, "*actions D"]) -> Float[Array, "2 *actions"]:
+        """Both values; see :class:`Critic` for several actions."""
         return jnp.stack([critic(groups, action) for critic in self.critics])

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState
+from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState, training_data
 from drivax.learning.driving import Driving
 from drivax.named import find_named
 from drivax.planners.planner import Planner
@@ -55,31 +55,32 @@ def check_algorithm(config: AlgorithmConfig | str) -> None:
         "count environment steps as a whole number",
     )
     bank, simulator = worlds.worlds(), Simulator(_TASK)
-    learner = found.build(Driving(simulator), bank, _ITERATIONS)
+    environment = Driving(simulator)
+    learner = found.build(environment, bank, _ITERATIONS)
     expect(isinstance(learner, Learner), f"{what} builds no Learner", "give it init, iterate and planner")
-    state = _check_iterations(what, learner, bank)
+    state = _check_iterations(what, learner, training_data(found, environment, bank))
     _check_planner(what, learner, bank, simulator, state.parameters)
 
 
-def _check_iterations(what: str, learner: Learner, bank: ScenarioBank) -> Any:
+def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     init, iterate = jax.jit(learner.init), jax.jit(learner.iterate, donate_argnums=1)
-    first = init(bank, jax.random.key(0))
+    first = init(data, jax.random.key(0))
     expect(
         isinstance(first, LearnerState), f"{what} has a state without parameters or iteration", "name them so"
     )
     expect(
-        _forms(jax.eval_shape(learner.init, bank, jax.random.key(1))) == _forms(first),
+        _forms(jax.eval_shape(learner.init, data, jax.random.key(1))) == _forms(first),
         f"{what} has a state whose form depends on the key",
         "let shapes follow from the configuration only",
     )
-    following, _ = jax.eval_shape(learner.iterate, bank, first)
+    following, _ = jax.eval_shape(learner.iterate, data, first)
     expect(
         _forms(following) == _forms(first),
         f"{what} changes the form of its state in an iteration",
         "return the same record with the same shapes and types",
     )
     stored = _stored(first)
-    second, logs = iterate(bank, first)
+    second, logs = iterate(data, first)
     expect(
         int(second.iteration) == int(stored.iteration) + 1,
         f"{what} counts from iteration {int(stored.iteration)} to {int(second.iteration)}",
@@ -91,13 +92,13 @@ def _check_iterations(what: str, learner: Learner, bank: ScenarioBank) -> Any:
         "return the new parameters",
     )
     _check_logs(what, logs)
-    again, _ = iterate(bank, jax.tree.map(jnp.copy, stored))
+    again, _ = iterate(data, jax.tree.map(jnp.copy, stored))
     expect(
         same(_numbers(again), _numbers(second), 0.0),
         f"{what} does not repeat an iteration bit for bit",
         "keep keys and everything else that an iteration needs in the state",
     )
-    third, logs = iterate(bank, second)
+    third, logs = iterate(data, second)
     _check_logs(what, logs)
     check_numbers(what, [np.atleast_1d(leaf) for leaf in jax.tree.leaves(_numbers(third.parameters))])
     return third

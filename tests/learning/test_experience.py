@@ -1,0 +1,130 @@
+"""Recorded experience: what the simulator gives while the expert drives, drawn by weight."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.errors import DataError, UsageError
+from drivax.learning.driving import Driving
+from drivax.learning.experience import ExperienceConfig, Recorded, transitions
+from drivax.planners.simple import Expert, logged_motion
+from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.observations import ObservationConfig
+from drivax.tasks.task import Task
+from pendulum import Pendulum
+
+OBSERVATION = ObservationConfig(agents=2, steps=2, road=0, lights=1, route=3)
+JUMP = 40
+DRIVING = Driving(Simulator(Task(observation=OBSERVATION, metrics="none")))
+
+
+@pytest.fixture(scope="module")
+def bank(data):
+    bank = ScenarioBank.from_scenarios(data)
+    # Somebody stands in ego's way half a second behind the current step of the first scenario: the episode ends there.
+    ego, box = bank.agents[0, 15, 0], bank.agent_box[0, 0]
+    agents = bank.agents.at[0, :, 1].set(ego)
+    # In the last, the log loses ego.
+    agents = agents.at[2, 70:, 0, AGENT_VALID].set(0.0)
+    # In the second, it looks aside for a moment.
+    agents = agents.at[1, JUMP, 0, 3:5].set(-agents[1, JUMP, 0, 4:2:-1])
+    return replace(bank, agents=agents, agent_box=bank.agent_box.at[0, 1].set(box))
+
+
+@pytest.fixture(scope="module")
+def experience(bank):
+    return ExperienceConfig().of(DRIVING, bank)
+
+
+def drive(bank, index):
+    """The expert drives online, by the planner that evaluations use: what every step was, from the current one on."""
+    simulator, planner = DRIVING.simulator, Expert(DRIVING.task.actions)
+
+    def step(state, _):
+        seen = simulator.observe(bank, state.scene)
+        situation = simulator.situation(bank, state)
+        action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
+        after, made = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
+        following = simulator.observe(bank, after.scene)
+        return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)
+
+    return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]
+
+
+def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, experience):
+    online = jax.device_get(jax.jit(jax.vmap(drive, (None, 0)))(bank, jnp.arange(3)))
+    expert = jax.device_get(experience.expert)
+    index, step = np.nonzero(expert.usable)
+    places = jnp.asarray(index), jnp.asarray(step)
+    found = jax.device_get(jax.jit(lambda e, p: transitions(DRIVING, e, p))(experience, places))
+    seen, action, reward, terminated, following, truncated = jax.tree.map(
+        lambda leaf: leaf[index, step - 10], online
+    )
+    first = step == 10
+    assert first.sum() == 3 and len(index) > 100
+    for name, value in seen.items():
+        # Only at its first step does an episode not know what the expert did before.
+        np.testing.assert_allclose(
+            found.observation[name][~first], value[~first], atol=1e-3, rtol=1e-4, err_msg=name
+        )
+        np.testing.assert_allclose(found.following[name], following[name], atol=1e-3, rtol=1e-4, err_msg=name)
+    np.testing.assert_allclose(found.action, action, atol=1e-4)
+    np.testing.assert_allclose(found.reward, reward, atol=1e-4, rtol=1e-4)
+    np.testing.assert_array_equal(found.terminated, terminated)
+    np.testing.assert_array_equal(expert.truncated[index, step], truncated)
+    assert np.abs(reward).max() > 0
+
+
+def test_nothing_is_learned_behind_an_end_nor_without_the_expert(experience):
+    expert = jax.device_get(experience.expert)
+    assert isinstance(DRIVING, Recorded)
+    end = int(np.argmax(expert.terminated[0]))
+    assert 10 <= end < 16 and expert.terminated[0, end]
+    np.testing.assert_array_equal(np.nonzero(expert.usable[0])[0], np.arange(10, end + 1))
+    # An action looks two steps ahead; the last one that is known of is that of step 88.
+    whole, lost = expert.usable[1], expert.usable[2]
+    assert whole[10:89].all() and not whole[:10].any() and not whole[89:].any()
+    assert lost[10:68].all() and not lost[68:].any()
+
+
+def test_clipped_steps_are_left_out_unless_they_are_asked_for(bank, experience):
+    expert = jax.device_get(experience.expert)
+    index, step = np.nonzero(expert.clipped & expert.usable)
+    assert {JUMP - 1} <= {s for i, s in zip(index, step, strict=True) if i == 1}
+    assert (np.abs(expert.action) <= 1.0).all()
+    taken = ExperienceConfig(mask_clipped=False).of(DRIVING, bank)
+    for made, drawn in ((experience, False), (taken, True)):
+        chances = np.diff(np.asarray(made.critic.cumulative).astype(np.int64), prepend=0)
+        assert ((chances.reshape(expert.usable.shape)[index, step] > 0) == drawn).all()
+
+
+def test_what_follows_the_weights(bank, experience):
+    usable = np.asarray(experience.expert.usable & ~experience.expert.clipped)
+    weights = np.zeros(usable.shape)
+    weights[1, 20], weights[1, 30], weights[0, 3] = 3.0, 1.0, 100.0
+    both = ExperienceConfig().of(DRIVING, bank, weights)
+    apart = ExperienceConfig(weighted="policy").of(DRIVING, bank, weights)
+    assert both.policy is None and apart.policy is not None
+    # (3 + 1)^2 / (9 + 1); the weight of a step that is none counts for nothing.
+    assert float(both.critic.effective) == pytest.approx(1.6) == float(apart.policy.effective)
+    assert float(apart.critic.effective) == pytest.approx(usable.sum())
+    np.testing.assert_array_equal(apart.critic.cumulative, experience.critic.cumulative)
+
+
+def test_what_cannot_be_learned_from_is_refused(bank):
+    shape = (3, 91)
+    for weights, words in (
+        (np.ones((3, 90)), r"weights of shape \(3, 90\) for 3 scenarios of 91 steps"),
+        (np.full(shape, -1.0), "step 0 of scenario 0 is -1"),
+        (np.full(shape, np.nan), "step 0 of scenario 0 is nan"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            ExperienceConfig().of(DRIVING, bank, weights)
+    with pytest.raises(DataError, match="no step has any weight"):
+        ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
+    with pytest.raises(UsageError, match="Pendulum holds no recorded episodes"):
+        ExperienceConfig().of(Pendulum(), ())

@@ -1,0 +1,71 @@
+"""Fitted-Q evaluation where the answer is known."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.learning.config import TrainConfig
+from drivax.learning.experience import ExperienceConfig
+from drivax.learning.fitted_q import FittedQ, FittedQConfig
+from drivax.learning.validation import rank
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
+from recorded import Table, Told
+
+NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(32,)), head=(32,), activation="relu")
+GAMMA, LENGTH = 0.8, 6
+
+
+@pytest.fixture(scope="module")
+def table():
+    """A loop in which pushing right pays 1 and pushing left nothing; half of the expert's pushes go either way."""
+    shape = (40, LENGTH + 1)
+    right = np.random.default_rng(0).random(shape) < 0.5
+    number = np.broadcast_to(np.arange(LENGTH + 1), shape)
+    never = jnp.zeros(shape, bool)
+    return Table(
+        seen=jnp.stack([jnp.asarray(number / LENGTH, jnp.float32)] * 3, axis=-1),
+        action=jnp.where(jnp.asarray(right), 0.5, -0.5)[..., None],
+        reward=jnp.asarray(right, jnp.float32),
+        terminated=never,
+        truncated=jnp.asarray(number == LENGTH - 1),
+        usable=jnp.asarray(number < LENGTH),
+    )
+
+
+def test_policies_are_worth_what_they_earn(table):
+    """By hand: always right earns 1 / (1 - gamma) = 5 without ends, and (1 - gamma^6) / (1 - gamma) = 3.69 with one."""
+    ends = replace(table, terminated=table.truncated, truncated=table.terminated)
+    # Where episodes are cut off the same state follows, so that the loop goes on for ever.
+    loops = replace(table, seen=jnp.ones_like(table.seen))
+    judge = FittedQ(FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05), NETWORK, Told(), GAMMA)
+
+    @jax.jit
+    def both(data):
+        def always(push):
+            return judge.value(data, lambda seen: jnp.full((*seen["pendulum"].shape[:-1], 1), push))
+
+        return always(0.5), always(-0.5)
+
+    for data, worth in ((loops, 1 / (1 - GAMMA)), (ends, (1 - GAMMA**LENGTH) / (1 - GAMMA))):
+        right, left = both(ExperienceConfig().of(Told(), data))
+        assert float(right) == pytest.approx(worth, rel=0.05)
+        assert float(left) == pytest.approx(0.0, abs=0.1)
+
+
+def test_checkpoints_are_compared_by_it():
+    row = {"validation/fitted_q": -3.0, "validation/mean_q": 9.0, "validation/vmax_score": 0.5}
+    assert rank("fitted_q", row) == (-3.0,) < rank("fitted_q", row | {"validation/fitted_q": -2.0})
+    assert rank("fitted_q", row | {"validation/fitted_q": float("nan")}) == (-np.inf,)
+    assert rank("score", row) == (0.5,)
+    values = {"checkpoint_rule": "fitted_q", "evaluate_every": 1}
+    for algorithm in ({"kind": "bc"}, {"kind": "iql"}):
+        with pytest.raises(UsageError, match="evaluates by no fitted Q"):
+            settings.load(TrainConfig, values | {"algorithm": algorithm})
+    fits = {"kind": "iql", "fitted_q": {"updates": 5}}
+    assert settings.load(TrainConfig, values | {"algorithm": fits}).checkpoint_rule == "fitted_q"

@@ -1,0 +1,422 @@
+"""Offline algorithms: losses against NumPy on the networks' own outputs, and what they learn of small worlds."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.learning.algorithm import training_data
+from drivax.learning.config import TrainConfig
+from drivax.learning.cql import CqlConfig
+from drivax.learning.experience import ExperienceConfig, WeightedSet
+from drivax.learning.iql import IqlConfig
+from drivax.learning.loop import train
+from drivax.learning.policies import load_policy
+from drivax.learning.replay import Transitions
+from drivax.learning.td3_bc import Td3BcConfig
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
+from drivax.planners.planner import Planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.testing import check_algorithm
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.sinks import read_rows
+from recorded import Table, Told, arms
+
+NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
+COUNT, ACTIONS = 16, 3
+CQL = CqlConfig(network=NETWORK, batch=COUNT, actions=ACTIONS, gamma=0.9, penalty=2.0)
+IQL = IqlConfig(network=NETWORK, batch=COUNT, gamma=0.9)
+TD3_BC = Td3BcConfig(network=NETWORK, batch=COUNT, gamma=0.9)
+
+
+@pytest.fixture(scope="module")
+def part():
+    """A batch of steps."""
+    keys = jax.random.split(jax.random.key(1), 5)
+    return Transitions(
+        observation={"pendulum": jax.random.normal(keys[0], (COUNT, 3))},
+        action=jax.random.uniform(keys[1], (COUNT, 1), minval=-0.9, maxval=0.9),
+        reward=jax.random.normal(keys[2], (COUNT,)),
+        terminated=jax.random.bernoulli(keys[3], 0.3, (COUNT,)),
+        following={"pendulum": jax.random.normal(keys[4], (COUNT, 3))},
+    )
+
+
+@pytest.fixture(scope="module")
+def improved(part):
+    """Other steps, to improve the policy at."""
+    return {"pendulum": 0.5 - part.observation["pendulum"]}, -part.action
+
+
+def begun(config):
+    """A learner with what it trains, and targets that differ from what they follow."""
+    learner = config.build(Told(), arms([0.0], [0.0]), 1)
+    state = jax.jit(learner.init)((), jax.random.key(0))
+    target = jax.tree.map(lambda leaf: leaf + 0.1, state.target)
+    return learner, {"policy": state.parameters, **state.rest}, target
+
+
+def losses(learner, trained, target, part, improved, key):
+    """What is logged of a batch."""
+    found = jax.jit(lambda t: learner.loss(t, target, part, improved, key))(trained)
+    return float(found[0]), {name: float(value) for name, value in found[1].items()}
+
+
+def on_the_host(tree):
+    return {name: np.asarray(value, np.float64) for name, value in tree.items()}
+
+
+def test_cql_against_numpy(part, improved):
+    config = replace(CQL, gap=1.5, imitation=0.7, penalty_temperature=2.0)
+    learner, trained, target = begun(config)
+    key = jax.random.key(7)
+    total, logs = losses(learner, trained, target, part, improved, key)
+
+    @jax.jit
+    def outputs(trained):
+        """What the losses are made of, drawn by the same keys."""
+        critic_key, policy_key = jax.random.split(key)
+        next_key, sample_key = jax.random.split(critic_key)
+        uniform_key, now_key, then_key = jax.random.split(sample_key, 3)
+        following = learner.distribution(trained["policy"], part.following)
+        now = learner.distribution(trained["policy"], part.observation)
+        there = learner.distribution(trained["policy"], improved[0])
+        then = jnp.tanh(following.sample(next_key))
+        uniform = jax.random.uniform(uniform_key, (ACTIONS, COUNT, 1), minval=-1.0)
+        rows = {"uniform": [], "now": [], "then": []}
+        for number in range(ACTIONS):
+            for name, policy, own in (("now", now, now_key), ("then", following, then_key)):
+                choice = policy.sample(jax.random.split(own, ACTIONS)[number])
+                q = learner.q(trained["critic"], part.observation, jnp.tanh(choice))
+                rows[name].append((q, policy.log_prob(choice)))
+            rows["uniform"].append((learner.q(trained["critic"], part.observation, uniform[number]), None))
+        choice = there.sample(policy_key)
+        return {
+            "target": learner.q(target["critic"], part.following, then),
+            "q": learner.q(trained["critic"], part.observation, part.action),
+            **{f"q_{name}": jnp.stack([q for q, _ in found]) for name, found in rows.items()},
+            **{f"p_{name}": jnp.stack([p for _, p in rows[name]]) for name in ("now", "then")},
+            "judged": learner.q(trained["critic"], improved[0], jnp.tanh(choice)),
+            "log_prob": there.log_prob(choice),
+            "mode": there.mode(),
+        }
+
+    found = on_the_host(outputs(trained))
+    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, found["target"].min(axis=0))
+    error = 0.5 * ((found["q"] - goal) ** 2).mean()
+    stacked = np.concatenate([
+        found["q_uniform"] / 2 + np.log(2.0),
+        found["q_now"] / 2 - found["p_now"][:, None],
+        found["q_then"] / 2 - found["p_then"][:, None],
+    ])  # fmt: skip
+    penalty = (2 * (special.logsumexp(stacked, axis=0) - np.log(3 * ACTIONS)) - found["q"]).mean()
+    soft = 0.1 * found["log_prob"] - found["judged"].min(axis=0)
+    off = found["mode"] - np.asarray(improved[1])
+    policy = (soft / np.abs(found["judged"].min(axis=0)).mean()).mean() + 0.7 * (off**2).mean()
+    expected = {
+        "critic": error,
+        "penalty": penalty,
+        "penalty_weight": 2.0,
+        "mean_q": found["q"].mean(),
+        "mean_q_uniform": found["q_uniform"].mean(),
+        "policy": policy,
+        "mean_q_policy": found["judged"].mean(),
+        "entropy": -found["log_prob"].mean(),
+        "temperature": 0.1,
+        "imitation_error": np.abs(off).mean(),
+    }
+    assert set(logs) == set(expected)
+    for name, number in expected.items():
+        assert logs[name] == pytest.approx(number, rel=1e-4, abs=1e-5), name
+    heat = -0.1 * (found["log_prob"].mean() - 1.0)
+    multiplier = -2.0 * (penalty - 1.5)
+    assert total == pytest.approx(error + 2 * penalty + multiplier + policy + heat, rel=1e-4)
+
+
+def test_the_published_penalty_puts_the_action_of_the_data_among_the_others(part, improved):
+    config = replace(CQL, importance=False, next_actions=False, imitation=0.0)
+    learner, trained, target = begun(config)
+    key = jax.random.key(7)
+    _, logs = losses(learner, trained, target, part, improved, key)
+    sample_key = jax.random.split(jax.random.split(key)[0])[1]
+    now, following = (
+        learner.distribution(trained["policy"], seen) for seen in (part.observation, part.following)
+    )
+    action, density = learner._sampled(now, following, part.action, sample_key)
+    assert action.shape == (2 * ACTIONS + 1, COUNT, 1) and not np.asarray(density).any()
+    np.testing.assert_array_equal(action[-1], part.action)
+    q = np.asarray(learner.q(trained["critic"], part.observation, action), np.float64)
+    data = np.asarray(learner.q(trained["critic"], part.observation, part.action), np.float64)
+    # The study's, but for a constant: the logarithm of how many there are.
+    expected = (special.logsumexp(q, axis=1) - data).mean() - np.log(2 * ACTIONS + 1)
+    assert logs["penalty"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_iql_against_numpy(part, improved):
+    learner, trained, target = begun(replace(IQL, largest_weight=1.05))
+    total, logs = losses(learner, trained, target, part, improved, jax.random.key(7))
+
+    @jax.jit
+    def outputs(trained):
+        policy = learner.distribution(trained["policy"], improved[0])
+        return {
+            "target": learner.q(target["critic"], part.observation, part.action),
+            "q": learner.q(trained["critic"], part.observation, part.action),
+            "value": learner._value(trained["value"], part.observation),
+            "then": learner._value(trained["value"], part.following),
+            "there": learner.q(target["critic"], *improved),
+            "value_there": learner._value(trained["value"], improved[0]),
+            "log_prob": policy.log_prob(jnp.arctanh(improved[1])),
+        }
+
+    found = on_the_host(outputs(trained))
+    error = found["target"].min(axis=0) - found["value"]
+    value = (np.where(error > 0, 0.7, 0.3) * error**2).mean()
+    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, found["then"])
+    critic = 0.5 * ((found["q"] - goal) ** 2).mean()
+    advantage = found["there"].min(axis=0) - found["value_there"]
+    weights = np.minimum(np.exp(3.0 * advantage), 1.05)
+    policy = -(weights * found["log_prob"]).mean()
+    assert 0.0 < logs["weights_cut"] == (weights == 1.05).mean() < 1.0
+    for name, number in (
+        ("value", value),
+        ("critic", critic),
+        ("policy", policy),
+        ("weight", weights.mean()),
+    ):
+        assert logs[name] == pytest.approx(number, rel=1e-4), name
+    assert total == pytest.approx(value + critic + policy, rel=1e-4)
+
+
+def test_td3_bc_against_numpy(part, improved):
+    learner, trained, target = begun(replace(TD3_BC, noise=0.5, noise_bound=0.3))
+    key = jax.random.key(7)
+    total, logs = losses(learner, trained, target, part, improved, key)
+
+    @jax.jit
+    def outputs(trained):
+        mode = learner.distribution(target["policy"], part.following).mode()
+        noise = 0.5 * jax.random.normal(key, mode.shape)
+        then = jnp.clip(mode + jnp.clip(noise, -0.3, 0.3), -1.0, 1.0)
+        action = learner.distribution(trained["policy"], improved[0]).mode()
+        return {
+            "target": learner.q(target["critic"], part.following, then),
+            "q": learner.q(trained["critic"], part.observation, part.action),
+            "judged": learner.q(trained["critic"], improved[0], action)[0],
+            "off": action - improved[1],
+            "noise": noise,
+        }
+
+    found = on_the_host(outputs(trained))
+    assert (np.abs(found["noise"]) > 0.3).any() and (np.abs(found["noise"]) < 0.3).any()
+    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, found["target"].min(axis=0))
+    critic = 0.5 * ((found["q"] - goal) ** 2).mean()
+    policy = -2.5 * found["judged"].mean() / np.abs(found["judged"]).mean() + (found["off"] ** 2).mean()
+    assert logs["critic"] == pytest.approx(critic, rel=1e-4)
+    assert logs["policy"] == pytest.approx(policy, rel=1e-4)
+    assert total == pytest.approx(critic + policy, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "config", [replace(CQL, gap=1.5, imitation=0.5), IQL, TD3_BC], ids=["cql", "iql", "td3"]
+)
+def test_every_loss_reaches_its_own_parameters_only(config, part, improved):
+    learner, trained, target = begun(config)
+
+    @jax.jit
+    def slopes(trained):
+        def of(trained, name):
+            total, logs = learner.loss(trained, target, part, improved, jax.random.key(7))
+            return total if name == "total" else logs[name]
+
+        return {name: jax.grad(of)(trained, name) for name in ("total", "critic", "policy")}
+
+    found = slopes(trained)
+    largest = partial(
+        jax.tree.reduce, lambda most, leaf: max(most, float(jnp.abs(leaf).max())), initializer=0.0
+    )
+    for part_of_loss in ("critic", "policy"):
+        for name in trained:
+            reached = largest(found[part_of_loss][name])
+            assert (reached > 1e-6) == (name == part_of_loss), (part_of_loss, name)
+    # Nothing but the critics' own losses moves them; of CQL these are two.
+    if not isinstance(config, CqlConfig):
+        jax.tree.map(
+            partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6),
+            found["total"]["critic"], found["critic"]["critic"],
+        )  # fmt: skip
+    for name in set(trained) - {"policy", "critic"}:
+        assert largest(found["total"][name]) > 0.0, name
+
+
+def learned(config, data, iterations=20, weights=None):
+    """A learner and its state after so many iterations, and what the last one logged."""
+    learner = config.build(Told(), data, iterations)
+    made = training_data(config, Told(), data, weights)
+
+    @jax.jit
+    def run(made):
+        state = learner.init(made, jax.random.key(0))
+        return jax.lax.scan(lambda s, _: learner.iterate(made, s), state, None, iterations)
+
+    state, logs = run(made)
+    return learner, state, jax.tree.map(lambda leaf: float(leaf[-1]), logs)
+
+
+FAST = {"batch": 64, "updates": 50, "policy_rate": 3e-3, "critic_rate": 3e-3}
+
+
+@pytest.fixture(scope="module")
+def bandit():
+    """Arms from -0.5 to 0.5, of which the higher ones pay more; beyond, where nobody has been, all pay -1."""
+    action = np.random.default_rng(0).uniform(-0.5, 0.5, 500)
+    return arms(action, action)
+
+
+@pytest.mark.parametrize(
+    ("config", "stays"),
+    [
+        pytest.param(
+            CqlConfig(network=NETWORK, penalty=0.0, **FAST), False, id="sac", marks=pytest.mark.slow
+        ),
+        pytest.param(CqlConfig(network=NETWORK, penalty=1.0, **FAST), True, id="cql"),
+        pytest.param(IqlConfig(network=NETWORK, inverse_temperature=10.0, **FAST), True, id="iql"),
+        pytest.param(Td3BcConfig(network=NETWORK, q_weight=100.0, **FAST), False, id="td3"),
+        pytest.param(Td3BcConfig(network=NETWORK, q_weight=0.2, **FAST), True, id="td3_bc"),
+    ],
+)
+def test_arms_that_nobody_pulled(bandit, config, stays):
+    """Without a term that keeps them there, actions go where the critic makes up values."""
+    learner, state, _ = learned(config, bandit)
+    seen = {"pendulum": jnp.ones(3)}
+    action = learner.distribution(state.parameters, seen).mode()
+    believed = float(learner.q(state.rest["critic"], seen, action).min())
+    true = float(action[0]) if abs(float(action[0])) <= 0.5 else -1.0
+    assert (abs(float(action[0])) <= 0.55) == stays, float(action[0])
+    assert (believed - true > 0.5) == (not stays), (believed, true)
+    if stays:
+        assert float(action[0]) > 0.05, "better than what is done on average"
+
+
+def test_a_timeout_is_worth_what_follows():
+    """One state for ever, paid 1 a step: 1 / (1 - gamma) where episodes are cut off, 1 where they end."""
+    ones, number = jnp.ones((20, 10)), jnp.broadcast_to(jnp.arange(10), (20, 10))
+    never = jnp.zeros((20, 10), bool)
+    table = Table(jnp.ones((20, 10, 3)), jnp.zeros((20, 10, 1)), ones, never, number == 8, number < 9)
+    config = IqlConfig(network=NETWORK, gamma=0.8, tau=0.1, expectile=0.5, **FAST)
+    for data, worth in ((table, 5.0), (replace(table, terminated=table.usable), 1.0)):
+        _, _, logs = learned(config, data)
+        assert logs["loss/mean_value"] == pytest.approx(worth, rel=0.05)
+
+
+def test_weights_choose_what_is_learned_from(bandit):
+    """Only the arms around 0.3 have weight: for all that is learned, or for the policy alone."""
+    weights = np.zeros((500, 2))
+    weights[:, 0] = np.abs(np.asarray(bandit.action[:, 0, 0]) - 0.3) < 0.05
+    chosen = bandit.action[:, 0, 0][weights[:, 0] > 0]
+    config = IqlConfig(network=NETWORK, inverse_temperature=0.0, loss="mse", **FAST)
+    for weighted, mean in (("all", float(chosen.mean())), ("policy", 0.0)):
+        records = ExperienceConfig(weighted=weighted)
+        learner, state, logs = learned(replace(config, records=records), bandit, weights=weights)
+        action = float(learner.distribution(state.parameters, {"pendulum": jnp.ones(3)}).mode()[0])
+        assert action == pytest.approx(0.3, abs=0.05)
+        assert logs["loss/mean_q"] == pytest.approx(mean, abs=0.08)
+        assert logs["sampler/policy_effective"] == pytest.approx(len(chosen))
+        assert logs["sampler/critic_effective"] == pytest.approx(len(chosen) if weighted == "all" else 500)
+
+
+def test_what_cannot_be_learned_is_refused():
+    grid = replace(NETWORK, distribution="grid")
+    for config in (CqlConfig, Td3BcConfig, partial(IqlConfig, loss="mse")):
+        with pytest.raises(UsageError, match="a gradient through its actions"):
+            config(network=grid)
+    assert IqlConfig(network=grid).loss == "likelihood"
+    for config, words in (
+        (partial(IqlConfig, expectile=1.0), "an expectile of 1"),
+        (partial(IqlConfig, inverse_temperature=-1.0), "weights of IQL"),
+        (partial(CqlConfig, actions=0), "too small"),
+        (partial(CqlConfig, penalty=0.0, gap=1.0), "nothing for a multiplier"),
+        (partial(Td3BcConfig, delay=0), "a delay of 1"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            config()
+
+
+RESUMED = {
+    "td3_bc": replace(TD3_BC, updates=3, normalise=True),
+    "cql": replace(CQL, updates=3, gap=1.0, imitation=1.0),
+    "iql": replace(IQL, updates=3, records=ExperienceConfig(weighted="policy")),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "td3_bc" else pytest.param(name, marks=pytest.mark.slow) for name in RESUMED]
+)
+def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
+    """Stopped in the middle, with an odd number of updates behind it, and restored from disk."""
+    config, weights = RESUMED[name], np.random.default_rng(0).uniform(size=(500, 2))
+    learner = config.build(Told(), bandit, 4)
+    data = training_data(config, Told(), bandit, weights)
+    iterate, states = jax.jit(learner.iterate), [jax.jit(learner.init)(data, jax.random.key(5))]
+    for _ in range(4):
+        states.append(iterate(data, states[-1])[0])
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, states[1])
+    # Restored into shapes alone, and for the environment's bare data, as a fresh process does.
+    state = checkpoints.restore(jax.eval_shape(learner.init, bandit, jax.random.key(0)))
+    again = training_data(config, Told(), bandit, weights)
+    for _ in range(3):
+        state = iterate(again, state)[0]
+    one, other = ([_plain(leaf) for leaf in jax.tree.leaves(part)] for part in (state, states[-1]))
+    for mine, theirs in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    if name == "td3_bc":
+        # Six updates with a delay of two: the policy moved in three of them.
+        counts = {
+            int(leaf)
+            for leaf in jax.tree.leaves(states[2].optimiser)
+            if jnp.issubdtype(leaf.dtype, jnp.integer)
+        }
+        assert counts == {3, 6}
+
+
+def _plain(leaf):
+    key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if key else leaf)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RESUMED)
+def test_algorithms_keep_to_the_rules(name):
+    check_algorithm(RESUMED[name])
+
+
+@pytest.mark.slow
+def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
+    """Of one run: validation in closed loop beside the mean Q, and a policy that drives."""
+    network = {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]}
+    values = {
+        "task": {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 3}},
+        "algorithm": {"kind": "td3_bc", "network": network, "batch": 8, "updates": 2},
+        "total_steps": 64,
+        "evaluate_every": 2,
+    }
+    config = settings.load(TrainConfig, values)
+    run = train(config, WeightedSet(data, np.ones((3, 91))), tmp_path / "run", validation=data)
+    rows = [row for row in read_rows(run.metrics) if "validation/mean_q" in row]
+    assert len(rows) == 2 and all("validation/vmax_score" in row for row in rows)
+    assert rows[0]["sampler/policy_effective"] > 100
+    bank = ScenarioBank.from_scenarios(data)
+    planner, _ = load_policy(run.path, bank)
+    learner = config.algorithm.build(config.environment(), bank, config.iterations)
+    held_out = training_data(config.algorithm, config.environment(), bank)
+    state = Checkpoints(run.checkpoints).restore(jax.eval_shape(learner.init, bank, jax.random.key(0)))
+    assert rows[-1]["validation/mean_q"] == pytest.approx(learner.judge(held_out, state)["mean_q"], rel=1e-5)
+    assert isinstance(planner, Planner)

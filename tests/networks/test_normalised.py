@@ -1,0 +1,71 @@
+"""Statistics of features against NumPy, and what they make of observations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from drivax.networks.encoders import MlpConfig
+from drivax.networks.normalised import NormalisedConfig, feature_statistics, tell_statistics
+
+SPEC = {"ego": (3,), "agents": (4, 2), "agents_mask": (4,)}
+
+
+@pytest.fixture(scope="module")
+def groups():
+    rng = np.random.default_rng(0)
+    mask = rng.random((50, 4)) < 0.6
+    agents = rng.normal([100.0, -3.0], [0.5, 20.0], size=(50, 4, 2))
+    ego = rng.normal(size=(50, 3)) * [1.0, 5.0, 0.0]
+    return {
+        "ego": jnp.asarray(ego, jnp.float32),
+        "agents": jnp.asarray(np.where(mask[..., None], agents, 0.0), jnp.float32),
+        "agents_mask": jnp.asarray(mask),
+    }
+
+
+def test_statistics_are_of_the_rows_that_are_there(groups):
+    found = feature_statistics(groups)
+    assert set(found) == {"ego", "agents"}
+    rows = np.asarray(groups["agents"], np.float64)[np.asarray(groups["agents_mask"])]
+    np.testing.assert_allclose(found["agents"][0], rows.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(found["agents"][1], rows.std(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(found["ego"][1], np.asarray(groups["ego"], np.float64).std(axis=0), atol=1e-5)
+    # Another order of rows, and other numbers in masked ones, are the same rows.
+    order = np.random.default_rng(1).permuted(np.tile(np.arange(4), (50, 1)), axis=1)
+    filled = jnp.where(groups["agents_mask"][..., None], groups["agents"], jnp.nan)
+    other = {
+        "ego": groups["ego"],
+        "agents": jnp.take_along_axis(filled, jnp.asarray(order)[..., None], axis=1),
+        "agents_mask": jnp.take_along_axis(groups["agents_mask"], jnp.asarray(order), axis=1),
+    }
+    for one, again in zip(jax.tree.leaves(found), jax.tree.leaves(feature_statistics(other)), strict=True):
+        np.testing.assert_allclose(one, again, rtol=1e-4, atol=1e-6)
+    nobody = groups | {"agents_mask": jnp.zeros((50, 4), bool)}
+    np.testing.assert_array_equal(jnp.stack(feature_statistics(nobody)["agents"]), [[0, 0], [1, 1]])
+
+
+def test_what_encoders_see_has_no_mean_and_unit_deviation(groups):
+    made = NormalisedConfig(MlpConfig(rows=(8,), hidden=(8,))).build(SPEC, nnx.Rngs(0))
+    plain = made.encoder
+    # Without statistics it changes nothing but what is very far.
+    near = {**groups, "agents": groups["agents"] / 100, "ego": groups["ego"] / 10}
+    np.testing.assert_allclose(made(near), plain(near), rtol=1e-5)
+    tell_statistics(made, feature_statistics(groups))
+    rows = np.asarray(made._scaled("agents", groups["agents"]))[np.asarray(groups["agents_mask"])]
+    np.testing.assert_allclose(rows.mean(axis=0), 0.0, atol=1e-3)
+    np.testing.assert_allclose(rows.std(axis=0), 1.0, rtol=1e-3)
+    # A feature that is always the same stays finite, and one that is far off is clipped.
+    assert np.isfinite(made({**groups, "ego": groups["ego"].at[:, 2].set(7.0)})).all()
+    assert float(made._scaled("ego", jnp.array([1e6, 0.0, 0.0]))[0]) == 10.0
+
+
+def test_no_gradient_reaches_statistics(groups):
+    made = NormalisedConfig(MlpConfig(hidden=(8,))).build(SPEC, nnx.Rngs(0))
+    tell_statistics(made, feature_statistics(groups))
+    graph, parameters = nnx.split(made, nnx.Param)
+    slopes = jax.grad(lambda p: nnx.merge(graph, p)(groups).sum())(parameters)
+    for name in ("mean", "deviation"):
+        assert all((np.asarray(leaf) == 0.0).all() for leaf in jax.tree.leaves(slopes[name]))
+    assert any((np.asarray(leaf) != 0.0).any() for leaf in jax.tree.leaves(slopes["encoder"]))
