@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -61,3 +64,21 @@ def test_a_sampling_checkpoint_from_noisy_starts_over_an_old_run(data, tmp_path,
     assert not settings.load(EvaluationConfig, out / "config.yaml").sample
     np.testing.assert_array_equal(modes["ego"][:, 0], sampled["ego"][:, 0])
     assert (np.abs(modes["action"] - sampled["action"]).max(axis=(1, 2)) > 0.05).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("planner", ["idm", "pdm", "search", "random", "zoo:aggressive"])
+def test_the_number_of_threads_changes_no_bit(data, planner, tmp_path):
+    """XLA's pool has a thread per core unless NPROC says otherwise, which it reads once per process."""
+    found = []
+    for threads in ("1", "2", "8"):
+        out = tmp_path / threads
+        call = ["evaluate", "--planner", planner, "--data", str(data), "--out", str(out), "--traffic", "idm"]
+        subprocess.run(
+            [sys.executable, "-m", "drivax", *call],
+            env=os.environ | {"NPROC": threads},
+            check=True,
+            timeout=900,
+        )
+        found.append((out / "episodes.csv").read_bytes())
+    assert found[0] == found[1] == found[2]

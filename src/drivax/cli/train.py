@@ -6,13 +6,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from drivax import settings
+from drivax.curation.scores import read_scores
+from drivax.curation.weights import WeightConfig, weights_of
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
+from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.threads import widen_pool
 from drivax.scenario.store import ScenarioSet
@@ -20,13 +23,15 @@ from drivax.scenario.store import ScenarioSet
 
 @dataclass(frozen=True)
 class Train:
-    """Train a policy with reinforcement learning.
+    """Train a policy: online, by imitation, or offline from recorded steps.
 
     SIGTERM writes a checkpoint and ends the run; --resume goes on from there.
 
     CONFIG is a YAML file or the name of a preset; any of its settings can be given behind as --section.key VALUE.
 
     Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
+
+    Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
     """
 
     config: tyro.conf.Positional[str]
@@ -37,6 +42,10 @@ class Train:
     """Run folder to write."""
     validation: Path | None = None
     """Scenario set that chooses the best checkpoint."""
+    scores: Path | None = None
+    """Scores of DATA by drivax curate: bc and offline algorithms draw each recorded step by its weight."""
+    scale: Literal["step", "scenario"] = "step"
+    """Whether steps are weighted one by one, or as their scenarios are; with --scores."""
     seeds: int = 1
     """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
@@ -58,9 +67,10 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     if args.begin_from is not None:
         config = replace(config, begin_from=args.begin_from)
     validation = None if args.validation is None else ScenarioSet.open(args.validation)
+    data = ScenarioSet.open(args.data)
     folder = train(
         config,
-        ScenarioSet.open(args.data),
+        data if args.scores is None else _weighted(data, args.scores, args.scale),
         args.out,
         validation=validation,
         resume=args.resume,
@@ -70,3 +80,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     )
     print(f"wrote {folder.path}")
     return 0
+
+
+def _weighted(data: ScenarioSet, scores: Path, scale: Literal["step", "scenario"]) -> WeightedSet:
+    return WeightedSet(data, weights_of(read_scores(scores, data), WeightConfig(), scale))
