@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from drivax.errors import DataError, UsageError
+from drivax.learning.config import TrainConfig
 from drivax.learning.policies import PACKED, open_policy
 from drivax.learning.program import Program
 from drivax.tracking.checkpoints import Checkpoints, is_part
@@ -78,6 +79,17 @@ class Origin:
         cure = "begin from a run with the same network, observation and actions"
         found = checkpoints.restore_parts(templates, self.step, cure)
         return {path: found[source] for path, source in sources.items()}
+
+
+def with_step(config: TrainConfig) -> TrainConfig:
+    """The configuration with the step of the run that it begins from, so that whoever resumes finds the same one.
+
+    Raises:
+        UsageError, DataError: As :meth:`Origin.of`.
+    """
+    if config.begin_from is None:
+        return config
+    return replace(config, begin_from=str(Origin.of(config.begin_from)))
 
 
 def inherited(begin_from: str | None, program: Program, say: Callable[[str], None]) -> dict[str, Any]:

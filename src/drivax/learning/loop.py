@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from drivax.learning.agents import Agents
 from drivax.learning.algorithm import Judges, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
-from drivax.learning.first_state import Origin, first_state, inherited
+from drivax.learning.first_state import first_state, inherited, with_step
 from drivax.learning.folders import create_folders, facts, resumed_folders
 from drivax.learning.journal import Journal
 from drivax.learning.policy_traffic import find_traffic
@@ -70,13 +70,8 @@ def train(
         config, folders = resumed_folders(data, validation, weights, out, seeds)
     else:
         refuse_existing(out, overwrite, "training")
-        if config.begin_from is not None:
-            # Whoever resumes finds the same step.
-            config = replace(config, begin_from=str(Origin.of(config.begin_from)))
-    if config.patience and validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    if seeds < 1:
-        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+        config = with_step(config)
+    _refuse(config, validation, seeds)
     numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
     environment = config.environment()
     bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
@@ -85,9 +80,7 @@ def train(
     learner = config.algorithm.build(environment, bank, config.iterations)
     experience = training_data(config.algorithm, environment, bank, weights)
     program = Program(Agents(learner, numbers), experience, config.devices)
-    memory = program.account(None if held_out is None else held_out.bank)
-    memory.refuse_too_much()
-    say(memory.text())
+    _account(program, held_out, say)
     # Before any folder is made: they may not fit.
     networks = None if resume else inherited(config.begin_from, program, say)
     folders = folders or create_folders(
@@ -97,6 +90,20 @@ def train(
         journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
         _learn(_Run(config, program, journals, held_out, recorded, networks, say))
     return RunFolder.open(out)
+
+
+def _refuse(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:
+    """Refuses what cannot be meant, before the long work."""
+    if config.patience and validation is None:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    if seeds < 1:
+        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+
+
+def _account(program: Program, held_out: Validation | None, say: Callable[[str], None]) -> None:
+    memory = program.account(None if held_out is None else held_out.bank)
+    memory.refuse_too_much()
+    say(memory.text())
 
 
 @dataclass(frozen=True)
