@@ -14,7 +14,7 @@ from drivax.errors import DrivaxError
 
 #: More scenarios are never loaded at a time, however much memory there is: their bank is then some 6 GB.
 MOST = 10_000
-#: What a program is allowed per scenario that it drives: PDM-Closed takes 4.3 MB, IDM and policies 0.1 MB.
+#: What a program may take per scenario that it drives; PDM-Closed takes half (docs/log/2026-11-22-evaluation.md).
 _PROGRAM_BYTES = 8_000_000
 #: What a control group (of a container, a job) says: its limit, and what counts against it.
 _GROUP_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))

@@ -38,8 +38,8 @@ from drivax.simulator.traffic import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 
-#: Scenarios that a program drives side by side on a CPU, and on anything else. PDM-Closed takes 12 % longer for each of
-#: 16 than of 8, and 20 % less than of 64 (the caches); IDM 8 % longer than of 64.
+#: Scenarios that a program drives side by side on a CPU, where more leave the caches and fewer cost overhead
+#: (docs/log/2026-11-22-evaluation.md), and on anything else.
 LANES, LANES_ELSEWHERE = 16, 256
 #: No more scenarios than these are named in an error.
 _TOLD = 5
