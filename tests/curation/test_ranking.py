@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from drivax.curation.ranking import auc_interval, precision_at_base_rate, roc_auc
+from drivax.curation.ranking import auc_interval, precision_at_base_rate, rank_correlation, roc_auc
 from drivax.errors import UsageError
 
 RNG = np.random.default_rng(5)
@@ -68,3 +69,10 @@ def test_what_cannot_be_meant():
             measure(SCORES, np.zeros(150, bool))
     with pytest.raises(UsageError, match="two of either kind"):
         auc_interval(SCORES, np.arange(150) == 0)
+
+
+def test_rank_correlation_is_scipys():
+    rng = np.random.default_rng(0)
+    one, other = rng.integers(0, 20, 200).astype(float), rng.normal(size=200)
+    other += 0.1 * one
+    assert rank_correlation(one, other) == pytest.approx(stats.spearmanr(one, other).statistic)

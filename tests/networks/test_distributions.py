@@ -12,6 +12,7 @@ from drivax.networks.distributions import (
     Beta,
     Distribution,
     Grid,
+    Mixture,
     SquashedGaussian,
     distribution,
     first_parameters,
@@ -23,7 +24,13 @@ LEVELS = ((-1.0, -0.25, 0.0, 0.25, 1.0), (-0.5, 0.0, 0.5))
 GAUSSIAN = SquashedGaussian(jnp.array([0.3, -1.0]), jnp.array([0.2, 1.4]))
 BETA = Beta(jnp.array([1.0, 7.5]), jnp.array([3.0, 2.0]))
 GRID = Grid(jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32), LEVELS)
-ALL = {"gaussian": GAUSSIAN, "beta": BETA, "grid": GRID}
+MIXTURE = Mixture(
+    jnp.array([0.5, -0.3, 0.1]),
+    SquashedGaussian(
+        jnp.array([[0.3, -1.0], [-0.8, 0.2], [0.0, 1.5]]), jnp.array([[0.2, 1.4], [0.5, 0.3], [0.1, 0.8]])
+    ),
+)
+ALL = {"gaussian": GAUSSIAN, "beta": BETA, "grid": GRID, "mixture": MIXTURE}
 
 
 def draws(one, count=20_000):
@@ -108,6 +115,20 @@ def test_grid_against_scipy():
     assert stats.chisquare(counts, np.exp(wanted) * counts.sum()).pvalue > 1e-3
 
 
+def test_mixture_against_scipy():
+    action = np.array([[0.7, -0.9], [-0.3, 0.2]])
+    shares = special.softmax(np.asarray(MIXTURE.logits, float))
+    parts = [
+        gaussian_density(action, np.asarray(loc, float), np.asarray(scale, float)).prod(axis=-1)
+        for loc, scale in zip(MIXTURE.parts.loc, MIXTURE.parts.scale, strict=True)
+    ]
+    choice = MIXTURE.choice_of(jnp.asarray(action))
+    np.testing.assert_allclose(
+        jax.vmap(MIXTURE.log_prob)(choice), np.log(shares @ np.array(parts)), rtol=1e-4
+    )
+    np.testing.assert_allclose(MIXTURE.mode(), np.tanh([0.3, -1.0]), rtol=1e-5)
+
+
 @pytest.mark.parametrize("kind", ALL)
 def test_samples_agree_with_what_a_distribution_says_of_itself(kind):
     one = ALL[kind]
@@ -150,7 +171,7 @@ def test_samples_are_differentiable_in_the_parameters(kind):
     np.testing.assert_allclose(found, wanted, atol=0.01)
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "beta", "grid"])
+@pytest.mark.parametrize("kind", ALL)
 def test_policy_gradients_are_finite_at_saturation(kind):
     actions = Actions(2, LEVELS)
     count = parameters_of(kind, actions)
@@ -160,7 +181,7 @@ def test_policy_gradients_are_finite_at_saturation(kind):
     def of(raw, key):
         one = distribution(kind, raw[:, None].repeat(3, 1), actions)
         choice = one.choice_of(jnp.broadcast_to(bounds, (3, 3, 2)))
-        far = choice + (9.0 if kind == "gaussian" else 0.0)
+        far = choice + (9.0 if kind in ("gaussian", "mixture") else 0.0)
         mine = one.sample(key)
         surrogate = one.log_prob(choice) + one.log_prob(far) + one.log_prob(mine) + one.entropy_estimate(key)
         return jnp.sum(surrogate) + jnp.sum(one.mean_action() + one.mode() + one.action(mine))
@@ -180,7 +201,10 @@ def test_first_parameters_are_around_zero_with_the_asked_spread():
     np.testing.assert_allclose(
         jax.nn.softmax(grid.logits), np.outer(*(w / w.sum() for w in weights)).ravel(), atol=1e-6
     )
-    for one in (gaussian, beta, grid):
+    mixture = distribution("mixture", jnp.asarray(first_parameters("mixture", actions, 0.3)), actions)
+    np.testing.assert_allclose(mixture.parts.scale, 0.3, rtol=1e-5)
+    assert parameters_of("mixture", actions) == len(first_parameters("mixture", actions, 0.3))
+    for one in (gaussian, beta, grid, mixture):
         np.testing.assert_allclose(one.mean_action(), 0.0, atol=1e-6)
         np.testing.assert_allclose(one.mode(), 0.0, atol=1e-6)
 

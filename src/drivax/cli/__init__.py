@@ -44,7 +44,9 @@ COMMANDS = {
     "export": Command("drivax.cli.export", "Export", "part of a scenario set, or another format, from a set"),
     "inspect": Command("drivax.cli.inspect", "Inspect", "what a scenario set holds, and whether it is sound"),
     "view": Command("drivax.cli.view", "View", "one HTML page in which a scenario set can be browsed"),
-    "curate": Command("drivax.cli.curate", "Curate", "how critical each scenario is: scores for a set"),
+    "curate": Command(
+        "drivax.cli.curate", "Curate", "how critical each scenario is: scores for a set", overrides=True
+    ),
     "train": Command(
         "drivax.cli.train", "Train", "train a planner from a configuration file", overrides=True
     ),
@@ -53,6 +55,9 @@ COMMANDS = {
     ),
     "compare": Command(
         "drivax.cli.compare", "Compare", "is one planner better than another? a tested answer"
+    ),
+    "study": Command(
+        "drivax.cli.study", "Study", "a whole experiment with controls and verdicts", overrides=True
     ),
     "report": Command("drivax.cli.report", "Report", "one HTML page with tables and pictures from runs"),
     "bench": Command(

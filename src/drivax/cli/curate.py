@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from drivax.errors import UsageError
 
 if TYPE_CHECKING:
     from drivax.curation.scores import ScoreTable
@@ -20,17 +23,22 @@ class Curate:
 
     published: the published heuristic, faults included, to compare with.
 
+    ensemble: how much cloned drivers that have seen different recordings disagree; trains them first.
+
     action_rarity: how seldom the recorded driver does what it does (action_rarity_published: by the published bins).
 
     uniform, random_matched, oracle: all alike; the scores of --like, dealt out by lot; the built-in world's labels.
 
     Example: drivax curate kinematic --data sets/world --out scores.npz --export sets/critical 500
+
+    Example: drivax curate ensemble --data sets/world --out scores.npz --cloning.loss likelihood
     """
 
     method: Annotated[
         Literal[
             "kinematic",
             "published",
+            "ensemble",
             "action_rarity",
             "action_rarity_published",
             "uniform",
@@ -51,24 +59,40 @@ class Curate:
     """Table of the same set whose scores random_matched deals out."""
     seed: int = 0
     """What random_matched deals by."""
+    config: Path | None = None
+    """YAML file with settings of an ensemble; any of them can be given behind as --section.key VALUE."""
     overwrite: bool = False
     """Replace OUT if it is a file, and TOP if it is a scenario set."""
 
 
-def run(args: Curate) -> int:
+def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and say how scores and weights lie."""
+    from drivax import settings
     from drivax.curation.methods import Wanted, curate
     from drivax.curation.scores import refuse_existing, write_scores
+    from drivax.curation.scouts import ScoutsConfig
     from drivax.curation.subset import check_top, write_top
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 
+    if args.method != "ensemble" and (overrides or args.config is not None):
+        raise UsageError(
+            f"{args.method} has no settings here", cure="leave out " + " ".join(overrides or ["--config"])
+        )
+    scouts = settings.load(ScoutsConfig, args.config or {}, overrides)
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
         check_top(data, *args.export, overwrite=args.overwrite)
     with Progress("scoring", "scenarios", len(data)) as bar:
-        wanted = Wanted(data, args.like, args.seed, lambda done, total: bar.update(done))
+        wanted = Wanted(
+            data,
+            args.like,
+            args.seed,
+            scouts,
+            progress=lambda done, _: bar.update(done),
+            training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
+        )
         table = curate(args.method, wanted)
     write_scores(table, args.out, args.overwrite)
     _tell(table, args.out)
@@ -88,6 +112,10 @@ def _tell(table: ScoreTable, out: Path) -> None:
     low, middle, high, most = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
     first = table.scenario_ids[int(table.scenarios.argmax())]
     print(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
+    if "error_rank_correlation" in table.config:
+        print(
+            f"  scores of steps and errors of the scouts: rank correlation {table.config['error_rank_correlation']:.2f}"
+        )
     print(f"  scores: 5 % {low:.3f}, median {middle:.3f}, 95 % {high:.3f}, largest {most:.3f} ({first})")
     for scale in ("step", "scenario"):
         drawn = draws_of(weights_of(table, WeightConfig(), scale), table.drawn)

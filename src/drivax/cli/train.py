@@ -11,7 +11,9 @@ from typing import Annotated, Literal
 import tyro
 
 from drivax import settings
-from drivax.curation.scores import read_scores
+from drivax.curation.agents import AGENTS, weighted
+from drivax.curation.methods import Wanted, curate
+from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, weights_of
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
@@ -31,6 +33,8 @@ class Train:
 
     Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
 
+    Example: drivax train offline/cql --data sets/train --agent heuristic --out runs/cql-heuristic
+
     Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
     """
 
@@ -46,6 +50,14 @@ class Train:
     """Scores of DATA by drivax curate: bc and offline algorithms draw each recorded step by its weight."""
     scale: Literal["step", "scenario"] = "step"
     """Whether steps are weighted one by one, or as their scenarios are; with --scores."""
+    agent: (
+        Literal[
+            "bc", "baseline", "cql_bc", "heuristic", "heuristic_scenario", "ensemble", "ensemble_scenario",
+            "action_rarity", "action_rarity_scenario", "random_matched", "random_matched_scenario", "oracle",
+        ]
+        | None
+    ) = None  # fmt: skip
+    """Curation of the agent of that name in the long-tail study: scores DATA first, or takes --scores."""
     seeds: int = 1
     """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
@@ -67,10 +79,9 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     if args.begin_from is not None:
         config = replace(config, begin_from=args.begin_from)
     validation = None if args.validation is None else ScenarioSet.open(args.validation)
-    data = ScenarioSet.open(args.data)
     folder = train(
         config,
-        data if args.scores is None else _weighted(data, args.scores, args.scale),
+        _data(args, config),
         args.out,
         validation=validation,
         resume=args.resume,
@@ -82,5 +93,21 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
     return 0
 
 
-def _weighted(data: ScenarioSet, scores: Path, scale: Literal["step", "scenario"]) -> WeightedSet:
-    return WeightedSet(data, weights_of(read_scores(scores, data), WeightConfig(), scale))
+def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
+    """The set, with weights if scores or an agent are asked for."""
+    data = ScenarioSet.open(args.data)
+    if args.agent is None:
+        if args.scores is None:
+            return data
+        return WeightedSet(data, weights_of(read_scores(args.scores, data), WeightConfig(), args.scale))
+    agent, scores = AGENTS[args.agent], args.scores
+    own, wanted = (
+        settings.kind_of(type(one.algorithm)) for one in (config, settings.load(TrainConfig, agent.preset))
+    )
+    if own != wanted:
+        raise UsageError(f"the agent {args.agent} is trained by {wanted}", cure=f"use {agent.preset}")
+
+    def table(method: str) -> ScoreTable:
+        return curate(method, Wanted(data)) if scores is None else read_scores(scores, data)
+
+    return weighted(agent, data, table, WeightConfig(), seed=config.seed)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,12 +15,15 @@ from drivax.curation.combining import Combination
 from drivax.curation.controls import event_steps, matched
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.published import PublishedConfig
+from drivax.curation.ranking import rank_correlation
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.scoring import Progress, score_steps, valid_steps
+from drivax.curation.scouts import Scouts, ScoutsConfig, train_scouts
 from drivax.errors import UsageError
 from drivax.named import nearest
 from drivax.scenario.store import ScenarioSet
+from drivax.settings import plain
 
 #: The kinematic heuristic. A scenario is as critical as its most critical second. Weights and the second were chosen on
 #: the validation set of the built-in world's benchmark (docs/results/curation.md).
@@ -39,6 +43,10 @@ PUBLISHED = Combination(
 )
 #: Rarity: a scenario is as rare as its rarest steps, of which the few very rarest may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
+#: A scenario is as uncertain as its most uncertain second.
+ENSEMBLE_SCENARIO = "top10"
+#: Disagreement above this percentile of a set scores 1.
+_MOST = 99.0
 _ALL = Combination({"all": 1.0})
 
 
@@ -50,13 +58,17 @@ class Wanted:
         data: The set.
         like: Table to match (``random_matched`` only).
         seed: Of what is drawn by lot.
+        scouts: The ensemble (``ensemble`` only).
         progress: Called with (scenarios done, scenarios).
+        training: Called with (iterations done, iterations) while scouts are trained.
     """
 
     data: ScenarioSet
     like: Path | None = None
     seed: int = 0
+    scouts: ScoutsConfig = field(default_factory=ScoutsConfig)
     progress: Progress | None = None
+    training: Progress | None = None
 
 
 #: A method: from what is asked to the table.
@@ -99,6 +111,39 @@ def _rarity(name: str, config: KernelRarity | PublishedRarity) -> Method:
         return table_of(name, {**asdict(config), **asdict(expert)}, wanted.data, components, RARITY)
 
     return score
+
+
+def _ensemble(wanted: Wanted) -> ScoreTable:
+    return ensemble_table(
+        train_scouts(wanted.scouts, wanted.data, wanted.training), wanted.data, wanted.progress
+    )
+
+
+def ensemble_table(scouts: Scouts, data: ScenarioSet, progress: Progress | None = None) -> ScoreTable:
+    """Scores by the disagreement of an ensemble, which may have been trained on another set.
+
+    Components are the disagreement about each number of the action, over the percentile 99 of their sum in the set; of
+    scouts trained by likelihood there is one, the mutual information over its largest possible value. The table's
+    configuration says how scores and errors of the scouts correlate by rank, over all steps: on the set that they were
+    trained on, errors of the one that has not seen the scenario.
+    """
+    opinions = scouts.opinions(data, progress)
+    valid = valid_steps(data)
+    if opinions.information is None:
+        disagreement = opinions.disagreement(scouts.deviation)
+        largest = np.percentile(disagreement.sum(axis=-1)[valid], _MOST)
+        parts = np.clip(disagreement / max(largest, np.finfo(np.float64).tiny), 0.0, 1.0)
+        components = {f"action_{number}": part for number, part in enumerate(np.moveaxis(parts, -1, 0))}
+    else:
+        components = {"information": opinions.information / math.log(scouts.config.folds)}
+    combination = Combination(dict.fromkeys(components, 1.0), ENSEMBLE_SCENARIO)
+    own = data.hash == scouts.set_hash
+    error = opinions.error(scouts.deviation, scouts.fold if own else None)
+    about = {**plain(scouts.config), "trained_on": scouts.set_hash, "error_rank_correlation": None}
+    table = table_of("ensemble", about, data, components, combination)
+    known = opinions.known
+    about["error_rank_correlation"] = rank_correlation(table.steps[known], error[known])
+    return replace(table, config=about | {"combination": asdict(combination)})
 
 
 def _uniform(wanted: Wanted) -> ScoreTable:
@@ -148,6 +193,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "kinematic": _heuristic("kinematic", KinematicConfig(), KINEMATIC),
         "published": _heuristic("published", PublishedConfig(), PUBLISHED),
         "action_rarity": _rarity("action_rarity", KernelRarity()),
+        "ensemble": _ensemble,
         "action_rarity_published": _rarity("action_rarity_published", PublishedRarity()),
         "uniform": _uniform,
         "random_matched": _random_matched,

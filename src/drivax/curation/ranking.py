@@ -73,6 +73,12 @@ def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | N
     return float(np.sum(found * taken) / wanted)
 
 
+def rank_correlation(one: Numbers, other: Numbers) -> float:
+    """The correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN where one of them is constant."""
+    with np.errstate(invalid="ignore"):
+        return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
+
+
 def _check(labels: Labels) -> None:
     if labels.all() or not labels.any():
         raise UsageError("there is nothing to find, or nothing else", cure="use a set that has both")

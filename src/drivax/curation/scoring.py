@@ -35,6 +35,13 @@ def score_steps(data: ScenarioSet, of: Any, progress: Progress | None = None) ->
     Raises:
         DataError: A scenario has no future.
     """
+    return each_batch(data, lambda bank: of_logs(of, bank), progress)
+
+
+def each_batch(
+    data: ScenarioSet, of: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
+) -> dict[str, Array]:
+    """What a function says of banks of some scenarios of a set each, all of one shape: by name ``[N, ...]``."""
     sizes = Sizes.used(data)
     parts: list[dict[str, Any]] = []
     for first in range(0, len(data), BATCH):
@@ -42,7 +49,7 @@ def score_steps(data: ScenarioSet, of: Any, progress: Progress | None = None) ->
         count = len(scenarios)
         if len(data) > BATCH:
             scenarios += [scenarios[-1]] * (BATCH - count)
-        found = of_logs(of, ScenarioBank.from_scenarios(scenarios, trim=sizes))
+        found = of(ScenarioBank.from_scenarios(scenarios, trim=sizes))
         # A batch is scored while the next one is stacked; no more than one waits.
         jax.block_until_ready(parts[-1:])
         parts.append({name: part[:count] for name, part in found.items()})

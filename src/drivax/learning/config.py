@@ -55,6 +55,7 @@ class TrainConfig:
             rest of the state is fresh, and every other setting free as long as the networks fit.
         evaluate_every: Iterations between validations (with ``--validation``); 0: only at the end.
         checkpoint_every: Iterations between checkpoints; there is always one at the end.
+        keep: How many of the newest checkpoints stay, beside the best one.
         checkpoint_rule: What makes one checkpoint better than another in validation: the ``score``, or
             ``lexicographic``: fewest failures, then progress, then comfort; ``fitted_q``, for offline algorithms that
             have updates of it: what it expects of the policy on held-out steps.
@@ -74,6 +75,7 @@ class TrainConfig:
     begin_from: str | None = None
     evaluate_every: int = 0
     checkpoint_every: int = 20
+    keep: int = 2
     checkpoint_rule: Rule = "score"
     patience: int = 0
     devices: int | None = None
@@ -81,9 +83,9 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if isinstance(self.task.actions, DirectState):
             raise UsageError("policies cannot learn in direct_state", cure="choose a space in [-1, 1]")
-        if self.evaluate_every < 0 or self.checkpoint_every < 1 or self.patience < 0:
+        if self.evaluate_every < 0 or min(self.checkpoint_every, self.keep) < 1 or self.patience < 0:
             raise UsageError(
-                "evaluate_every and patience are at least 0, checkpoint_every is at least 1",
+                "evaluate_every and patience are at least 0, checkpoint_every and keep at least 1",
                 cure="use patience 0 to go on to the end",
             )
         if self.patience and not self.evaluate_every:

@@ -59,7 +59,7 @@ class CqlConfig(OfflineConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.refuse_grid()
+        self.refuse_choices()
         if self.actions < 1 or min(self.temperature, self.penalty_temperature) <= 0.0:
             raise UsageError("actions or a temperature of CQL is too small", cure="use more than 0")
         if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):

@@ -184,7 +184,7 @@ class Driving:
 
     def _moment(self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]) -> Scene:
         """A logged moment as if the expert had driven there."""
-        scene, before = (self._logged.scene(bank, index, at) for at in (step, step - 1))
+        scene, before = (self._logged.scene(bank, index, at) for at in (step, jnp.maximum(step - 1, 0)))
         return replace(scene, action=self._did(bank, before)[0])
 
     def _did(self, bank: ScenarioBank, scene: Scene) -> tuple[Float[Array, " D"], Bool[Array, ""]]:

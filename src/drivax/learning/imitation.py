@@ -19,7 +19,7 @@ from drivax.learning.experience import Experience, ExperienceConfig, moments, re
 from drivax.learning.optimisers import clipped_adam
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy
-from drivax.networks.distributions import Actions, Distribution
+from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.planners.network import NetworkPlanner
 from drivax.scenario.record import record
 
@@ -217,7 +217,10 @@ def refuse_flat(cloning: Cloning, network: NetworkConfig) -> None:
     """Refuses a loss without a gradient.
 
     Raises:
-        UsageError: The mode of a grid is a choice among levels, which no squared error moves.
+        UsageError: The mode is a choice among levels or parts, which no squared error moves.
     """
-    if cloning.loss == "mse" and network.distribution == "grid":
-        raise UsageError("a grid's mode has no gradient for the loss 'mse'", cure="use loss: likelihood")
+    if cloning.loss == "mse" and network.distribution not in REPARAMETRISED:
+        raise UsageError(
+            f"the mode of {network.distribution!r} has no gradient for the loss 'mse'",
+            cure="use loss: likelihood",
+        )

@@ -46,7 +46,7 @@ class IqlConfig(OfflineConfig):
         if self.inverse_temperature < 0.0 or self.largest_weight <= 0.0:
             raise UsageError("weights of IQL that cannot be", cure="use 0 or more, and a cut above 0")
         if self.loss == "mse":
-            self.refuse_grid()
+            self.refuse_choices()
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Iql:
         """IQL in an environment."""

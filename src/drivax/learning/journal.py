@@ -25,7 +25,7 @@ class Journal:
     def __init__(self, folder: RunFolder, config: TrainConfig) -> None:
         self.folder = folder
         self.config = config
-        self.checkpoints = Checkpoints(folder.checkpoints)
+        self.checkpoints = Checkpoints(folder.checkpoints, config.keep)
         self._ranks: list[tuple[float, ...]] = []
         self._log: MetricLog | None = None
         newest = self.newest

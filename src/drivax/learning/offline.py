@@ -22,7 +22,7 @@ from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Transitions
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
-from drivax.networks.distributions import Actions, Distribution
+from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.networks.normalised import (
     NormalisedConfig,
     Statistics,
@@ -88,16 +88,16 @@ class OfflineConfig:
             replace(network, encoder=NormalisedConfig(encoder=network.encoder)) if self.normalise else network
         )
 
-    def refuse_grid(self) -> None:
+    def refuse_choices(self) -> None:
         """Refuses a policy whose actions have no gradient.
 
         Raises:
-            UsageError: The policy chooses among levels.
+            UsageError: The policy chooses among levels or parts.
         """
-        if self.network.distribution == "grid":
+        if self.network.distribution not in REPARAMETRISED:
             raise UsageError(
                 f"{type(self).__name__} needs a policy with a gradient through its actions",
-                cure="use gaussian or beta; iql and bc learn a grid",
+                cure="use gaussian or beta; iql and bc learn all",
             )
 
 

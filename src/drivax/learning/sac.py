@@ -22,7 +22,7 @@ from drivax.learning.environment import Environment, Environments
 from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Replay, ReplayConfig, Transitions
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
-from drivax.networks.distributions import Actions, Distribution
+from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
 from drivax.planners.network import NetworkPlanner
 from drivax.rl.temporal_difference import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
 from drivax.scenario.record import record
@@ -80,7 +80,7 @@ class SacConfig:
                 "there is no step with a successor before the first update",
                 cure=f"set warm_up to {2 * self.environments} or more",
             )
-        if self.network.distribution == "grid":
+        if self.network.distribution not in REPARAMETRISED:
             raise UsageError(
                 "SAC needs a policy with a gradient through its samples", cure="gaussian or beta"
             )

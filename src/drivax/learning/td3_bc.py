@@ -38,7 +38,7 @@ class Td3BcConfig(OfflineConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.refuse_grid()
+        self.refuse_choices()
         if min(self.q_weight, self.noise, self.noise_bound) < 0.0 or self.delay < 1:
             raise UsageError(
                 "settings of TD3+BC that cannot be", cure="use 0 or more, and a delay of 1 or more"

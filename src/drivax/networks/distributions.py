@@ -1,9 +1,9 @@
 """Action distributions.
 
-A *choice* is what a policy draws and what is stored; its *action* is what it means, in [-1, 1]. The Gaussian's choice
-is the unsquashed sample, so that a saturated action keeps a finite log-probability; the Beta's lies in (0, 1); the
-grid's is the number of a combination of levels. Log-densities are those of the action, so that entropies of the
-Gaussian and the Beta can be compared.
+A *choice* is what a policy draws and what is stored; its *action* is what it means, in [-1, 1]. The choice of a
+Gaussian, or of a mixture of them, is the unsquashed sample, so that a saturated action keeps a finite log-probability;
+the Beta's lies in (0, 1); the grid's is the number of a combination of levels. Log-densities are those of the action,
+so that entropies can be compared, but for the grid's.
 """
 
 from __future__ import annotations
@@ -16,18 +16,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betaln, digamma
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
 from drivax.scenario.record import record, static
 
-DistributionName = Literal["gaussian", "beta", "grid"]
+DistributionName = Literal["gaussian", "beta", "grid", "mixture"]
+#: Those whose samples have a gradient in all of their parameters.
+REPARAMETRISED: tuple[DistributionName, ...] = ("gaussian", "beta")
 
 _MIN_SCALE, _MAX_SCALE = 1e-3, 2.0
 #: Actions so near to the bounds stand for all beyond when a Gaussian's choice is asked for: arctanh has poles there.
 _SQUASHED = 0.999
 #: How near a Beta's choice comes to 0 and 1, where the log-density has poles.
 _EDGE = 1e-6
+#: Gaussians in a mixture.
+_PARTS = 3
 #: Nodes of the Gauss-Hermite rule; the mean of tanh is within 1e-3 for every scale up to 2.
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(24)
 
@@ -54,7 +58,7 @@ class Distribution(Protocol):
     """A distribution over actions, or a batch of them; a pytree."""
 
     def sample(self, key: Array) -> Float[Array, "*batch choice"]:
-        """A choice at random, differentiable in the parameters where choices are continuous."""
+        """A choice at random, differentiable in all parameters if :data:`REPARAMETRISED`."""
         ...
 
     def log_prob(self, choice: Float[Array, "*batch choice"]) -> Float[Array, "*batch"]:
@@ -235,6 +239,63 @@ class Grid:
         return jnp.asarray(combinations(self.levels))
 
 
+@record
+class Mixture:
+    """``tanh`` of one of several diagonal Gaussians (mixture density network; Bishop 1994): it can have several modes.
+
+    Its samples have no gradient in the shares of the parts.
+
+    Attributes:
+        logits: Of each part's share.
+        parts: The Gaussians, side by side.
+    """
+
+    logits: Float[Array, "*batch part"]
+    parts: SquashedGaussian
+
+    @classmethod
+    def from_parameters(cls, parameters: Float[Array, "*batch parameters"]) -> Mixture:
+        """From a head's output: logits, then each part as :meth:`SquashedGaussian.from_parameters` reads it."""
+        logits, rest = jnp.split(parameters, [_PARTS], axis=-1)
+        return cls(logits, SquashedGaussian.from_parameters(rest.reshape(*rest.shape[:-1], _PARTS, -1)))
+
+    def sample(self, key: Array) -> Float[Array, "*batch action"]:
+        """A sample of one of the parts, before squashing."""
+        which_key, noise_key = jax.random.split(key)
+        which = jax.random.categorical(which_key, self.logits)
+        return _part(self.parts.sample(noise_key), which)
+
+    def log_prob(self, choice: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+        """Log of the weighted sum of the parts' densities."""
+        shares, one = jax.nn.log_softmax(self.logits), choice[..., None, :]
+        each = jnp.broadcast_to(one, jnp.broadcast_shapes(one.shape, self.parts.loc.shape))
+        return jax.nn.logsumexp(shares + self.parts.log_prob(each), axis=-1)
+
+    def action(self, choice: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
+        """The squashed choice."""
+        return jnp.tanh(choice)
+
+    def choice_of(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
+        """As of the Gaussian."""
+        return jnp.arctanh(jnp.clip(action, -_SQUASHED, _SQUASHED))
+
+    def mode(self) -> Float[Array, "*batch action"]:
+        """The squashed mean of the part with the largest share."""
+        return _part(self.parts.mode(), jnp.argmax(self.logits, axis=-1))
+
+    def mean_action(self) -> Float[Array, "*batch action"]:
+        """The mean of the parts' means; within 1e-3."""
+        return jnp.sum(jax.nn.softmax(self.logits)[..., None] * self.parts.mean_action(), axis=-2)
+
+    def entropy_estimate(self, key: Array) -> Float[Array, "*batch"]:
+        """Minus the log-density of one sample: the entropy has no closed form."""
+        return -self.log_prob(self.sample(key))
+
+
+def _part(values: Float[Array, "*batch part action"], which: Int[Array, "*batch"]) -> Array:
+    return jnp.take_along_axis(values, which[..., None, None], axis=-2)[..., 0, :]
+
+
 def combinations(levels: tuple[tuple[float, ...], ...]) -> Float[np.ndarray, "combination action"]:
     """Every combination of levels, the last axis counting fastest."""
     axes = np.meshgrid(*(np.asarray(axis, np.float32) for axis in levels), indexing="ij")
@@ -247,7 +308,9 @@ def parameters_of(kind: DistributionName, actions: Actions) -> int:
     Raises:
         UsageError: If a grid is asked for where actions have no levels.
     """
-    return len(combinations(_levels(actions))) if kind == "grid" else 2 * actions.size
+    if kind == "grid":
+        return len(combinations(_levels(actions)))
+    return _PARTS * (1 + 2 * actions.size) if kind == "mixture" else 2 * actions.size
 
 
 def first_parameters(
@@ -259,16 +322,21 @@ def first_parameters(
         kind: Which.
         actions: What it is over.
         scale: Of the unsquashed Gaussian; of the Beta's action; on the grid, of the Gaussian whose density gives the
-            levels their probabilities.
+            levels their probabilities; of each part of a mixture, whose means begin up to so far from zero.
 
     Raises:
         UsageError: If a Beta cannot be so wide.
     """
     if kind == "grid":
         return (-0.5 * (combinations(_levels(actions)) / scale) ** 2).sum(axis=-1)
+    spread = math.log(math.expm1(scale))
     if kind == "gaussian":
-        spread = math.log(math.expm1(scale))
         return np.repeat(np.array([0.0, spread], np.float32), actions.size)
+    if kind == "mixture":
+        # Parts that begin alike would stay alike; the one around zero begins as the largest.
+        means = np.linspace(-scale, scale, _PARTS)
+        parts = [np.repeat([mean, spread], actions.size) for mean in means]
+        return np.concatenate([(means == 0.0).astype(float), *parts]).astype(np.float32)
     # A symmetric Beta's action has the variance 1 / (2 alpha + 1).
     above = (scale**-2 - 1.0) / 2.0 - 1.0
     if above <= 0.0:
@@ -283,7 +351,8 @@ def distribution(
     """The distribution that a head's output means."""
     if kind == "grid":
         return Grid(parameters, _levels(actions))
-    return (SquashedGaussian if kind == "gaussian" else Beta).from_parameters(parameters)
+    made = {"gaussian": SquashedGaussian, "beta": Beta, "mixture": Mixture}[kind]
+    return made.from_parameters(parameters)
 
 
 def _levels(actions: Actions) -> tuple[tuple[float, ...], ...]:

@@ -1,0 +1,262 @@
+"""Scouts: an ensemble of cloned drivers that have seen different recordings. Where they disagree, data are scarce.
+
+Each scout leaves one fold of the recordings out; all are trained side by side in one program, and differ in their first
+parameters, too. Deep ensembles: Lakshminarayanan et al. 2017, arXiv 1612.01474.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.curation.rarity import KernelRarity, rarity_steps
+from drivax.curation.scoring import Progress, each_batch
+from drivax.errors import UsageError
+from drivax.evaluation.clusters import recordings
+from drivax.learning.driving import Driving
+from drivax.learning.experience import Experience, ExperienceConfig, recorded
+from drivax.learning.imitation import Bc, BcConfig
+from drivax.learning.sampler import Sampler, sampler
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.distributions import Distribution
+from drivax.networks.entity import EntityConfig
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.features import Features
+from drivax.tasks.observations import PRESETS
+from drivax.tasks.task import Task
+
+#: Logs whose steps are observed at once.
+_AT_ONCE = 8
+#: Actions that are drawn from every scout to measure how much their distributions differ.
+_DRAWN = 16
+
+#: Nothing that a driver could copy instead of looking: no past steps, no last action.
+_SEEN = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
+
+Numbers = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class ScoutsConfig:
+    """An ensemble of scouts.
+
+    Attributes:
+        folds: How many scouts; each leaves out every so manieth recording, chosen by lot.
+        cloning: How each is trained. With ``loss: mse`` scouts disagree by the variance of what they would do; with
+            ``likelihood`` by how much their distributions differ, so that ``network.distribution: mixture`` can
+            disagree about modes.
+        total_steps: Recorded steps that each learns from, rounded up to whole iterations of ``cloning``.
+        weighted: ``plain``: all steps alike; ``rarity``: drawn by inverse density of the expert's action, clipped
+            (:class:`~drivax.curation.rarity.KernelRarity` with its exponent at 1).
+        task: What scouts see, and what actions are.
+        seed: Of folds, networks and draws.
+    """
+
+    folds: int = 5
+    cloning: BcConfig = field(
+        default_factory=lambda: BcConfig(
+            batch=128, network=NetworkConfig(encoder=EntityConfig(), activation="relu")
+        )
+    )
+    total_steps: int = 384_000
+    weighted: Literal["plain", "rarity"] = "plain"
+    task: Task = field(default_factory=lambda: Task(observation=_SEEN, metrics="none"))
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.folds < 2:
+            raise UsageError(
+                f"{self.folds} folds", cure="use 2 or more: one scout has nobody to disagree with"
+            )
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the training."""
+        return -(-self.total_steps // self.cloning.steps_per_iteration)
+
+
+@dataclass(frozen=True)
+class Opinions:
+    """What scouts make of every step of a set.
+
+    Attributes:
+        action: What each would do, by the mode, in units of the action space.
+        expert: What the expert did.
+        known: Where what the expert did is known, and an action does it.
+        information: Mutual information of action and scout, nats, if they were trained by likelihood.
+    """
+
+    action: Float[Numbers, "N T K D"]
+    expert: Float[Numbers, "N T D"]
+    known: Bool[Numbers, "N T"]
+    information: Float[Numbers, "N T"] | None
+
+    def disagreement(self, deviation: Float[Numbers, " D"]) -> Float[Numbers, "N T D"]:
+        """Variance among the scouts (unbiased), in units of the variance of what experts do."""
+        return self.action.astype(np.float64).var(axis=2, ddof=1) / deviation**2
+
+    def error(
+        self, deviation: Float[Numbers, " D"], fold: Int[Numbers, " N"] | None
+    ) -> Float[Numbers, "N T"]:
+        """Squared error over the expert's variance, summed over the action.
+
+        Args:
+            deviation: Standard deviation of what experts do.
+            fold: Of each scenario, whose scout is judged since it has not seen it; None: nobody has seen any, and
+                their mean is judged.
+        """
+        action = self.action.astype(np.float64)
+        if fold is None:
+            one = action.mean(axis=2)
+        else:
+            one = np.take_along_axis(action, fold[:, None, None, None], axis=2)[:, :, 0]
+        return (((one - self.expert) / deviation) ** 2).sum(axis=-1)
+
+
+@dataclass(frozen=True)
+class Scouts:
+    """A trained ensemble.
+
+    Attributes:
+        config: What it is.
+        learner: What one scout is.
+        parameters: Of all, along a leading axis.
+        set_hash: ``ScenarioSet.hash`` of what it was trained on.
+        fold: Of every scenario of that.
+        deviation: Standard deviation of what the experts of those did, in units of the action space.
+    """
+
+    config: ScoutsConfig
+    learner: Bc
+    parameters: Any
+    set_hash: str
+    fold: Int[Numbers, " N"]
+    deviation: Float[Numbers, " D"]
+
+    def opinions(self, data: ScenarioSet, progress: Progress | None = None) -> Opinions:
+        """What they make of a set, which need not be the one that they were trained on."""
+        found = each_batch(data, lambda bank: self._of_bank(self.parameters, bank), progress)
+        return Opinions(**{"information": None, **found})
+
+    @partial(jax.jit, static_argnums=0)
+    def _of_bank(self, parameters: Any, bank: ScenarioBank) -> dict[str, Array]:
+        environment = recorded(self.learner.environment)
+        steps = jnp.arange(bank.steps)
+
+        def one(index: Array) -> dict[str, Array]:
+            seen = environment.observe_recorded(bank, (jnp.full_like(steps, index), steps))
+            act = partial(self.learner.distribution, observation=seen)
+            found = {"action": jnp.moveaxis(jax.vmap(lambda own: act(own).mode())(parameters), 0, 1)}
+            if self.config.cloning.loss == "likelihood":
+                found["information"] = mutual_information(jax.vmap(act)(parameters), jax.random.key(0))
+            return found
+
+        expert = environment.expert_steps(bank)
+        found = jax.lax.map(one, jnp.arange(len(bank)), batch_size=_AT_ONCE)
+        return {**found, "expert": expert.action, "known": expert.usable & ~expert.clipped}
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+
+def mutual_information(scouts: Distribution, key: Array) -> Float[Array, "*batch"]:
+    """How much an action tells of whose it is, nats: from 0, where all distributions are the same, to ``ln K``.
+
+    The mean of ``ln p_k(a) - ln (1/K sum_j p_j(a))`` over scouts k and actions that they draw (Jensen-Shannon
+    divergence; Lin 1991), estimated from 16 of each.
+
+    Args:
+        scouts: Distributions along a leading axis of K.
+        key: Of the draws.
+    """
+    count = jax.tree.leaves(scouts)[0].shape[0]
+    density = jax.vmap(lambda one, choice: one.log_prob(choice), (0, None))
+
+    def of_draw(key: Array) -> Array:
+        choice = jax.vmap(lambda one, key: one.sample(key))(scouts, jax.random.split(key, count))
+        log_prob = jax.vmap(density, (None, 0))(scouts, choice)  # [whose action, whose density, ...]
+        own = jnp.moveaxis(jnp.diagonal(log_prob), -1, 0)
+        return jnp.mean(own - jax.nn.logsumexp(log_prob, axis=1) + math.log(count), axis=0)
+
+    found = jnp.mean(jax.lax.map(of_draw, jax.random.split(key, _DRAWN)), axis=0)
+    return jnp.clip(found, 0.0, math.log(count))
+
+
+def folds_of(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers, " N"]:
+    """A fold of every scenario: recordings, shuffled, are dealt out one by one, so that none is cut apart.
+
+    Raises:
+        UsageError: There are fewer recordings than folds.
+    """
+    names, number = np.unique(clusters, return_inverse=True)
+    if len(names) < folds:
+        raise UsageError(
+            f"{len(names)} recordings for {folds} folds",
+            cure=f"use {folds} recordings or more, or fewer folds",
+        )
+    return np.random.default_rng(seed).permutation(len(names))[number] % folds
+
+
+def train_scouts(
+    config: ScoutsConfig, data: ScenarioSet, say: Callable[[int, int], None] | None = None
+) -> Scouts:
+    """Trains an ensemble.
+
+    Args:
+        config: What it is.
+        data: Scenarios; all of them are held on the device.
+        say: Called with (iterations done, iterations).
+
+    Raises:
+        UsageError: There are fewer recordings than folds.
+        DataError: No step can be learned from.
+    """
+    environment = Driving(Simulator(config.task))
+    entries = data.entries
+    columns = ([str(entry[name]) for entry in entries] for name in ("dataset", "segment", "scenario_id"))
+    clusters = recordings(*columns)
+    fold = folds_of(clusters, config.folds, config.seed)
+    bank = ScenarioBank.from_scenarios(data)
+    learner = config.cloning.build(environment, bank, config.iterations)
+    experience, draws, deviation = _experience(config, environment, bank, fold)
+
+    def all_scouts(experience: Experience, draws: Sampler, state: Any) -> Any:
+        return jax.vmap(lambda own, one: learner.iterate(replace(experience, critic=own), one))(draws, state)
+
+    iterate = jax.jit(all_scouts, donate_argnums=2)
+    keys = jax.random.split(jax.random.key(config.seed), config.folds)
+    state = jax.jit(jax.vmap(learner.init, (None, 0)))(bank, keys)
+    for done in range(config.iterations):
+        state, logs = iterate(experience, draws, state)
+        jax.block_until_ready(logs)
+        if say is not None:
+            say(done + 1, config.iterations)
+    return Scouts(config, learner, state.parameters, data.hash, fold, deviation)
+
+
+def _experience(
+    config: ScoutsConfig, environment: Driving, bank: ScenarioBank, fold: Int[Numbers, " N"]
+) -> tuple[Experience, Sampler, Float[Numbers, " D"]]:
+    """What scouts learn from, how each draws along a leading axis, and the deviation of what experts do."""
+    made = ExperienceConfig(mask_clipped=config.cloning.mask_clipped).of(environment, bank)
+    usable = np.asarray(made.expert.usable & ~(made.expert.clipped & config.cloning.mask_clipped))
+    action = np.asarray(made.expert.action, np.float64)
+    weights = usable.astype(np.float64)
+    if config.weighted == "rarity":
+        weights = rarity_steps(KernelRarity(temper=1.0), action, usable)
+    samplers = [sampler(weights * (fold != own)[:, None]) for own in range(config.folds)]
+    draws = jax.tree.map(lambda *parts: jnp.stack(parts), *samplers)
+    return made, draws, np.maximum(action[usable].std(axis=0), 1e-6)

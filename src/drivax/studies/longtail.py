@@ -1,0 +1,251 @@
+"""The long-tail study: does training on critical moments more often make a safer driver?
+
+Agents that differ in how recorded steps are drawn are trained with several seeds under one budget, drive one test set,
+and are compared scenario by scenario. What is done is not done again: a study that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from drivax.curation.agents import AGENTS, weighted
+from drivax.curation.controls import event_kinds
+from drivax.curation.methods import Wanted, curate
+from drivax.curation.rarity import ExpertActions
+from drivax.curation.scores import ScoreTable, read_scores, write_scores
+from drivax.curation.scoring import score_steps
+from drivax.curation.subset import top_rows
+from drivax.curation.weights import draws_of
+from drivax.errors import UsageError
+from drivax.evaluation.crossed import crossed_difference
+from drivax.evaluation.stored import read_evaluation
+from drivax.learning.loop import train
+from drivax.learning.validation import rank
+from drivax.scenario.store import ScenarioSet
+from drivax.studies.longtail_drives import Say, clusters, drive_all, driven, rare_rows, test_set
+from drivax.studies.longtail_page import write_page
+from drivax.studies.longtail_plan import (
+    BY_MEAN_Q,
+    CRITICAL,
+    DRIVES,
+    FIRST,
+    REPORT,
+    RESULTS,
+    SCORES,
+    Job,
+    LongtailConfig,
+    Sets,
+    run_of,
+)
+from drivax.studies.longtail_results import METRICS, Condition, judge, rankings, rates, summary
+from drivax.studies.workers import one_core_each
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.runs import RunFolder, write_text
+from drivax.tracking.sinks import read_rows
+from drivax.viewer.player import write_player
+
+_PROGRESS = "validation/progress_ratio"
+#: Methods whose most critical scenarios can be watched, and how many of each.
+_SHOWN, _TOP = ("kinematic", "ensemble", "action_rarity"), 3
+
+
+def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
+    """Makes the folder of a study, or finds that it is of this very study.
+
+    Raises:
+        UsageError: It is of another one.
+        DataError: A set is no scenario set.
+    """
+    data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
+    if not out.exists():
+        RunFolder.create(out, config, data, kind="longtail")
+        return
+    folder = RunFolder.open(out)
+    hashes = [entry["hash"] for entry in folder.info.get("data", [])]
+    if folder.config(LongtailConfig) != config or hashes != [one.hash for one in data]:
+        raise UsageError(
+            "holds a study with other settings, or of other scenarios", file=out, cure="choose another name"
+        )
+
+
+def score(config: LongtailConfig, sets: Sets, out: Path, say: Say) -> dict[str, ScoreTable]:
+    """The tables of all methods that the agents ask for, of the training set; read where they are there already."""
+    data, tables = ScenarioSet.open(sets.train), {}
+    for method in dict.fromkeys(AGENTS[agent].method for agent in config.agents):
+        file = out / SCORES / f"{method}.npz"
+        if not file.is_file():
+            say(f"scoring by {method}")
+            write_scores(curate(method, Wanted(data, scouts=config.scouts)), file)
+        tables[method] = read_scores(file, data)
+    return tables
+
+
+def train_all(
+    config: LongtailConfig, sets: Sets, out: Path, agents: Sequence[str], cores: int | None, say: Say
+) -> None:
+    """Trains agents that are not trained yet, each seed by itself on one core."""
+    jobs = [Job(config, sets, out, agent, seed) for seed in range(config.seeds) for agent in agents]
+    waiting = [job for job in jobs if not _done(job)]
+    for number, (job, took) in enumerate(one_core_each(_train, waiting, cores), start=1):
+        say(f"trained {job.agent}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
+
+
+def _done(job: Job) -> bool:
+    config = job.config.train_config(job.agent, job.seed)
+    last = config.iterations * config.algorithm.steps_per_iteration
+    return last in Checkpoints(job.run / "checkpoints").steps()
+
+
+def _train(job: Job) -> float:
+    began = time.perf_counter()
+    data = ScenarioSet.open(job.sets.train)
+
+    def table(method: str) -> ScoreTable:
+        return read_scores(job.out / SCORES / f"{method}.npz", data)
+
+    train(
+        job.config.train_config(job.agent, job.seed),
+        weighted(AGENTS[job.agent], data, table, job.config.weights, job.seed),
+        job.run,
+        validation=ScenarioSet.open(job.sets.validation),
+        resume=bool(Checkpoints(job.run / "checkpoints").steps()),
+        overwrite=True,
+    )
+    return time.perf_counter() - began
+
+
+def study(
+    config: LongtailConfig,
+    sets: Sets,
+    out: Path,
+    *,
+    cores: int | None = None,
+    anyway: bool = False,
+    say: Say = print,
+) -> dict[str, Any]:
+    """Runs a study from wherever it is to its end; see the module.
+
+    Args:
+        config: What is compared.
+        sets: The scenario sets.
+        out: Its folder.
+        cores: How many trainings run side by side; None: one on every core.
+        anyway: Go on where the conditions for a comparison are not met; the report says so.
+        say: Called with a line about every step.
+
+    Returns:
+        What ``results.json`` holds.
+
+    Raises:
+        UsageError: ``baseline`` or ``bc`` do not drive well enough, or ``out`` holds another study.
+    """
+    begin(config, sets, out)
+    tables = score(config, sets, out, say)
+    test = test_set(sets, out)
+    train_all(config, sets, out, FIRST, cores, say)
+    drive_all(config, out, test, FIRST, say)
+    met = conditions(config, out)
+    for one in met:
+        say(one.words())
+    least = detectable(config, out, test)
+    say(
+        "smallest difference that will be found: " + ", ".join(f"{name} {x:.3f}" for name, x in least.items())
+    )
+    if not all(one.met for one in met) and not anyway:
+        raise UsageError(
+            "the baseline does not drive well enough, so that a comparison would say little",
+            file=out,
+            cure="train longer, choose other settings, or pass --anyway",
+        )
+    train_all(config, sets, out, config.agents, cores, say)
+    drive_all(config, out, test, config.agents, say)
+    results = found(config, out, test, tables, met)
+    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+    data = ScenarioSet.open(sets.train)
+    expert = score_steps(data, ExpertActions())
+    write_page(results, tables, expert["action"][expert["known"]], out / REPORT)
+    rows = dict.fromkeys(row for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP))
+    write_player([data[row] for row in rows], out / CRITICAL, overwrite=True, title="most critical drives")
+    say(f"wrote {out / REPORT}")
+    return results
+
+
+def conditions(config: LongtailConfig, out: Path) -> list[Condition]:
+    """Whether what everything is compared with drives well."""
+    found = []
+    for agent in FIRST:
+        curves = []
+        for seed in range(config.seeds):
+            rows = [r for r in read_rows(run_of(out, agent, seed) / "metrics.jsonl") if _PROGRESS in r]
+            curves.append(
+                {"score": [_score(row) for row in rows], "progress": [row[_PROGRESS] for row in rows]}
+            )
+        found.append(Condition.of(agent, curves, config.progress, config.flat))
+    return found
+
+
+def _score(row: Mapping[str, float]) -> float:
+    found = rank("score", row)
+    assert found is not None
+    return found[0]
+
+
+def detectable(config: LongtailConfig, out: Path, test: ScenarioSet) -> dict[str, float]:
+    """The smallest difference that the study finds with a probability of 80 %, if others vary as the baseline.
+
+    By its own seeds against ``bc``, whose variation stands for that of the others; known before the others learn.
+    """
+    one, other = (driven(config, out, name) for name in FIRST)
+    labels = clusters(test)
+    return {name: crossed_difference(one[name], other[name], labels).detectable() for name in METRICS}
+
+
+def found(
+    config: LongtailConfig,
+    out: Path,
+    test: ScenarioSet,
+    tables: Mapping[str, ScoreTable],
+    met: Sequence[Condition],
+) -> dict[str, Any]:
+    """Everything that the study found, as plain values."""
+    rare, labels = rare_rows(config, test), clusters(test)
+    drives = {name: driven(config, out, name) for name in (*config.agents, BY_MEAN_Q)}
+    expert = read_evaluation(out / DRIVES / "expert").metrics
+    drives["expert"] = {name: expert[name][None] for name in METRICS}
+    data = ScenarioSet.open(Path(RunFolder.open(out).info["data"][0]["path"]))
+    rule = {
+        name: crossed_difference(drives[BY_MEAN_Q][name], drives["baseline"][name], labels)
+        for name in METRICS
+    }
+    return {
+        "about": {
+            "seeds": config.seeds,
+            "train": len(data),
+            "test": len(test),
+            "rare": int(rare.sum()),
+            "labelled": bool((event_kinds(test) > 0).any()),
+        },
+        "conditions": [asdict(one) for one in met],
+        "detectable": detectable(config, out, test),
+        "claims": [summary(one) for one in judge(drives, labels, rare, config.agents)],
+        "rates": {name: rates(drives[name], labels, rare) for name in ("expert", *config.agents)},
+        "draws": {
+            name: asdict(
+                draws_of(
+                    weighted(AGENTS[name], data, tables.__getitem__, config.weights).weights,
+                    tables[AGENTS[name].method].drawn,
+                )
+            )
+            for name in config.agents
+        },
+        "rankings": rankings(tables),
+        "mean_q": {
+            name: {"difference": one.difference, "interval": list(one.interval())}
+            for name, one in rule.items()
+        },
+    }

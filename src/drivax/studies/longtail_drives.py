@@ -1,0 +1,94 @@
+"""The drives of a long-tail study: its test set, who drives it, and what is read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from drivax.curation.controls import event_kinds
+from drivax.curation.methods import Wanted, curate
+from drivax.evaluation.clusters import recordings
+from drivax.evaluation.runs import EvaluationConfig, run_evaluation
+from drivax.evaluation.stored import read_evaluation
+from drivax.learning.policies import load_policy
+from drivax.planners.catalogue import make_planner
+from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.sizes import Sizes
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.studies.longtail_plan import BY_MEAN_Q, DRIVES, TEST, LongtailConfig, Sets, drive_of, run_of
+from drivax.tracking.sinks import read_rows
+
+#: What critics expect of the policy on held-out steps: by it the published study chose its checkpoints.
+MEAN_Q = "validation/mean_q"
+Say = Callable[[str], None]
+
+
+def test_set(sets: Sets, out: Path) -> ScenarioSet:
+    """The scenarios of the test, as a set of their own: half of them with an event where events are labelled."""
+    path = out / TEST
+    if not path.is_dir():
+        parts = [ScenarioSet.open(one) for one in sets.test]
+        rows = [(part, row) for part in parts for row in range(len(part))]
+        with_event = np.concatenate([event_kinds(part) for part in parts]) > 0
+        if with_event.any() and not with_event.all():
+            most = min(with_event.sum(), (~with_event).sum())
+            kinds = [np.flatnonzero(one)[:most] for one in (with_event, ~with_event)]
+            rows = [rows[place] for place in np.sort(np.concatenate(kinds))]
+        source = {"command": "study longtail", "sets": [part.hash for part in parts]}
+        with ScenarioWriter(path, parts[0].capacity, source) as writer:
+            for part, row in rows:
+                writer.add(part[row])
+    return ScenarioSet.open(path)
+
+
+def rare_rows(config: LongtailConfig, test: ScenarioSet) -> Bool[np.ndarray, " n"]:
+    """Which scenarios of the test are rare: those with an event, or the most critical ones where none are labelled."""
+    labelled = event_kinds(test) > 0
+    if labelled.any():
+        return labelled
+    scores = curate("kinematic", Wanted(test)).scenarios
+    return scores >= np.quantile(scores, 1.0 - config.rare)
+
+
+def drive_all(config: LongtailConfig, out: Path, test: ScenarioSet, agents: Sequence[str], say: Say) -> None:
+    """Drives the test set with the expert and with all agents that have not driven it yet."""
+    sizes = Sizes.used(test)
+    expert = out / DRIVES / "expert"
+    if not expert.is_dir():
+        run_evaluation(EvaluationConfig("expert"), make_planner("expert"), test, expert, sizes=sizes)
+    bank = ScenarioBank.from_scenarios([test[0]])
+    for agent in agents:
+        for seed in range(config.seeds):
+            run = run_of(out, agent, seed)
+            asked: list[tuple[str, int | None]] = [(agent, None)]
+            if agent == "baseline":
+                asked.append((BY_MEAN_Q, highest_mean_q(run)))
+            for name, step in asked:
+                folder = drive_of(out, name, seed)
+                if folder.is_dir():
+                    continue
+                planner, task = load_policy(run, bank, step=step)
+                told = str(run) if step is None else f"{run}@{step}"
+                run_evaluation(EvaluationConfig(told), planner, test, folder, task=task, sizes=sizes)
+                say(f"drove {name}, seed {seed}")
+
+
+def highest_mean_q(run: Path) -> int:
+    """The step of the validation at which critics expected most."""
+    rows = [row for row in read_rows(run / "metrics.jsonl") if MEAN_Q in row]
+    return int(max(rows, key=lambda row: row[MEAN_Q])["step"])
+
+
+def driven(config: LongtailConfig, out: Path, agent: str) -> dict[str, Float[np.ndarray, "seed scenario"]]:
+    """What the agents of one name did in the test, by metric, in the order of the test set."""
+    tables = [read_evaluation(drive_of(out, agent, seed)) for seed in range(config.seeds)]
+    return {name: np.stack([table.metrics[name] for table in tables]) for name in tables[0].metrics}
+
+
+def clusters(test: ScenarioSet) -> list[str]:
+    """The recording of every scenario."""
+    names = ("dataset", "segment", "scenario_id")
+    return recordings(*([str(entry[name]) for entry in test.entries] for name in names))

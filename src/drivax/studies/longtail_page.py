@@ -1,0 +1,219 @@
+"""The report of a long-tail study: one HTML page, made of ``results.json`` and of the score tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.curation.scores import ScoreTable
+from drivax.show.histograms import histogram
+from drivax.show.page import page, publish
+from drivax.studies.longtail_results import METRICS, RELATED, UNRELATED
+
+_SHORT = {
+    "collision": "collision", "at_fault_collision": "at fault", "offroad": "off-road", "accuracy": "accuracy",
+    "progress_ratio": "progress", "vmax_score": "vmax score",
+}  # fmt: skip
+_KINDS = {"all": "All scenarios", "common": "Common scenarios", "rare": "Rare scenarios"}
+_SIGNS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
+#: Cells of the map of actions along either dimension, and its size in pixels.
+_CELLS, _SIZE = 48, 336
+_STYLE = """
+table.wide td, table.wide th { text-align: left; }
+.map rect { stroke: none; }
+.map text { font-size: 11px; fill: var(--soft); }
+"""
+
+Actions = Float[np.ndarray, "n 2"]
+
+
+def write_page(
+    results: Mapping[str, Any], tables: Mapping[str, ScoreTable], actions: Actions, out: Path
+) -> None:
+    """Writes the report.
+
+    Args:
+        results: What the study found (``results.json``).
+        tables: Scores of the training set by method.
+        actions: What experts do there, in units of the action space.
+        out: The HTML file.
+    """
+    scored = {name: table for name, table in tables.items() if len(table.components) or name == "oracle"}
+    sections = [
+        _section("Before the comparison", _conditions(results)),
+        _section("Verdicts", _verdicts(results)),
+        _section("How the agents drove", "".join(_rates(results, kind) for kind in _KINDS)),
+        _section("How the weights lie", _draws(results)),
+        _section("Are the methods different?", _rankings(results)),
+        _section("Choosing checkpoints by the highest mean Q", _mean_q(results)),
+        _section("Scores", _scores(scored)),
+        _section("Actions of the experts", _action_map(actions)),
+    ]
+    publish(out, page("The long-tail study", _lead(results), sections, _STYLE))
+
+
+def _lead(results: Mapping[str, Any]) -> str:
+    verdicts = [one["verdict"] for one in results["claims"]]
+    counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _SIGNS)
+    about = results["about"]
+    caution = "" if all(one["met"] for one in results["conditions"]) else (
+        "<p><b>The conditions of the comparison are not met</b>: read its verdicts as those of agents that do not "
+        "drive well.</p>"
+    )  # fmt: skip
+    return (
+        f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['rates']) - 1} agents, {about['seeds']} seeds, "
+        f"{about['train']:,} training and {about['test']:,} test scenarios ({about['rare']:,} of them rare, "
+        f"{'labelled' if about['labelled'] else 'by the kinematic heuristic'}).</p>{caution}"
+    )
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{body}</section>"
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    head = "".join(f"<th scope=col>{escape(one)}</th>" for one in heads)
+    body = "".join(
+        "<tr>"
+        + f"<th scope=row>{escape(row[0])}</th>"
+        + "".join(f"<td>{escape(c)}</td>" for c in row[1:])
+        + "</tr>"
+        for row in rows
+    )
+    return f"<div class=scroll><table class='{kind}'><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _conditions(results: Mapping[str, Any]) -> str:
+    rows = [
+        (one["agent"], f"{one['progress']:.1%}", f"{one['change']:+.3f}", "yes" if one["met"] else "no")
+        for one in results["conditions"]
+    ]
+    found = ", ".join(f"{_SHORT[name]} {value:.3f}" for name, value in results["detectable"].items())
+    return (
+        _table(("agent", "progress of the expert's", "score, third to last quarter", "good enough"), rows)
+        + "<p>The smallest difference between two kinds of agents that so many seeds and scenarios find with a "
+        f"probability of 80 %, from the baseline's seeds: {escape(found)}.</p>"
+    )
+
+
+def _verdicts(results: Mapping[str, Any]) -> str:
+    rows = []
+    for one in results["claims"]:
+        claim, low_high = one["claim"], one["interval"]
+        difference = "" if low_high is None else (
+            f"{one['difference']:+.3f} [{low_high[0]:+.3f}, {low_high[1]:+.3f}]"
+        )  # fmt: skip
+        change = "" if one["change"] is None else (
+            "{:+.0%} [{:+.0%}, {:+.0%}]".format(*one["change"])
+        )  # fmt: skip
+        p = "" if one["adjusted"] is None else f"{one['adjusted']:.3f}"
+        rows.append(
+            (
+                claim["words"],
+                _SHORT[claim["metric"]],
+                difference,
+                change,
+                p,
+                _SIGNS[one["verdict"]],
+                one["needed"],
+            )
+        )
+    heads = ("claim", "metric", "difference", "relative", "adjusted p", "verdict", "what would decide")
+    return _table(heads, rows, "wide") + (
+        "<p><small>Differences are means over seeds and scenarios with 95 % intervals; both seeds and recordings are "
+        "drawn by chance (Welch-Satterthwaite). P-values are adjusted for the number of all claims (Holm). A claim is "
+        "supported or contradicted below 0.05, otherwise undecided; how many seeds or recordings would decide is "
+        "reckoned as if the difference were the one found.</small></p>"
+    )
+
+
+def _rates(results: Mapping[str, Any], kind: str) -> str:
+    found = {name: rates[kind] for name, rates in results["rates"].items() if kind in rates}
+    if not found:
+        return ""
+    rows = [(name, *(_mean(rates[metric]) for metric in METRICS)) for name, rates in found.items()]
+    return f"<h3>{_KINDS[kind]}</h3>" + _table(("agent", *(_SHORT[name] for name in METRICS)), rows)
+
+
+def _mean(interval: Mapping[str, Any]) -> str:
+    if interval["mean"] is None:
+        return "–"
+    low, high = interval["low"], interval["high"]
+    return f"{interval['mean']:.3f}" + ("" if low is None else f" [{low:.3f}, {high:.3f}]")
+
+
+def _draws(results: Mapping[str, Any]) -> str:
+    names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
+    heads = ("agent", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
+    rows = [(agent, *(f"{one[name]:.2f}" for name in names)) for agent, one in results["draws"].items()]
+    return _table(heads, rows)
+
+
+def _rankings(results: Mapping[str, Any]) -> str:
+    rows = [
+        (
+            f"{one['one']} and {one['other']}",
+            f"{one['rho']:+.2f}",
+            f"{one['overlap']:.0%}",
+            _SIGNS[one["orthogonal"]],
+        )
+        for one in results["rankings"]
+    ]
+    return _table(
+        ("methods", "rank correlation", "same among the top 5 %", "“they are orthogonal”"), rows
+    ) + (
+        f"<p><small>Of the scores of the training scenarios. Below ±{UNRELATED} rankings are called unrelated, above "
+        f"±{RELATED} related. Two rankings by lot have 5 % of their top 5 % in common.</small></p>"
+    )
+
+
+def _mean_q(results: Mapping[str, Any]) -> str:
+    found = results["mean_q"]
+    rows = [
+        (_SHORT[name], f"{one['difference']:+.3f} [{one['interval'][0]:+.3f}, {one['interval'][1]:+.3f}]")
+        for name, one in found.items()
+    ]
+    return _table(("metric", "by mean Q minus by driving"), rows) + (
+        "<p><small>The baseline's checkpoints with the highest mean Q on held-out steps, as the published study takes "
+        "them, against those with the best validation score, on the test set.</small></p>"
+    )
+
+
+def _scores(tables: Mapping[str, ScoreTable]) -> str:
+    charts = "".join(
+        histogram(f"{name}: scores of scenarios", {name: table.scenarios}, "score")
+        for name, table in tables.items()
+    )
+    tops = [
+        (name, *(table.scenario_ids[row] for row in np.argsort(-table.scenarios, kind="stable")[:3]))
+        for name, table in tables.items()
+    ]
+    return (
+        f"<div class=charts>{charts}</div>"
+        + _table(("method", "most critical", "second", "third"), tops, "wide")
+        + "<p>These drives can be watched in <a href=critical.html>critical.html</a>.</p>"
+    )
+
+
+def _action_map(actions: Actions) -> str:
+    counts, _, _ = np.histogram2d(actions[:, 0], actions[:, 1], bins=_CELLS, range=((-1, 1), (-1, 1)))
+    dark = np.log1p(counts) / np.log1p(counts.max())
+    side = _SIZE / _CELLS
+    cells = "".join(
+        f'<rect x="{30 + column * side:.1f}" y="{(_CELLS - 1 - row) * side:.1f}" width="{side:.1f}" '
+        f'height="{side:.1f}" fill="var(--ink)" fill-opacity="{dark[row, column]:.2f}"/>'
+        for row, column in np.argwhere(counts > 0)
+    )
+    return (
+        f'<figure class="chart map"><figcaption>How often experts do what<small>logarithmic; '
+        f"{len(actions):,} steps</small></figcaption>"
+        f'<svg viewBox="0 0 {_SIZE + 40} {_SIZE + 30}" role="img" aria-label="map of actions">{cells}'
+        f'<text x="{30 + _SIZE / 2:.0f}" y="{_SIZE + 20}" text-anchor="middle">steering, left is positive</text>'
+        f'<text transform="translate(18 {_SIZE / 2:.0f}) rotate(-90)" text-anchor="middle">acceleration</text>'
+        "</svg></figure>"
+    )

@@ -1,0 +1,157 @@
+"""Scouts: folds, disagreement and information by hand, and an ensemble that knows where it has seen little."""
+
+import math
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drivax.cli import main
+from drivax.curation.methods import ensemble_table
+from drivax.curation.scores import read_scores
+from drivax.curation.scouts import (
+    Opinions,
+    ScoutsConfig,
+    folds_of,
+    mutual_information,
+    train_scouts,
+)
+from drivax.errors import UsageError
+from drivax.learning.imitation import BcConfig
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
+from drivax.networks.entity import EntityConfig
+from drivax.scenario.assemble import assemble
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from quick import quick
+from scenes import SMALL, car, straight_road
+
+NETWORK = NetworkConfig(encoder=EntityConfig(width=8), head=(8,), activation="relu")
+TINY = ScoutsConfig(
+    folds=3, cloning=BcConfig(network=NETWORK, batch=16, updates=4, learning_rate=3e-3), total_steps=2_000
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Five recordings, two windows each."""
+    path = tmp_path_factory.mktemp("scouts") / "set"
+    with ScenarioWriter(path, SMALL) as writer:
+        for row in range(10):
+            cars = [car(speed=8.0 + 0.2 * row), car(x=60.0, speed=8.0)]
+            drive = replace(straight_road(cars), scenario_id=f"drive-{row}", segment=f"recording-{row // 2}")
+            writer.add(assemble(drive, SMALL))
+    return ScenarioSet.open(path)
+
+
+@pytest.fixture(scope="module")
+def scouts(data):
+    return train_scouts(TINY, data)
+
+
+def test_folds_never_share_a_recording():
+    rng = np.random.default_rng(0)
+    clusters = [f"recording-{number}" for number in rng.integers(0, 40, 300)]
+    fold = folds_of(clusters, 5, seed=1)
+    assert {len(set(fold[np.array(clusters) == name])) for name in clusters} == {1}
+    sizes = np.bincount([fold[clusters.index(name)] for name in sorted(set(clusters))])
+    assert len(sizes) == 5 and np.ptp(sizes) <= 1
+    assert (folds_of(clusters, 5, seed=2) != fold).any()
+    with pytest.raises(UsageError, match="4 recordings for 5 folds"):
+        folds_of(["a", "b", "c", "d", "d"], 5, seed=0)
+
+
+def test_disagreement_is_the_variance_in_units_of_what_experts_do():
+    action = np.zeros((1, 2, 3, 2), np.float32)
+    action[0, 1] = [[0.1, 0.0], [0.2, 0.0], [0.3, 0.3]]
+    told = Opinions(action, np.zeros((1, 2, 2)), np.ones((1, 2), bool), None)
+    found = told.disagreement(np.array([0.5, 0.1]))
+    np.testing.assert_allclose(found[0, 0], 0.0)
+    np.testing.assert_allclose(found[0, 1], [0.01 / 0.25, 0.03 / 0.01], rtol=1e-5)
+
+
+def test_errors_are_those_of_the_scout_that_has_not_seen_the_scenario():
+    action = np.zeros((2, 1, 2, 1), np.float32)
+    action[0, 0], action[1, 0] = [[0.4], [0.9]], [[0.1], [0.2]]
+    told = Opinions(action, np.zeros((2, 1, 1)), np.ones((2, 1), bool), None)
+    np.testing.assert_allclose(told.error(np.array([0.1]), np.array([0, 1]))[:, 0], [16.0, 4.0], rtol=1e-5)
+    np.testing.assert_allclose(told.error(np.array([0.1]), None)[:, 0], [6.5**2, 1.5**2], rtol=1e-5)
+
+
+def stacked(*ones):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *ones)
+
+
+def test_information_of_grids_is_the_jensen_shannon_divergence():
+    shares = np.random.default_rng(0).dirichlet(np.ones(6), size=3)
+    levels = ((-1.0, 0.0, 1.0), (-0.5, 0.5))
+    scouts = stacked(*(Grid(jnp.log(jnp.asarray(row, jnp.float32)), levels) for row in shares))
+    mean = shares.mean(axis=0)
+    wanted = np.mean([np.sum(row * np.log(row / mean)) for row in shares])
+    found = quick(jax.vmap(mutual_information, (None, 0)), scouts, jax.random.split(jax.random.key(0), 200))
+    assert found.mean() == pytest.approx(wanted, abs=0.02)
+
+
+def test_information_tells_modes_that_a_mean_does_not():
+    """Two scouts that agree to turn either way know the same; two that turn one way each do not."""
+
+    def sides(first):
+        parts = SquashedGaussian(jnp.array([[0.0, -1.0], [0.0, 1.0], [0.0, 0.0]]), jnp.full((3, 2), 0.05))
+        return Mixture(jnp.array([first, -first, -50.0]), parts)
+
+    key = jax.random.key(0)
+    assert float(mutual_information(stacked(sides(0.0), sides(0.0)), key)) == pytest.approx(0.0, abs=1e-5)
+    assert float(mutual_information(stacked(sides(50.0), sides(-50.0)), key)) == pytest.approx(math.log(2))
+
+
+def test_each_scout_is_trained_without_its_fold(scouts, data):
+    assert scouts.set_hash == data.hash
+    told = scouts.opinions(data)
+    assert told.action.shape == (10, 91, 3, 2) and told.information is None
+    assert np.ptp(told.action, axis=2).max() > 0.0
+    assert sorted(np.bincount(scouts.fold)) == [2, 4, 4]
+
+
+@pytest.mark.parametrize("weighted", ["plain", pytest.param("rarity", marks=pytest.mark.slow)])
+def test_the_table_of_an_ensemble(data, scouts, weighted):
+    trained = scouts if weighted == "plain" else train_scouts(replace(TINY, weighted="rarity"), data)
+    table = ensemble_table(trained, data)
+    assert table.method == "ensemble" and sorted(table.components) == ["action_0", "action_1"]
+    assert 0.0 < table.scenarios.max() <= 1.0
+    assert -1.0 <= table.config["error_rank_correlation"] <= 1.0
+    assert table.config["trained_on"] == data.hash
+
+
+def test_the_command_trains_scouts_that_can_disagree_about_modes(data, tmp_path, capsys):
+    out = tmp_path / "scores.npz"
+    arguments = ["curate", "ensemble", "--data", str(data.path), "--out", str(out), "--folds", "2"]
+    arguments += ["--total_steps", "500", "--cloning.batch", "16", "--cloning.updates", "4"]
+    arguments += ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
+    assert main(arguments) == 0
+    assert "rank correlation" in capsys.readouterr().out
+    table = read_scores(out, data)
+    assert list(table.components) == ["information"]
+    assert table.config["cloning"]["network"]["distribution"] == "mixture"
+
+
+def test_what_cannot_be_is_refused(data, tmp_path, capsys):
+    with pytest.raises(UsageError, match="1 folds"):
+        ScoutsConfig(folds=1)
+    assert (
+        main(
+            [
+                "curate",
+                "kinematic",
+                "--data",
+                str(data.path),
+                "--out",
+                str(tmp_path / "s.npz"),
+                "--folds",
+                "3",
+            ]
+        )
+        == 2
+    )
+    assert "kinematic has no settings here; leave out --folds 3" in capsys.readouterr().err

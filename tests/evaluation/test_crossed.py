@@ -1,0 +1,117 @@
+"""Differences over seeds and scenarios: hand-computed, against SciPy where one part vanishes, calibrated."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from drivax.errors import UsageError
+from drivax.evaluation.crossed import crossed_difference, relative_change
+
+
+def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, both=0.0, shift=0.0):
+    """Values of two kinds of agents: effects of agents, of scenarios (common to all), and of both together."""
+    common = rng.normal(size=scenarios) * scenario
+    kinds = [
+        common + rng.normal(size=(seeds, 1)) * agent + rng.normal(size=(seeds, scenarios)) * both
+        for _ in range(2)
+    ]
+    return kinds[0] + shift, kinds[1]
+
+
+def test_by_hand():
+    a, b = np.array([[1.0, 0.0], [1.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 1.0]])
+    found = crossed_difference(a, b)
+    assert found.difference == 0.5
+    # Means of agents are 0.5, 1 and 0, 0.5; differences by scenario 1 and 0.
+    assert found.seeds == pytest.approx((0.125 / 2, 0.125 / 2))
+    assert found.scenarios == pytest.approx(2 * (0.25 + 0.25) / 4)
+    assert found.error == pytest.approx(math.sqrt(0.125 + 0.25))
+    parts = (0.0625, 0.0625, 0.25)
+    assert found.freedom == pytest.approx(0.375**2 / sum(part**2 for part in parts))
+
+
+def test_of_seeds_alone_it_is_welch():
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(2, 5)) * np.array([[1.0], [3.0]])
+    a, b = (np.repeat(row[:, None], 30, axis=1) for row in means)
+    found, wanted = crossed_difference(a, b), stats.ttest_ind(*means, equal_var=False)
+    assert found.p == pytest.approx(wanted.pvalue)
+    assert found.interval() == pytest.approx(tuple(wanted.confidence_interval()))
+
+
+def test_of_scenarios_alone_it_is_a_paired_t_test():
+    rng = np.random.default_rng(1)
+    one, other = rng.normal(size=(2, 40))
+    a, b = np.tile(one, (3, 1)), np.tile(other, (4, 1))
+    assert crossed_difference(a, b).p == pytest.approx(stats.ttest_rel(one, other).pvalue)
+
+
+def test_clusters_count_once():
+    rng = np.random.default_rng(2)
+    a, b = drawn(rng, 3, 20, agent=0.1, both=1.0)
+    alone = crossed_difference(a, b)
+    twice = crossed_difference(np.tile(a, 2), np.tile(b, 2), np.tile(np.arange(20), 2))
+    assert (twice.difference, twice.p) == pytest.approx((alone.difference, alone.p))
+    assert crossed_difference(np.tile(a, 2), np.tile(b, 2)).scenarios < 0.6 * alone.scenarios
+
+
+@pytest.mark.parametrize(
+    "effects", [{"agent": 1.0}, {"agent": 0.3, "both": 1.0}, {"scenario": 3.0, "both": 1.0}]
+)
+def test_it_is_not_fooled_by_chance(effects):
+    """Of comparisons without a difference at most 5 % are called one; by scenarios alone far more would be."""
+    rng = np.random.default_rng(3)
+    found = [crossed_difference(*drawn(rng, 5, 50, **effects)).p < 0.05 for _ in range(400)]
+    assert np.mean(found) < 0.08  # 5 % and three standard errors
+
+
+def test_it_finds_what_it_says_it_can():
+    rng = np.random.default_rng(4)
+    effects = {"agent": 0.3, "both": 1.0}
+    typical = np.mean([crossed_difference(*drawn(rng, 5, 200, **effects)).detectable() for _ in range(100)])
+    found = [crossed_difference(*drawn(rng, 5, 200, shift=typical, **effects)).p < 0.05 for _ in range(300)]
+    assert 0.72 < np.mean(found) < 0.93
+
+
+def test_how_many_would_be_needed():
+    rng = np.random.default_rng(5)
+    found = crossed_difference(*drawn(rng, 4, 400, agent=0.2, both=1.0, shift=0.15))
+    wanted = 1.959964 + 0.841621
+    seeds = found.seeds_needed()
+    each = 4 * sum(found.seeds)
+    assert seeds == math.ceil(each / ((abs(found.difference) / wanted) ** 2 - found.scenarios))
+    no_noise = crossed_difference(*drawn(rng, 4, 400, agent=5.0, shift=0.01))
+    assert no_noise.clusters_needed() is None  # no number of scenarios makes up for seeds
+
+
+def test_relative_change_of_a_constant_ratio_is_exact():
+    rng = np.random.default_rng(6)
+    b = rng.uniform(1.0, 2.0, size=(3, 30))
+    change, low, high = relative_change(0.5 * b, b)
+    assert change == pytest.approx(-0.5)
+    assert low < -0.5 < high
+    assert relative_change(0.0 * b, b) is None
+
+
+def test_relative_change_covers():
+    """Rates of 0.1 and 0.2: the interval holds -0.5 in nearly all of the cases."""
+    rng = np.random.default_rng(7)
+    held = 0
+    for _ in range(200):
+        a, b = rng.random((5, 400)) < 0.1, rng.random((5, 400)) < 0.2
+        _, low, high = relative_change(a.astype(float), b.astype(float))
+        held += low <= -0.5 <= high
+    assert held / 200 > 0.9
+
+
+def test_undefined_scenarios_are_left_out_and_too_little_is_refused():
+    a, b = np.array([[1.0, 0.0, np.nan], [1.0, 1.0, 1.0]]), np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    assert crossed_difference(a, b) == crossed_difference(a[:, :2], b[:, :2])
+    with pytest.raises(UsageError, match="nothing to tell chance by"):
+        crossed_difference(a[:1], b)
+    with pytest.raises(UsageError, match="nothing to tell chance by"):
+        crossed_difference(a, b, ["one"] * 3)
+    with pytest.raises(UsageError, match="different scenarios"):
+        crossed_difference(a, b[:, :2])

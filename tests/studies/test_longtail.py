@@ -1,0 +1,194 @@
+"""The long-tail study: verdicts on results that are known, and the whole study on a few scenarios."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from drivax import settings
+from drivax.cli import main
+from drivax.curation.agents import AGENTS, CURATED, weighted
+from drivax.curation.methods import Wanted, curate
+from drivax.curation.weights import WeightConfig, draws_of
+from drivax.errors import UsageError
+from drivax.evaluation.crossed import Crossed
+from drivax.scenario.assemble import assemble
+from drivax.scenario.recording import Event
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.studies import longtail
+from drivax.studies.longtail_plan import LongtailConfig, Sets
+from drivax.studies.longtail_results import METRICS, Condition, judge, needed, rankings, rates
+from drivax.studies.workers import one_core_each
+from scenes import SMALL, car, straight_road
+
+SEEDS, SCENARIOS = 5, 400
+TINY = [
+    "--total_steps", "64", "--validations", "4", "--seeds", "2",
+    "--agents", "[baseline, bc, heuristic, random_matched]",
+    "--training", '["--algorithm.batch", "8", "--algorithm.updates", "1", "--algorithm.network.head", "[4]"]',
+]  # fmt: skip
+
+
+def drives(rates_of, rng):
+    """Failures drawn by the rates of every agent; accuracy is their absence, the rest says nothing."""
+    found = {}
+    for name, rate in rates_of.items():
+        seeds = np.clip(rate + 0.004 * rng.normal(size=(SEEDS, 1)), 0, 1)
+        hit = (rng.random((SEEDS, SCENARIOS)) < seeds).astype(float)
+        found[name] = dict.fromkeys(METRICS, hit) | {"accuracy": 1.0 - hit}
+    return found
+
+
+def verdicts(rates_of, seed=0):
+    rng = np.random.default_rng(seed)
+    labels = [f"recording-{number}" for number in range(SCENARIOS)]
+    found = judge(drives(rates_of, rng), labels, np.arange(SCENARIOS) % 2 == 0, list(rates_of))
+    return {one.claim.words: one for one in found}
+
+
+EVEN = dict.fromkeys(AGENTS, 0.16)
+
+
+def test_agents_that_do_not_differ_support_no_claim():
+    found = [one.verdict for seed in range(20) for one in verdicts(EVEN, seed).values()]
+    assert found.count("supported") <= 0.01 * len(found)
+    of_size = [verdicts(EVEN, seed)["uncertainty cuts collisions 2.9 times"].verdict for seed in range(20)]
+    assert of_size.count("contradicted") >= 18
+
+
+def test_a_real_effect_is_supported_and_one_that_lots_have_too_is_not_credited():
+    better = EVEN | {"ensemble": 0.055, "heuristic": 0.06, "random_matched": 0.06}
+    found = verdicts(better)
+    assert found["ensemble collides less than the baseline"].verdict == "supported"
+    assert found["ensemble fails less than the baseline"].verdict == "supported"
+    assert found["heuristic collides less than the baseline"].verdict == "supported"
+    assert found["heuristic collides less than the same weights dealt out by lot"].verdict == "undecided"
+    assert found["uncertainty cuts collisions 2.9 times"].verdict == "supported"
+    low_high = found["uncertainty cuts collisions 2.9 times"].change
+    assert low_high[1] < 0.055 / 0.16 - 1 < low_high[2]
+
+
+def test_an_effect_of_the_other_sign_contradicts():
+    found = verdicts(EVEN | {"action_rarity": 0.3})
+    one = found["action_rarity collides less than the baseline"]
+    assert one.verdict == "contradicted" and one.found.difference > 0.1
+    assert one.adjusted >= one.found.p
+
+
+def test_what_is_undecided_says_what_would_decide():
+    few = Crossed(0.02, (4e-5, 4e-5), 1e-5, (5, 5), 400)
+    assert needed(few) == "20 seeds each would find a difference of this size"
+    assert needed(replace(few, difference=1e-6)).startswith("neither seeds nor recordings")
+    assert "test recordings" in needed(Crossed(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400))
+
+
+def test_every_curated_agent_has_a_control_of_its_effective_size(data):
+    tables = {
+        name: curate(name, Wanted(data)) for name in ("kinematic", "action_rarity", "uniform", "oracle")
+    }
+    for scale, lot in (("step", "random_matched"), ("scenario", "random_matched_scenario")):
+        drawn = tables["kinematic"].drawn
+        sizes = []
+        for name in (lot, "heuristic" if scale == "step" else "heuristic_scenario"):
+            made = weighted(AGENTS[name], data, tables.__getitem__, WeightConfig(), seed=3)
+            sizes.append(draws_of(made.weights, drawn).effective)
+        assert sizes[0] == pytest.approx(sizes[1], rel=1e-9)
+    assert len(CURATED) == 6 and {AGENTS[name].scale for name in CURATED} == {"step", "scenario"}
+    with pytest.raises(
+        UsageError, match="scores of 'kinematic' for an agent that is curated by 'action_rarity'"
+    ):
+        weighted(AGENTS["action_rarity"], data, lambda _: tables["kinematic"], WeightConfig())
+
+
+def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():
+    rising = {"score": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8], "progress": [0.0] * 7 + [0.95]}
+    flat = {"score": [0.1, 0.5, 0.8, 0.8, 0.81, 0.8, 0.8, 0.8], "progress": [0.0] * 4 + [0.9] + [0.0] * 3}
+    one = Condition.of("bc", [rising], 0.8, 0.03)
+    assert one.change == pytest.approx(0.2) and one.progress == 0.95 and not one.met
+    assert Condition.of("bc", [flat], 0.8, 0.03).met
+    assert not Condition.of("bc", [flat], 0.91, 0.03).met
+
+
+def test_rankings_and_rates(data):
+    kinematic = curate("kinematic", Wanted(data))
+    same = rankings({"kinematic": kinematic, "published": kinematic, "uniform": kinematic})
+    assert same == [
+        {"one": "kinematic", "other": "published", "rho": 1.0, "overlap": 1.0, "orthogonal": "contradicted"}
+    ]
+    rng = np.random.default_rng(0)
+    found = rates(drives({"bc": 0.2}, rng)["bc"], list(range(SCENARIOS)), np.zeros(SCENARIOS, bool))
+    assert sorted(found) == ["all", "common"] and found["all"]["collision"]["low"] < 0.2
+
+
+def double(number):
+    """What workers do here."""
+    return 2 * number
+
+
+def test_workers_do_every_task():
+    assert sorted(one_core_each(double, [3, 1, 2], cores=1)) == [(1, 2), (2, 4), (3, 6)]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Six drives said to be of the built-in world, two with an event."""
+    path = tmp_path_factory.mktemp("longtail") / "set"
+    with ScenarioWriter(path, SMALL) as writer:
+        for row in range(6):
+            cars = [car(speed=8.0 + row), car(x=30.0 + row, speed=8.0)]
+            events = (Event(3, 8, 30, (101,)),) if row < 2 else ()
+            drive = replace(
+                straight_road(cars),
+                scenario_id=f"drive-{row}",
+                segment=f"r{row}",
+                dataset="drivax",
+                events=events,
+            )
+            writer.add(assemble(drive, SMALL))
+    return ScenarioSet.open(path)
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Trainings in this process: a new one takes half a minute to start and compile."""
+
+    def one_by_one(call, tasks, cores):
+        return [(task, call(task)) for task in tasks]
+
+    monkeypatch.setattr(longtail, "one_core_each", one_by_one)
+
+
+def test_the_whole_study(data, tmp_path, here, capsys):
+    out = tmp_path / "study"
+    sets = ["--data", str(data.path), "--validation", str(data.path), "--test", str(data.path)]
+    arguments = ["study", "longtail", *sets, "--out", str(out), *TINY]
+    assert main(arguments) == 1
+    assert "does not drive well enough" in capsys.readouterr().err
+    assert main([*arguments, "--anyway"]) == 0
+    told = capsys.readouterr()
+    assert "undecided" in told.out and "trained random_matched, seed 1" in told.err
+    results = json.loads((out / "results.json").read_text())
+    assert (
+        results["about"]["test"] == 4 and results["about"]["rare"] == 2
+    )  # as many without an event as with one
+    assert sorted(results["rates"]) == ["baseline", "bc", "expert", "heuristic", "random_matched"]
+    assert results["draws"]["bc"]["effective"] == 1.0
+    page = (out / "report.html").read_text()
+    assert "The conditions of the comparison are not met" in page and "http://" not in page
+    assert (out / "critical.html").is_file()
+    # Everything is there: nothing is trained or driven again.
+    assert main([*arguments, "--anyway"]) == 0
+    assert "trained" not in capsys.readouterr().err
+    assert main([*arguments, "--anyway", "--rare", "0.3"]) == 2
+    assert "holds a study with other settings" in capsys.readouterr().err
+
+
+def test_what_cannot_be_studied_is_refused(data, tmp_path):
+    with pytest.raises(UsageError, match="a study without bc"):
+        settings.load(LongtailConfig, {"agents": ["baseline"]})
+    with pytest.raises(UsageError, match="there is no agent 'heuristics'"):
+        settings.load(LongtailConfig, {"agents": ["baseline", "bc", "heuristics"]})
+    with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
+        Sets.of(data.path, None, ())
+    assert asdict(LongtailConfig())["seeds"] == 5
