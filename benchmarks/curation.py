@@ -1,14 +1,14 @@
 """Does curation find rare events? Scores of every method against the labels of the built-in world's benchmark.
 
     drivax generate sets/bench --benchmark
-    python benchmarks/curation.py events --bench sets/bench
+    python benchmarks/curation.py events --bench sets/bench [--method NAME ...]
     python benchmarks/curation.py speed --data sets/bench/validation
     python benchmarks/curation.py table
 
 ``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
 as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
-``test`` alone says.
+``test`` alone says; scouts are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ from typing import Any
 
 import numpy as np
 
+from drivax import settings
 from drivax.curation.controls import event_kinds, event_steps, matched
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.methods import RARITY, Wanted, curate, table_of
+from drivax.curation.methods import RARITY, Wanted, curate, ensemble_table, table_of
 from drivax.curation.published import PublishedConfig
 from drivax.curation.ranking import auc_interval, precision_at_base_rate, roc_auc
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.scoring import BATCH, score_steps
+from drivax.curation.scouts import ScoutsConfig, train_scouts
 from drivax.curation.weights import WeightConfig, draws_of, weights_of
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.sizes import Sizes
@@ -43,6 +45,16 @@ PAGE = REPOSITORY / "docs" / "results" / "curation.md"
 BEGIN, END = "<!-- curation.py: {} -->", "<!-- curation.py: end -->"
 #: An event forces a reaction where it asks for no less braking than IDM finds comfortable, m/s2.
 FORCED_MPS2 = 3.0
+SCORED = (
+    "kinematic", "published", "ensemble", "ensemble_mixture", "action_rarity", "action_rarity_published"
+)  # fmt: skip
+#: Scouts of point estimates, and of mixtures, which can disagree about modes.
+SCOUTS = {
+    "ensemble": ScoutsConfig(),
+    "ensemble_mixture": settings.load(
+        ScoutsConfig, {}, ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
+    ),
+}
 #: Share of scenarios with an event in an ordinary set (``WorldConfig.rare_rate``).
 NATURAL = 0.05
 
@@ -95,13 +107,15 @@ def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str,
     }
 
 
-def events(bench: Path) -> dict[str, Any]:
-    """Every method on both test sets."""
+def events(bench: Path, only: list[str], methods: dict[str, Any]) -> dict[str, Any]:
+    """Methods, or all of them, on both test sets, beside those that are known."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     truth = Truth.of(sets)
-    methods: dict[str, Any] = {}
-    for name, own, both in scored(sets):
+    methods = dict(methods) if only else {}
+    for name, own, both in scored(sets, bench / "train", only or list(SCORED)):
         methods[name] = found_by(truth, both) | {"draws": draws(own)}
+        if "error_rank_correlation" in own.config:
+            methods[name]["error_rank_correlation"] = own.config["error_rank_correlation"]
         if name == "kinematic":
             methods["random_matched"] = found_by(truth, matched(both, 0)) | {"draws": draws(matched(own, 0))}
         print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
@@ -109,13 +123,25 @@ def events(bench: Path) -> dict[str, Any]:
     return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL, "methods": methods}
 
 
-def scored(sets: list[ScenarioSet]) -> Iterator[tuple[str, ScoreTable, ScoreTable]]:
+def scored(
+    sets: list[ScenarioSet], train: Path, names: list[str]
+) -> Iterator[tuple[str, ScoreTable, ScoreTable]]:
     """By method: the table of the first set, and of all sets one after the other."""
     for name in ("kinematic", "published"):
-        tables = [curate(name, Wanted(data)) for data in sets]
-        yield name, tables[0], joined(tables)
+        if name in names:
+            tables = [curate(name, Wanted(data)) for data in sets]
+            yield name, tables[0], joined(tables)
+    for name in ("ensemble", "ensemble_mixture"):
+        if name in names:
+            scouts = train_scouts(SCOUTS[name], ScenarioSet.open(train))
+            first = ensemble_table(scouts, sets[0])
+            rest = [ensemble_table(scouts, data, scale=first.config["scale"]) for data in sets[1:]]
+            yield name, first, joined([first, *rest])
+    rarities = {"action_rarity": KernelRarity(), "action_rarity_published": PublishedRarity()}
+    if not rarities.keys() & set(names):
+        return
     actions = [score_steps(data, ExpertActions()) for data in sets]
-    for name, config in (("action_rarity", KernelRarity()), ("action_rarity_published", PublishedRarity())):
+    for name, config in rarities.items():
         usual = actions[0]["action"][actions[0]["known"]].astype(np.float64)
         tables = []
         for data, found in zip(sets, actions, strict=True):
@@ -259,6 +285,7 @@ def main() -> None:
     )
     parser.add_argument("what", choices=("events", "speed", "table"))
     parser.add_argument("--bench", type=Path)
+    parser.add_argument("--method", nargs="+", choices=SCORED, default=[])
     parser.add_argument("--data", type=Path)
     parser.add_argument("--count", type=int, default=256)
     args = parser.parse_args()
@@ -266,7 +293,11 @@ def main() -> None:
     if args.what == "table":
         PAGE.write_text(filled(PAGE.read_text(), stored))
         return
-    made = events(args.bench) if args.what == "events" else {"speed": speed(args.data, args.count)}
+    made = (
+        events(args.bench, args.method, stored.get("methods", {}))
+        if args.what == "events"
+        else {"speed": speed(args.data, args.count)}
+    )
     STORED.write_text(json.dumps(stored | made, indent=1) + "\n")
 
 

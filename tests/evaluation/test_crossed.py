@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from drivax.errors import UsageError
-from drivax.evaluation.crossed import crossed_difference, relative_change
+from drivax.evaluation.crossed import crossed_difference, crossed_mean, relative_change
 
 
 def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, both=0.0, shift=0.0):
@@ -46,6 +46,16 @@ def test_of_scenarios_alone_it_is_a_paired_t_test():
     one, other = rng.normal(size=(2, 40))
     a, b = np.tile(one, (3, 1)), np.tile(other, (4, 1))
     assert crossed_difference(a, b).p == pytest.approx(stats.ttest_rel(one, other).pvalue)
+
+
+def test_the_mean_of_one_kind():
+    rng = np.random.default_rng(8)
+    alone = rng.random((1, 40))
+    wanted = stats.ttest_1samp(alone[0], 0.0).confidence_interval()
+    assert crossed_mean(alone).interval() == pytest.approx(tuple(wanted))
+    constant = np.repeat(rng.random((5, 1)), 40, axis=1)
+    wanted = stats.ttest_1samp(constant[:, 0], 0.0).confidence_interval()
+    assert crossed_mean(constant).interval() == pytest.approx(tuple(wanted))
 
 
 def test_clusters_count_once():

@@ -1,15 +1,22 @@
 """Scores of a recorded drive against NumPy and SciPy on the recording itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
+from drivax.cli import main
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.logged import of_logs
+from drivax.curation.methods import Wanted, curate
 from drivax.curation.published import PublishedConfig
+from drivax.curation.scouts import ScoutsConfig
 from drivax.datasets.womd_scenario import WomdScenario
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.schema import Capacity
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +59,38 @@ def test_jerk_of_a_recorded_drive_is_that_of_scipy(recording, bank):
     found = np.asarray(of_logs(KinematicConfig(), bank)["volatility"][0])
     np.testing.assert_allclose(found[:-1], wanted, atol=2e-3)
     assert found[-1] == found[-2]
+
+
+def test_three_commands_find_the_most_critical_scenarios(real_data, repository, tmp_path, monkeypatch):
+    """The page for data engineers, command by command, on a recording instead of a folder of them."""
+    pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
+    page = (repository / "docs/guide/critical-scenarios.md").read_text()
+    block = page.split("```bash\n")[1].split("```")[0]
+    recording = real_data / "womd/motion_data_one_scenario.tfrecord"
+    lines = [line.replace("womd/training", str(recording)) for line in block.splitlines()]
+    lines = [line.replace(" 500", " 1") for line in lines]
+    assert len(lines) == 3 and str(recording) in lines[0] and lines[1].endswith("sets/critical 1")
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        assert main(line.split()[1:]) == 0
+    kept, critical = ScenarioSet.open("sets/womd"), ScenarioSet.open("sets/critical")
+    assert [one.id for one in critical] == [one.id for one in kept]
+    assert critical.manifest["source"]["part_of"]["method"] == "kinematic"
+    assert "rank 1 of 1 by kinematic" in (tmp_path / "critical.html").read_text()
+
+
+@pytest.mark.slow
+def test_scouts_score_recorded_drives(real_data, tmp_path):
+    """An ensemble of two on a recorded drive, twice: both score alike."""
+    pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
+    with ScenarioWriter(tmp_path / "set", Capacity()) as writer:
+        recorded = next(iter(WomdScenario().read(real_data / "womd/motion_data_one_scenario.tfrecord")))
+        writer.add(assemble(recorded))
+        writer.add(assemble(replace(recorded, scenario_id="again", segment="another")))
+    data = ScenarioSet.open(tmp_path / "set")
+    config = ScoutsConfig(
+        folds=2, cloning=replace(ScoutsConfig().cloning, batch=16, updates=5), total_steps=160
+    )
+    table = curate("ensemble", Wanted(data, scouts=config))
+    assert table.steps[table.valid].max() > 0.0
+    np.testing.assert_allclose(table.steps[0], table.steps[1], atol=1e-5)

@@ -10,6 +10,8 @@ import pytest
 
 from browser import acted, browse, needs_browser
 from drivax.cli import main
+from drivax.curation.combining import Combination
+from drivax.curation.scores import ScoreTable, write_scores
 from drivax.errors import UsageError
 from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import Capacity
@@ -113,6 +115,32 @@ def test_the_command(data, tmp_path, capsys):
 
 
 @needs_browser
+def test_the_most_critical_come_first_with_what_their_scores_are_made_of(data, tmp_path, capsys):
+    valid = np.array([scenario.agent_valid[:, 0] for scenario in data])
+    urgency = np.zeros(valid.shape)
+    urgency[:, 20:30] = np.array([[0.2], [0.9], [0.5]])
+    blank = ScoreTable(
+        "kinematic",
+        {},
+        data.hash,
+        ("calm", "bad", "new"),
+        valid,
+        urgency,
+        urgency[:, 0],
+        {"urgency": urgency},
+    )
+    write_scores(blank.combined(Combination({"urgency": 1.0})), tmp_path / "scores.npz")
+    out = tmp_path / "critical.html"
+    arguments = ["view", str(data.path), "--scores", str(tmp_path / "scores.npz"), "--out", str(out)]
+    assert main([*arguments, "--limit", "2"]) == 0
+    text = out.read_text()
+    assert re.findall(r"score (\S+), rank (\d) of 3 by kinematic", text) == [("0.900", "1"), ("0.500", "2")]
+    assert text.count("criticality over time</figcaption>") == 2 and '"id":"calm"' not in text
+    capsys.readouterr()
+    assert main(["view", str(data.path), "--scores", str(tmp_path / "none.npz"), "--out", str(out)]) == 1
+    assert "there are no scores" in capsys.readouterr().err
+
+
 def test_browsing_in_a_browser(page, tmp_path):
     """Opened at the second scenario, then the next one by key, then a filter that only the first one passes."""
     act = """

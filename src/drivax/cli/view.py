@@ -16,6 +16,8 @@ class View:
     Beside the player it shows each scenario's tags, flags and audit. Each scenario adds some tens of kilobytes.
 
     Example: drivax view sets/world --limit 20 --out world.html
+
+    Example: drivax view sets/world --scores scores.npz --limit 20 --out critical.html
     """
 
     set: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
@@ -26,20 +28,38 @@ class View:
     """Only the first so many."""
     ids: tuple[str, ...] = ()
     """Only these scenarios, in this order."""
+    scores: Path | None = None
+    """Scores of SET by drivax curate: shown over time, and the most critical first unless --ids says otherwise."""
     overwrite: bool = False
     """Replace an existing file."""
 
 
 def run(args: View) -> int:
     """Write the page and say where it is and what it leaves out."""
+    from drivax.curation.scores import read_scores
+    from drivax.curation.subset import top_rows
     from drivax.scenario.store import ScenarioSet
+    from drivax.show.criticality import criticality_html
     from drivax.viewer.player import select, write_player
 
     data = ScenarioSet.open(args.set)
     folder = args.set.resolve()
-    chosen = select(data, args.limit, args.ids)
+    beside: list[str] = []
+    if args.scores is None:
+        chosen = select(data, args.limit, args.ids)
+    else:
+        table = read_scores(args.scores, data)
+        chosen = select(
+            data, args.limit, args.ids or [table.scenario_ids[row] for row in top_rows(table, len(data))]
+        )
+        row = {name: row for row, name in enumerate(table.scenario_ids)}
+        beside = [criticality_html(table, row[scenario.id]) for scenario in chosen]
     path = write_player(
-        chosen, args.out or folder.with_name(f"{folder.name}.html"), args.overwrite, title=folder.name
+        chosen,
+        args.out or folder.with_name(f"{folder.name}.html"),
+        args.overwrite,
+        title=folder.name,
+        beside=beside,
     )
     print(f"{path} ({len(chosen)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
     return 0

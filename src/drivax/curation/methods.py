@@ -119,27 +119,41 @@ def _ensemble(wanted: Wanted) -> ScoreTable:
     )
 
 
-def ensemble_table(scouts: Scouts, data: ScenarioSet, progress: Progress | None = None) -> ScoreTable:
+def ensemble_table(
+    scouts: Scouts, data: ScenarioSet, progress: Progress | None = None, scale: float | None = None
+) -> ScoreTable:
     """Scores by the disagreement of an ensemble, which may have been trained on another set.
 
     Components are the disagreement about each number of the action, over the percentile 99 of their sum in the set; of
     scouts trained by likelihood there is one, the mutual information over its largest possible value. The table's
     configuration says how scores and errors of the scouts correlate by rank, over all steps: on the set that they were
     trained on, errors of the one that has not seen the scenario.
+
+    Args:
+        scouts: The ensemble.
+        data: The set.
+        progress: Called with (scenarios done, scenarios).
+        scale: Disagreement that scores 1; by default the percentile 99 of the set.
     """
     opinions = scouts.opinions(data, progress)
     valid = valid_steps(data)
     if opinions.information is None:
         disagreement = opinions.disagreement(scouts.deviation)
-        largest = np.percentile(disagreement.sum(axis=-1)[valid], _MOST)
-        parts = np.clip(disagreement / max(largest, np.finfo(np.float64).tiny), 0.0, 1.0)
+        if scale is None:
+            scale = float(np.percentile(disagreement.sum(axis=-1)[valid], _MOST))
+        parts = np.clip(disagreement / max(scale, np.finfo(np.float64).tiny), 0.0, 1.0)
         components = {f"action_{number}": part for number, part in enumerate(np.moveaxis(parts, -1, 0))}
     else:
         components = {"information": opinions.information / math.log(scouts.config.folds)}
     combination = Combination(dict.fromkeys(components, 1.0), ENSEMBLE_SCENARIO)
     own = data.hash == scouts.set_hash
     error = opinions.error(scouts.deviation, scouts.fold if own else None)
-    about = {**plain(scouts.config), "trained_on": scouts.set_hash, "error_rank_correlation": None}
+    about = {
+        **plain(scouts.config),
+        "trained_on": scouts.set_hash,
+        "scale": scale,
+        "error_rank_correlation": None,
+    }
     table = table_of("ensemble", about, data, components, combination)
     known = opinions.known
     about["error_rank_correlation"] = rank_correlation(table.steps[known], error[known])

@@ -59,7 +59,7 @@ class Crossed:
         """Degrees of freedom; infinite where nothing varies."""
         parts = (*self.seeds, self.scenarios)
         numbers = (*(count - 1 for count in self.agents), self.clusters - 1)
-        below = sum(part**2 / number for part, number in zip(parts, numbers, strict=True))
+        below = sum(part**2 / number for part, number in zip(parts, numbers, strict=True) if part > 0.0)
         return self.error**4 / below if below > 0.0 else math.inf
 
     @property
@@ -109,6 +109,20 @@ class Crossed:
             middle = (low + high) // 2
             low, high = (low, middle) if found(middle) else (middle, high)
         return high
+
+
+def crossed_mean(values: Values, clusters: Any = None) -> Crossed:
+    """The mean of one kind of agents, with an error as that of :func:`crossed_difference`; one agent alone is certain.
+
+    Args:
+        values: One row per agent, one column per scenario; scenarios that some agent leaves undefined are left out.
+        clusters: Labels of the clusters of scenarios; None: every scenario is its own.
+
+    Raises:
+        UsageError: There are fewer than two clusters of scenarios that all define.
+    """
+    twice = values if len(values) > 1 else np.repeat(values, 2, axis=0)
+    return crossed_difference(twice, np.zeros((2, values.shape[1])), clusters)
 
 
 def crossed_difference(a: Values, b: Others, clusters: Any = None) -> Crossed:

@@ -45,7 +45,8 @@ class NetworkConfig:
         activation: After every hidden layer of a head; outputs are linear.
         first_scale: Standard deviation of an untrained policy: before squashing (gaussian), of the action (beta), or
             of the Gaussian whose density gives the levels their probabilities (grid).
-        distribution: Of actions: a squashed Gaussian, a Beta, or a grid of levels, for ``discrete`` actions.
+        distribution: Of actions: a squashed Gaussian, a mixture of three, a Beta, or a grid of levels, for ``discrete``
+            actions.
         shared_encoder: Whether policy and value look through one encoder. Critics never share.
     """
 

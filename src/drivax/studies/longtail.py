@@ -27,6 +27,7 @@ from drivax.evaluation.stored import read_evaluation
 from drivax.learning.loop import train
 from drivax.learning.validation import rank
 from drivax.scenario.store import ScenarioSet
+from drivax.show.criticality import criticality_html
 from drivax.studies.longtail_drives import Say, clusters, drive_all, driven, rare_rows, test_set
 from drivax.studies.longtail_page import write_page
 from drivax.studies.longtail_plan import (
@@ -169,8 +170,14 @@ def study(
     data = ScenarioSet.open(sets.train)
     expert = score_steps(data, ExpertActions())
     write_page(results, tables, expert["action"][expert["known"]], out / REPORT)
-    rows = dict.fromkeys(row for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP))
-    write_player([data[row] for row in rows], out / CRITICAL, overwrite=True, title="most critical drives")
+    tops = {row: tables[name] for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP)}
+    write_player(
+        [data[row] for row in tops],
+        out / CRITICAL,
+        overwrite=True,
+        title="most critical drives",
+        beside=[criticality_html(table, row) for row, table in tops.items()],
+    )
     say(f"wrote {out / REPORT}")
     return results
 

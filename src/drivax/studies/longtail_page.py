@@ -140,11 +140,8 @@ def _rates(results: Mapping[str, Any], kind: str) -> str:
     return f"<h3>{_KINDS[kind]}</h3>" + _table(("agent", *(_SHORT[name] for name in METRICS)), rows)
 
 
-def _mean(interval: Mapping[str, Any]) -> str:
-    if interval["mean"] is None:
-        return "–"
-    low, high = interval["low"], interval["high"]
-    return f"{interval['mean']:.3f}" + ("" if low is None else f" [{low:.3f}, {high:.3f}]")
+def _mean(rate: Mapping[str, float]) -> str:
+    return f"{rate['mean']:.3f} [{rate['low']:.3f}, {rate['high']:.3f}]"
 
 
 def _draws(results: Mapping[str, Any]) -> str:

@@ -14,9 +14,8 @@ from drivax.curation.agents import AGENTS, CURATED
 from drivax.curation.ranking import rank_correlation
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
-from drivax.evaluation.crossed import Crossed, crossed_difference, relative_change
+from drivax.evaluation.crossed import Crossed, crossed_difference, crossed_mean, relative_change
 from drivax.evaluation.hypotheses import holm
-from drivax.evaluation.statistics import crossed_bootstrap
 
 Values = Float[np.ndarray, "seed scenario"]
 #: By metric.
@@ -205,13 +204,16 @@ def rates(driven: Driven, clusters: Sequence[str], rare: Rows) -> dict[str, dict
     """Of one agent: by kind of scenario and metric the mean over seeds and scenarios, with its interval."""
     labels = np.asarray(clusters)
     return {
-        kind: {
-            metric: crossed_bootstrap(driven[metric][:, rows], labels[rows], seed=0).as_dict()
-            for metric in METRICS
-        }
+        kind: {metric: _rate(crossed_mean(driven[metric][:, rows], labels[rows])) for metric in METRICS}
         for kind in ("all", "common", "rare")
-        if (rows := which(kind, rare)).any()
+        if np.unique(labels[rows := which(kind, rare)]).size > 1
     }
+
+
+def _rate(found: Crossed) -> dict[str, float]:
+    """Mean and interval, within what all of these metrics lie in."""
+    low, high = np.clip(found.interval(), 0.0, 1.0)
+    return {"mean": found.difference, "low": float(low), "high": float(high)}
 
 
 def rankings(tables: Mapping[str, ScoreTable]) -> list[dict[str, Any]]:

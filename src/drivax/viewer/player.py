@@ -44,7 +44,11 @@ def select(data: ScenarioSet, limit: int | None = None, ids: Sequence[str] = ())
 
 
 def write_player(
-    scenarios: Sequence[Scenario], out: Path, overwrite: bool = False, title: str = "scenarios"
+    scenarios: Sequence[Scenario],
+    out: Path,
+    overwrite: bool = False,
+    title: str = "scenarios",
+    beside: Sequence[str] = (),
 ) -> Path:
     """Writes the page.
 
@@ -53,6 +57,7 @@ def write_player(
         out: The HTML file; it appears when it is complete.
         overwrite: Replace an existing file.
         title: Heading of the page, as the name of the set.
+        beside: HTML for each scenario that stands above its facts; nothing where it is empty.
 
     Returns:
         ``out``.
@@ -63,7 +68,7 @@ def write_player(
     refuse_page(out, overwrite)
     if not scenarios:
         raise UsageError("there is no scenario to show", cure="name at least one")
-    publish(out, _page(scenarios, title))
+    publish(out, _page(scenarios, title, beside or [""] * len(scenarios)))
     return out
 
 
@@ -75,7 +80,7 @@ def findings(scenario: Scenario) -> str:
     return ", ".join(found)
 
 
-def _page(scenarios: Sequence[Scenario], title: str) -> str:
+def _page(scenarios: Sequence[Scenario], title: str, beside: Sequence[str]) -> str:
     packed = [pack_episode(scenario, [_log(scenario)], scenario.id) for scenario in scenarios]
     unclean = sum(bool(findings(scenario)) for scenario in scenarios)
     audited = sum(bool(scenario.audit) for scenario in scenarios)
@@ -83,7 +88,7 @@ def _page(scenarios: Sequence[Scenario], title: str) -> str:
     return page(
         title,
         f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
-        [_browser(scenarios)],
+        [_browser(scenarios, beside)],
         asset("browser.css", "drivax.viewer"),
         player_data(packed),
         [*player_scripts(), asset("browser.js", "drivax.viewer")],
@@ -97,9 +102,9 @@ def _log(scenario: Scenario) -> Drive:
     return Drive("log", logged_drive(scenario), 0, events, findings(scenario))
 
 
-def _browser(scenarios: Sequence[Scenario]) -> str:
+def _browser(scenarios: Sequence[Scenario], beside: Sequence[str]) -> str:
     buttons = "".join(map(_button, scenarios))
-    details = "".join(map(_details, scenarios))
+    details = "".join(map(_details, scenarios, beside))
     return (
         "<section class=browse><div class=choose><input type=search id=filter placeholder='id, tag or flag' "
         "aria-label='show scenarios with these words'><small id=shown></small>"
@@ -119,8 +124,8 @@ def _button(scenario: Scenario) -> str:
     )
 
 
-def _details(scenario: Scenario) -> str:
-    """Tags, flags, audit and what did not fit, as lists; shown while the scenario is."""
+def _details(scenario: Scenario, beside: str) -> str:
+    """What is to stand there; tags, flags, audit and what did not fit, as lists; shown while the scenario is."""
     source = scenario.source
     about = {
         "steps": int(scenario.steps),
@@ -136,7 +141,7 @@ def _details(scenario: Scenario) -> str:
         ("Source", _facts(about)),
         ("Did not fit", _facts(scenario.overflow) if scenario.overflow else "<p>nothing</p>"),
     )
-    return "<div hidden>" + "".join(f"<h3>{name}</h3>{text}" for name, text in parts) + "</div>"
+    return f"<div hidden>{beside}" + "".join(f"<h3>{name}</h3>{text}" for name, text in parts) + "</div>"
 
 
 def _audit(scenario: Scenario) -> dict[str, Any]:
