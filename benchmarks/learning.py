@@ -14,11 +14,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import os
 import shutil
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +31,7 @@ from drivax.learning.policies import pack_policy
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.show.runs import read_runs
+from drivax.studies.workers import one_core_each
 from drivax.tracking.runs import RunFolder, seed_folders, versions
 from learning_tables import COLUMNS, CURVES, drawn, filled, pages, picture
 
@@ -56,14 +54,9 @@ def trained(args: argparse.Namespace, overrides: list[str]) -> None:
     data, validation = (ScenarioSet.open(args.data / split) for split in ("train", "validation"))
     notes: dict[str, Any] = {"kind": "seeds", "seeds": args.seeds, "validation": validation.hash}
     RunFolder.create(out, config, [data], overwrite=True, **notes)
-    processes, cores = multiprocessing.get_context("spawn"), sorted(os.sched_getaffinity(0))
-    free = processes.SimpleQueue()
-    for core in cores:
-        free.put(core)
-    with ProcessPoolExecutor(len(cores), processes, initializer=_on_one_core, initargs=(free,)) as pool:
-        seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
-        agents = [replace(config, seed=seed) for seed in seeds]
-        took = list(pool.map(partial(_trained_alone, args.data, out), agents))
+    seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
+    agents = [replace(config, seed=seed) for seed in seeds]
+    took = [seconds for _, seconds in one_core_each(partial(_trained_alone, args.data, out), agents)]
     about: dict[str, Any] = {"seconds": max(took), "curves": learning_curves(out)}
     if args.first:
         before = json.loads((kept / TRAINING).read_text())
@@ -77,11 +70,6 @@ def trained(args: argparse.Namespace, overrides: list[str]) -> None:
     for folder in seed_folders(out):
         pack_policy(folder, kept / folder.name, bank, overwrite=True)
     (kept / TRAINING).write_text(json.dumps(about | {"seeds": len(learned()[name])}, indent=1) + "\n")
-
-
-def _on_one_core(free: Any) -> None:
-    # Before JAX starts, which makes as many threads as there are cores.
-    os.sched_setaffinity(0, {free.get()})
 
 
 def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:

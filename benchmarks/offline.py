@@ -1,8 +1,9 @@
-"""Offline updates per second of every algorithm of the presets ``offline/*``, and how many may be drawn per second.
+"""How fast offline learning is: updates of every preset ``offline/*``, scouts alone and side by side, and draws.
 
 Nothing else may run on the machine.
 
-python benchmarks/offline.py --data SET [--write]
+python benchmarks/offline.py --data SET --write
+python benchmarks/offline.py --table     (what is stored, into docs/algorithms/offline.md)
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import jax
 import numpy as np
 
 from drivax import settings
+from drivax.curation.scouts import ScoutsConfig, train_scouts
 from drivax.learning.agents import Agents
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
@@ -33,6 +35,8 @@ from drivax.scenario.store import ScenarioSet
 from drivax.tracking.runs import versions
 
 RESULT = Path(__file__).resolve().parent / "results" / "offline.json"
+PAGE = RESULT.parents[2] / "docs" / "algorithms" / "offline.md"
+BEGIN, END = "<!-- offline.py: begin -->", "<!-- offline.py: end -->"
 ALGORITHMS = ("bc", "cql", "cql_bc", "iql", "td3_bc")
 SCENARIOS, DRAWS = 10_000, 1_000_000
 
@@ -48,9 +52,8 @@ def seconds(call: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def updates(name: str, data: ScenarioSet, repeats: int) -> dict[str, Any]:
-    """Of one preset: updates per second, parameters that gradients change, and what preparing the steps took."""
-    config = replace(settings.load(TrainConfig, f"offline/{name}"), devices=1)
+def updates(config: TrainConfig, data: ScenarioSet, repeats: int) -> dict[str, Any]:
+    """Of one training: updates per second, parameters that gradients change, and what preparing the steps took."""
     environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     began = time.perf_counter()
@@ -75,6 +78,26 @@ def updates(name: str, data: ScenarioSet, repeats: int) -> dict[str, Any]:
     }
 
 
+def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
+    """Seconds per iteration of the default ensemble, and of one of its scouts alone."""
+    config = ScoutsConfig()
+    one = updates(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data, repeats)
+    config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
+    ends: list[float] = []
+    train_scouts(config, data, lambda done, total: ends.append(time.perf_counter()))
+    all_of_them = statistics.median(np.diff(ends))
+    alone = config.cloning.updates / one["updates_per_second"]
+    return {
+        "scouts": config.folds,
+        "parameters_of_one": one["parameters"],
+        "batch": config.cloning.batch,
+        "updates": config.cloning.updates,
+        "seconds_of_one": round(alone, 3),
+        "seconds_of_all": round(all_of_them, 3),
+        "ratio": round(all_of_them / alone, 2),
+    }
+
+
 def draws() -> int:
     """Places drawn per second among 10,000 scenarios of 91 steps, by uneven weights."""
     made = sampler(np.random.default_rng(0).gamma(0.5, size=(SCENARIOS, 91)))
@@ -82,15 +105,38 @@ def draws() -> int:
     return round(DRAWS / seconds(lambda: call(made, jax.random.key(0), (DRAWS,)), 5))
 
 
+def table(result: dict[str, Any]) -> str:
+    """What the page shows."""
+    rows = ["| algorithm | updates/s | batch | parameters |", "|---|---:|---:|---:|"]
+    rows += [
+        f"| `offline/{name}` | {one['updates_per_second']} | {one['batch']} | {one['parameters']:,} |"
+        for name, one in result["algorithms"].items()
+    ]
+    one = result["scouts"]
+    return "\n".join(rows) + (
+        f"\n\n{one['scouts']} scouts of {one['parameters_of_one']:,} parameters, batch {one['batch']}: "
+        f"{one['seconds_of_all']} s for {one['updates']} updates side by side, {one['ratio']} times as long as one "
+        f"alone. Steps are drawn {result['draws_per_second']:,} times per second ({', '.join(result['devices'])})."
+    )
+
+
 def main() -> None:
     """Measures, shows and stores."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--write", action="store_true", help="store the result")
+    parser.add_argument("--table", action="store_true", help="put what is stored into the page")
     args = parser.parse_args()
+    if args.table:
+        before, rest = PAGE.read_text().split(BEGIN)
+        shown = table(json.loads(RESULT.read_text()))
+        PAGE.write_text(f"{before}{BEGIN}\n\n{shown}\n\n{END}{rest.split(END)[1]}")
+        return
+    if args.data is None:
+        parser.error("--data is needed")
     data = ScenarioSet.open(args.data)
     result = {
         "command": "python benchmarks/offline.py --data SET --write",
@@ -98,7 +144,13 @@ def main() -> None:
         "devices": [device.device_kind for device in jax.devices()],
         "scenarios": len(data),
         "draws_per_second": draws(),
-        "algorithms": {name: updates(name, data, args.repeats) for name in ALGORITHMS},
+        "scouts": scouts(data, args.repeats),
+        "algorithms": {
+            name: updates(
+                replace(settings.load(TrainConfig, f"offline/{name}"), devices=1), data, args.repeats
+            )
+            for name in ALGORITHMS
+        },
         "versions": versions(),
     }
     print(json.dumps(result, indent=1))

@@ -106,7 +106,9 @@ def claims(agents: Sequence[str]) -> list[Claim]:
         lot = "random_matched_scenario" if AGENTS[name].scale == "scenario" else "random_matched"
         if lot in agents:
             found.append(Claim(f"{name} collides less than the same weights dealt out by lot", name, lot))
-            found.append(Claim(f"{name} collides less than those in rare scenarios", name, lot, rows="rare"))
+            found.append(
+                Claim(f"{name} collides less than weights by lot where it is rare", name, lot, rows="rare")
+            )
     for one, other, words in (
         ("ensemble", "heuristic", "uncertainty collides less than the heuristic"),
         ("action_rarity", "heuristic", "action rarity collides less than the heuristic"),
