@@ -178,7 +178,7 @@ def relative_change(a: Values, b: Others, clusters: Any = None) -> tuple[float, 
 
 
 def _defined(a: Values, b: Others) -> Bool[np.ndarray, " scenario"]:
-    return ~np.isnan(np.concatenate([a, b])).any(axis=0)
+    return np.asarray(~np.isnan(np.concatenate([a, b])).any(axis=0))
 
 
 def _finite(freedom: float) -> float:
