@@ -1,0 +1,72 @@
+"""The page of a long-tail study, of results that are known; in a browser."""
+
+import numpy as np
+import pytest
+
+from browser import acted, browse, needs_browser
+from drivax.curation.scores import ScoreTable
+from drivax.studies.longtail_page import write_page
+from drivax.studies.longtail_results import METRICS
+
+RATE = {metric: {"mean": 0.1234, "low": 0.1, "high": 0.15} for metric in METRICS}
+CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "metric": "collision", "rows": "all"}
+RESULTS = {
+    "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True},
+    "conditions": [{"agent": "baseline", "progress": 0.93, "change": 0.004, "met": True}],
+    "detectable": dict.fromkeys(METRICS, 0.031),
+    "claims": [
+        {
+            "claim": CLAIM | {"change": None}, "verdict": "supported", "needed": "", "difference": -0.05,
+            "interval": [-0.08, -0.02], "p": 0.001, "adjusted": 0.02, "change": [-0.3, -0.5, -0.1],
+        },
+        {
+            "claim": CLAIM | {"change": None}, "verdict": "undecided", "needed": "41 seeds each", "difference": None,
+            "interval": None, "p": None, "adjusted": None, "change": None,
+        },
+    ],
+    "rates": {name: {"all": RATE, "rare": RATE} for name in ("expert", "baseline")},
+    "draws": {"baseline": dict.fromkeys(("effective", "effective_scenarios", "tilt", "largest", "concentration"), 1.0)},
+    "rankings": [
+        {"one": "kinematic", "other": "ensemble", "rho": 0.41, "overlap": 0.2, "orthogonal": "contradicted"}
+    ],
+    "mean_q": {"collision": {"difference": 0.2, "interval": [0.1, 0.3]}},
+}  # fmt: skip
+
+
+@pytest.fixture
+def page(tmp_path):
+    rng = np.random.default_rng(0)
+    steps = rng.random((20, 91))
+    table = ScoreTable(
+        "kinematic",
+        {},
+        "hash",
+        tuple(f"drive-{row}" for row in range(20)),
+        np.ones((20, 91), bool),
+        steps,
+        steps.mean(axis=1),
+        {"urgency": steps},
+    )
+    write_page(RESULTS, {"kinematic": table}, rng.normal(0, 0.3, (500, 2)), tmp_path / "report.html")
+    return tmp_path / "report.html", table
+
+
+def test_it_says_what_was_found(page):
+    path, table = page
+    text = path.read_text()
+    assert "2 claims: 1 supported, 0 contradicted, 1 undecided" in text
+    assert "a &lt; b &amp; c" in text and "-0.050 [-0.080, -0.020]" in text and "-30% [-50%, -10%]" in text
+    assert "▲ supported" in text and "41 seeds each" in text
+    assert "1,126 test scenarios (563 of them rare, labelled)" in text
+    assert "The conditions of the comparison are not met" not in text
+    assert "kinematic and ensemble" in text and "+0.41" in text
+    assert table.scenario_ids[int(table.scenarios.argmax())] in text
+    assert "Common scenarios" not in text  # there are none in these results
+
+
+@needs_browser
+def test_it_fits_a_phone(page, tmp_path):
+    path, _ = page
+    act = "document.body.dataset.wide = document.documentElement.scrollWidth - innerWidth;"
+    dom = browse(acted(path, act), tmp_path, "--dump-dom", "--window-size=500,900")
+    assert 'data-wide="0"' in dom
