@@ -420,3 +420,19 @@ def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
     state = Checkpoints(run.checkpoints).restore(jax.eval_shape(learner.init, bank, jax.random.key(0)))
     assert rows[-1]["validation/mean_q"] == pytest.approx(learner.judge(held_out, state)["mean_q"], rel=1e-5)
     assert isinstance(planner, Planner)
+
+
+@pytest.mark.parametrize(("kind", "every"), [(IQL, 1), (TD3_BC, TD3_BC.delay)])
+def test_rates_fall_linearly_over_the_run(kind, every):
+    """Adam's step under a constant gradient is its rate, whatever moves how often."""
+    config = replace(kind, updates=10, last_rate=0.25, policy_rate=1e-3, gradient_norm=1e6)
+    learner = config.build(Told(), arms([0.0], [0.0]), 4)
+    adam = learner.adam(config.policy_rate, every)
+    weights = jnp.zeros(1)
+
+    def move(state, _):
+        change, state = adam.update(jnp.ones(1), state, weights)
+        return state, change[0]
+
+    moves = -np.asarray(jax.lax.scan(move, adam.init(weights), None, 40 // every + 1)[1])
+    np.testing.assert_allclose(moves, np.linspace(1e-3, 0.25e-3, 40 // every + 1), rtol=1e-4)

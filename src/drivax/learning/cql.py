@@ -69,18 +69,18 @@ class CqlConfig(OfflineConfig):
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Cql:
         """CQL in an environment."""
-        return Cql(self, environment, data)
+        return Cql(self, environment, data, iterations)
 
 
 class Cql(Offline):
     """CQL in one environment."""
 
-    def __init__(self, config: CqlConfig, environment: Environment, data: Any) -> None:
+    def __init__(self, config: CqlConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config = config
         self.target_entropy = (
             -float(environment.action_size) if config.target_entropy is None else config.target_entropy
         )
-        super().__init__(config, environment, data)
+        super().__init__(config, environment, data, iterations)
 
     def numbers(self) -> dict[str, float]:
         """Logarithms of the temperature, and of the multiplier if there is one."""

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 from drivax.errors import UsageError
 from drivax.learning.environment import Environment
 from drivax.learning.offline import Improved, Offline, OfflineConfig, Trained
-from drivax.learning.optimisers import clipped_adam
 from drivax.learning.replay import Transitions
 from drivax.networks.actor_critic import Value
 from drivax.rl.offline import advantage_weights, expectile_loss
@@ -50,15 +49,15 @@ class IqlConfig(OfflineConfig):
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Iql:
         """IQL in an environment."""
-        return Iql(self, environment, data)
+        return Iql(self, environment, data, iterations)
 
 
 class Iql(Offline):
     """IQL in one environment."""
 
-    def __init__(self, config: IqlConfig, environment: Environment, data: Any) -> None:
+    def __init__(self, config: IqlConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config = config
-        super().__init__(config, environment, data)
+        super().__init__(config, environment, data, iterations)
 
     def networks(self, key: Array) -> dict[str, nnx.Module]:
         """A value beside policy and critics."""
@@ -67,9 +66,7 @@ class Iql(Offline):
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
         """The value learns as the critics do."""
-        return super().optimisers() | {
-            "value": clipped_adam(self.config.critic_rate, self.config.gradient_norm)
-        }
+        return super().optimisers() | {"value": self.adam(self.config.critic_rate)}
 
     def loss(
         self, trained: Trained, target: Mapping[str, Any], part: Transitions, improved: Improved, key: Array

@@ -49,6 +49,7 @@ class OfflineConfig:
         gamma: Discount.
         tau: How far targets move toward what they follow per update.
         policy_rate, critic_rate: Learning rates of Adam; a value learns as fast as the critics.
+        last_rate: Both fall linearly over the run to so many times themselves; 1: they stay.
         gradient_norm: Gradients of each network are clipped to this global norm.
         normalise: Whether every feature of an observation is shifted and scaled by its mean and deviation over recorded
             steps, in front of every encoder.
@@ -63,6 +64,7 @@ class OfflineConfig:
     tau: float = 0.005
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
+    last_rate: float = 1.0
     gradient_norm: float = 10.0
     normalise: bool = False
     fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
@@ -139,8 +141,9 @@ class Offline:
     #: Names of what has a slowly following target.
     follows: ClassVar[tuple[str, ...]] = ("critic",)
 
-    def __init__(self, config: OfflineConfig, environment: Environment, data: Any) -> None:
+    def __init__(self, config: OfflineConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.settings, self.environment = config, environment
+        self.updates = iterations * config.updates
         self.spec = environment.shapes(data)
         self.optimiser = optax.partition(self.optimisers(), {name: name for name in self.optimisers()})
         # Only the structures are wanted: no number is drawn.
@@ -163,11 +166,16 @@ class Offline:
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
         """What moves each of them."""
-        config = self.settings
         return {
-            "policy": clipped_adam(config.policy_rate, config.gradient_norm),
-            "critic": clipped_adam(config.critic_rate, config.gradient_norm),
+            "policy": self.adam(self.settings.policy_rate),
+            "critic": self.adam(self.settings.critic_rate),
         }
+
+    def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
+        """Adam of something that moves in every, or every so manieth, update."""
+        config = self.settings
+        falls = self.updates // every if config.last_rate != 1.0 else 0
+        return clipped_adam(rate, config.gradient_norm, updates=falls, last=config.last_rate)
 
     def loss(
         self, trained: Trained, target: Mapping[str, Any], part: Transitions, improved: Improved, key: Array

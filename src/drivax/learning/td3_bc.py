@@ -46,7 +46,7 @@ class Td3BcConfig(OfflineConfig):
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Td3Bc:
         """TD3+BC in an environment."""
-        return Td3Bc(self, environment, data)
+        return Td3Bc(self, environment, data, iterations)
 
 
 class Td3Bc(Offline):
@@ -54,18 +54,19 @@ class Td3Bc(Offline):
 
     follows: ClassVar[tuple[str, ...]] = ("critic", "policy")
 
-    def __init__(self, config: Td3BcConfig, environment: Environment, data: Any) -> None:
+    def __init__(self, config: Td3BcConfig, environment: Environment, data: Any, iterations: int) -> None:
         self.config = config
-        super().__init__(config, environment, data)
+        super().__init__(config, environment, data, iterations)
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
         """The policy's rests between its updates."""
-        delay, every = self.config.delay, super().optimisers()
+        delay = self.config.delay
+        policy = self.adam(self.config.policy_rate, delay)
 
         def moves(step: Any, **_: Any) -> Any:
             return step % delay == delay - 1
 
-        return every | {"policy": optax.conditionally_mask(every["policy"], moves)}
+        return super().optimisers() | {"policy": optax.conditionally_mask(policy, moves)}
 
     def loss(
         self, trained: Trained, target: Mapping[str, Any], part: Transitions, improved: Improved, key: Array

@@ -165,7 +165,7 @@ def study(
         )
     train_all(config, sets, out, config.agents, cores, say)
     drive_all(config, out, test, config.agents, say)
-    results = found(config, out, test, tables, met)
+    results = findings(config, out, test, tables, met)
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
     data = ScenarioSet.open(sets.train)
     expert = score_steps(data, ExpertActions())
@@ -212,7 +212,7 @@ def detectable(config: LongtailConfig, out: Path, test: ScenarioSet) -> dict[str
     return {name: crossed_difference(one[name], other[name], labels).detectable() for name in METRICS}
 
 
-def found(
+def findings(
     config: LongtailConfig,
     out: Path,
     test: ScenarioSet,
