@@ -31,8 +31,8 @@ from drivax.learning.policies import pack_policy
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.show.runs import read_runs
-from drivax.studies.workers import one_core_each
 from drivax.tracking.runs import RunFolder, seed_folders, versions
+from drivax.tracking.workers import one_core_each
 from learning_tables import COLUMNS, CURVES, drawn, filled, pages, picture
 
 RESULT = Path(__file__).resolve().parent / "results" / "learning.json"

@@ -42,7 +42,9 @@ def data(tmp_path_factory):
 def tables(data, tmp_path_factory):
     like = tmp_path_factory.mktemp("tables") / "kinematic.npz"
     write_scores(curate("kinematic", Wanted(data)), like)
-    return {name: curate(name, Wanted(data, like if name == "random_matched" else None)) for name in METHODS}
+    # An ensemble has to be trained first, and has tests of its own.
+    names = [name for name in METHODS if name != "ensemble"]
+    return {name: curate(name, Wanted(data, like if name == "random_matched" else None)) for name in names}
 
 
 def test_every_method_scores_every_step_and_comes_back(data, tables, tmp_path):

@@ -124,6 +124,7 @@ def test_the_table_of_an_ensemble(data, scouts, weighted):
     assert table.config["trained_on"] == data.hash
 
 
+@pytest.mark.slow
 def test_the_command_trains_scouts_that_can_disagree_about_modes(data, tmp_path, capsys):
     out = tmp_path / "scores.npz"
     arguments = ["curate", "ensemble", "--data", str(data.path), "--out", str(out), "--folds", "2"]

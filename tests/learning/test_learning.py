@@ -111,7 +111,8 @@ def test_settings_that_cannot_be_meant():
         ({"latest_start": 9}, r"latest_start is 9; use 10 \(earliest_start\) to 88"),
         ({"earliest_start": -1}, "earliest_start is -1; use 0 or more"),
         ({"patience": 2}, "patience needs validations; set evaluate_every"),
-        ({"checkpoint_every": 0}, "checkpoint_every is at least 1"),
+        ({"checkpoint_every": 0}, "checkpoint_every and keep at least 1"),
+        ({"keep": 0}, "checkpoint_every and keep at least 1"),
         ({"task": {"actions": {"kind": "direct_state"}}}, "cannot learn in direct_state"),
     ):
         with pytest.raises(UsageError, match=words):

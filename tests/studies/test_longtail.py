@@ -19,7 +19,6 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.studies import longtail
 from drivax.studies.longtail_plan import LongtailConfig, Sets
 from drivax.studies.longtail_results import METRICS, Condition, judge, needed, rankings, rates
-from drivax.studies.workers import one_core_each
 from scenes import SMALL, car, straight_road
 
 SEEDS, SCENARIOS = 5, 400
@@ -120,15 +119,6 @@ def test_rankings_and_rates(data):
     rng = np.random.default_rng(0)
     found = rates(drives({"bc": 0.2}, rng)["bc"], list(map(str, range(SCENARIOS))), np.zeros(SCENARIOS, bool))
     assert sorted(found) == ["all", "common"] and found["all"]["collision"]["low"] < 0.2
-
-
-def double(number):
-    """What workers do here."""
-    return 2 * number
-
-
-def test_workers_do_every_task():
-    assert sorted(one_core_each(double, [3, 1, 2], cores=1)) == [(1, 2), (2, 4), (3, 6)]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from drivax.tracking.workers import worker_pool
+from drivax.tracking.workers import one_core_each, worker_pool
 
 PROGRAM = """
 import sys, time
@@ -51,3 +51,12 @@ def test_a_killed_parent_takes_its_workers_along(tmp_path, end):
     process.wait()
     process.stdout.close()
     assert group_is_gone(process.pid, 10.0)
+
+
+def on_which_cores(number):
+    """What workers do here."""
+    return number, len(os.sched_getaffinity(0))
+
+
+def test_every_task_has_one_core():
+    assert sorted(one_core_each(on_which_cores, [3, 1, 2], cores=2)) == [(n, (n, 1)) for n in (1, 2, 3)]

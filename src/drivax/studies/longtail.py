@@ -44,10 +44,10 @@ from drivax.studies.longtail_plan import (
     run_of,
 )
 from drivax.studies.longtail_results import METRICS, Condition, judge, rankings, rates, summary
-from drivax.studies.workers import one_core_each
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder, write_text
 from drivax.tracking.sinks import read_rows
+from drivax.tracking.workers import one_core_each
 from drivax.viewer.player import write_player
 
 _PROGRESS = "validation/progress_ratio"

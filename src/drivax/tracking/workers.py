@@ -7,16 +7,51 @@ import os
 import signal
 import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 
-def worker_pool(workers: int) -> ProcessPoolExecutor:
+def worker_pool(workers: int, cores: Sequence[int] | None = None) -> ProcessPoolExecutor:
     """A pool of fresh processes: on Ctrl-C they die silently, and a parent that is killed takes them along.
 
     Args:
         workers: Number of processes.
+        cores: The one core that each may use; None: any.
     """
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_start)
+    processes = multiprocessing.get_context("spawn")
+    free: Any = None
+    if cores is not None:
+        free = processes.SimpleQueue()
+        for core in cores:
+            free.put(core)
+    return ProcessPoolExecutor(workers, processes, initializer=_start, initargs=(free,))
+
+
+def one_core_each(
+    call: Callable[[Task], Result], tasks: Sequence[Task], cores: int | None = None
+) -> Iterator[tuple[Task, Result]]:
+    """Calls a function of every task in a process that has one core, and yields each result when it is there.
+
+    So trainings run side by side: none waits for another, and none changes another's bits.
+
+    Args:
+        call: A function of a module, which a new process can import.
+        tasks: What it is called with.
+        cores: How many cores to use at most; None: all that this process may use.
+    """
+    known = sorted(os.sched_getaffinity(0))[:cores]
+    with worker_pool(len(known), known) as pool:
+        waiting = {pool.submit(call, task): task for task in tasks}
+        try:
+            for done in as_completed(waiting):
+                yield waiting[done], done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def await_interrupt() -> None:
@@ -25,10 +60,13 @@ def await_interrupt() -> None:
     Raises:
         KeyboardInterrupt: That was it.
     """
-    time.sleep(0.3)
+    time.sleep(2.0)  # a busy machine is late
 
 
-def _start() -> None:
+def _start(free: Any) -> None:
+    if free is not None:
+        # Before JAX starts, which makes as many threads as there are cores.
+        os.sched_setaffinity(0, {free.get()})
     # On Ctrl-C workers die at once and silently; the parent cleans up.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_die_with_parent, daemon=True).start()
