@@ -67,8 +67,8 @@ def help_of(command: str) -> str:
 
 #: Pages that take more than a few seconds; what they say is tested quickly elsewhere.
 SLOW_PAGES = (
-    "docs/guide/custom.md", "docs/guide/dynamics.md", "docs/guide/gymnasium.md", "docs/guide/planners.md",
-    "docs/guide/rewards.md", "docs/guide/traffic.md", "docs/start/own_loop.md",
+    "docs/guide/custom.md", "docs/guide/dynamics.md", "docs/guide/evaluate.md", "docs/guide/gymnasium.md",
+    "docs/guide/planners.md", "docs/guide/rewards.md", "docs/guide/traffic.md", "docs/start/own_loop.md",
 )  # fmt: skip
 PYTHON_PAGES = [
     pytest.param(page, marks=pytest.mark.slow) if str(page.relative_to(REPOSITORY)) in SLOW_PAGES else page

@@ -83,6 +83,7 @@ def test_how_far_it_goes_until_it_fails(script):
     np.testing.assert_array_equal(found["metres_until_failure"], [3, 5, 0])
 
 
+@pytest.mark.slow
 def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
     benchmark = script("benchmark")
     monkeypatch.setattr(benchmark, "EPISODES", tmp_path)

@@ -68,6 +68,7 @@ def test_ids(name):
     )
 
 
+@pytest.mark.slow
 def test_environments_by_id(data):
     """On scenarios of the built-in world where none are given; Gymnasium's own wrappers check every call."""
     made = gymnasium.make("drivax/minimal-v0", data=data).unwrapped
@@ -81,6 +82,7 @@ def test_environments_by_id(data):
     assert isinstance(vector, VectorDrivingEnv) and vector.num_envs == 2
 
 
+@pytest.mark.slow
 def test_discrete_actions(data):
     """Choice i of 7 x 13 is acceleration level i // 13 and curvature level i % 13; the middle one does nothing."""
     env = DrivingEnv(data, replace(SMALL, actions=TASKS["discrete"].actions))
@@ -95,6 +97,7 @@ def test_discrete_actions(data):
             env.step(action)
 
 
+@pytest.mark.slow
 def test_spaces_are_the_tasks_groups(data):
     env = DrivingEnv(data)
     assert set(env.observation_space) == {
@@ -131,6 +134,7 @@ def test_a_step_is_the_simulators(env, data):
             np.testing.assert_allclose(got[name], wanted[name], atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_log_ends_truncated_with_the_metrics_of_an_evaluation(data):
     """Zero actions are the planner constant_velocity."""
     env = DrivingEnv(data, judging(SMALL))
@@ -221,6 +225,7 @@ def test_steps_are_compiled_once(data):
     assert {device.platform for leaf in jax.tree.leaves(third._state) for device in leaf.devices()} == {"cpu"}
 
 
+@pytest.mark.slow
 def test_a_batch_is_as_many_single_environments(data, env):
     """Every number of a batch of three against the same episodes one by one, through ends and new beginnings."""
     vector = VectorDrivingEnv(3, data, SMALL)

@@ -38,6 +38,7 @@ def trained(place, data, out, *more):
     return main([*call, *more])
 
 
+@pytest.mark.slow
 def test_scores_weigh_what_is_learned_from(place, capsys):
     scores = ("--scores", str(place / "scores.npz"), "--scale", "scenario")
     assert trained(place, "set-3", "weighted", *scores) == 0

@@ -106,6 +106,7 @@ def test_information_tells_modes_that_a_mean_does_not():
     assert float(mutual_information(stacked(sides(50.0), sides(-50.0)), key)) == pytest.approx(math.log(2))
 
 
+@pytest.mark.slow
 def test_each_scout_is_trained_without_its_fold(scouts, data):
     assert scouts.set_hash == data.hash
     told = scouts.opinions(data)

@@ -452,6 +452,7 @@ def every_file(folder):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "filtered", "deaths"), [(1, "all", (6, 13, 14, 26)), (2, "filtered", (6, 14))]
 )
@@ -587,6 +588,7 @@ if __name__ == "__main__":
 # --- The commands.
 
 
+@pytest.mark.slow
 def test_command_says_what_it_wrote_and_what_it_skipped(folder, tmp_path, capsys):
     (folder / "notes.txt").write_text("not a recording")
     assert main(["convert", str(folder), str(tmp_path / "set"), "--workers", "1"]) == 0

@@ -137,6 +137,7 @@ LEAN = ["--task.metrics", "none", "--task.observation.road", "0", "--task.observ
 QUICK = ("dynamics", "agents", "contacts", "ttc", "edges", "lanes", "route", "metrics")
 
 
+@pytest.mark.slow
 def test_bench(data, capsys, monkeypatch):
     parts = bench._parts
     monkeypatch.setattr(bench, "_parts", lambda of: {name: parts(of)[name] for name in QUICK})
@@ -169,6 +170,7 @@ def test_bench_by_metric_set(data, capsys, monkeypatch):
     assert next(row["relative"] for row in rows if (row["metrics"], row["batch"]) == ("full", 2)) == 1.0
 
 
+@pytest.mark.slow
 def test_a_part_of_a_set_has_the_rows_of_the_whole(evaluation, data, tmp_path, capsys):
     names = [one.id for one in ScenarioSet.open(data)]
     (tmp_path / "some.txt").write_text("\n".join(names[2:]))

@@ -111,6 +111,7 @@ def test_doctor_agrees_with_the_conversion(real_data):
         assert f"format {name}: " in said and files
 
 
+@pytest.mark.slow
 def test_filters_of_the_command_line(real_data, tmp_path):
     said = drivax(
         "convert", real_data / "scenarionet", tmp_path / "set", "--filter", "dataset=nuscenes", "--limit", "2"

@@ -39,6 +39,7 @@ def driven(out):
         return dict(stored)
 
 
+@pytest.mark.slow
 def test_a_sampling_checkpoint_from_noisy_starts_over_an_old_run(data, tmp_path, capsys):
     run = write_run(tmp_path / "bold", load(data).bank)
     out, planner = tmp_path / "run", f"{run.path}@4"

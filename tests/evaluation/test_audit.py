@@ -43,6 +43,7 @@ def test_every_finding_is_one_that_filters_know(found):
             assert not quantity.words or value in quantity.words
 
 
+@pytest.mark.slow
 def test_it_agrees_with_the_evaluation_of_the_expert(world, found):
     results = evaluate(Expert(), world.bank, world.names)
     for row, finding in enumerate(found):
@@ -57,6 +58,7 @@ def test_it_agrees_with_the_evaluation_of_the_expert(world, found):
         assert finding["route_reaches_goal"] == (metric["goal_distance"] <= 3.0)
 
 
+@pytest.mark.slow
 def test_companions_and_batches_change_nothing(world, found):
     scenarios = list(world.scenarios)
     assert audit(scenarios * 12) == found * 12 and len(found) * 12 > BATCH
@@ -186,6 +188,7 @@ def test_a_level_above_is_no_collision():
     assert same["log_collides"] is True and other["log_collides"] is False
 
 
+@pytest.mark.slow
 def test_the_ego_of_every_real_file_is_clean(real_data):
     """No collision, at most 1 % of the steps off the road, no false finding through z on the overpass."""
     scenarios = []
@@ -201,6 +204,7 @@ def test_the_ego_of_every_real_file_is_clean(real_data):
         assert finding["first_onroad_step"] == CURRENT_STEP, scenario.id
 
 
+@pytest.mark.slow
 def test_clipped_shares_count_what_the_log_asks_for():
     # Braking at 5 m/s2 from step 20 to 29 is within `physical` and beyond `published`; at 9 m/s2 beyond both.
     def braking(deceleration):

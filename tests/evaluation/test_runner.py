@@ -69,6 +69,7 @@ def by_scenario(results):
     }
 
 
+@pytest.mark.slow
 def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whole, driven):
     expected = by_scenario(whole)
     assert len(expected) == COUNT

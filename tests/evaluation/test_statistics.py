@@ -294,6 +294,7 @@ def test_crossed_bootstrap_of_interquartile_means_is_the_exact_distribution():
     assert found.high == pytest.approx(np.quantile(means, 0.9), abs=0.06)
 
 
+@pytest.mark.slow
 def test_crossed_bootstrap_against_others_draws_their_agents_too():
     values, others = np.array([[0.0, 2.0], [3.0, 5.0]]), np.array([[1.0, 1.0], [0.0, 4.0], [2.0, 6.0]])
     differences = [

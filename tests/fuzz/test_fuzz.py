@@ -1,4 +1,4 @@
-"""Every reader survives damaged files: 200 in each run, 10,000 in the slow one."""
+"""Every reader survives damaged files: 50 in each run, 10,000 in the slow one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _run(repository, name: str, files: int, seed: int) -> str:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_end_in_a_clear_error_or_a_sound_scenario(repository, name):
-    ends = _run(repository, name, files=200, seed=0)
+    ends = _run(repository, name, files=50, seed=0)
     assert '"bad record"' in ends or '"error"' in ends, "no damage was noticed: the damage is too gentle"
 
 

@@ -7,12 +7,12 @@ import sys
 import pytest
 
 CASES = [
-    ("ppo", "two"),
-    ("sac", "two"),
     ("bc", "none"),
     *(
         pytest.param(*case, marks=pytest.mark.slow)
         for case in (
+            ("ppo", "two"),
+            ("sac", "two"),
             ("ppo", "four_and_seeds"),
             ("sac", "four_and_seeds"),
             ("sac_observations", "two"),

@@ -119,6 +119,7 @@ def test_settings_that_cannot_be_meant():
             settings.load(TrainConfig, values)
 
 
+@pytest.mark.slow
 def test_what_is_recorded_of_a_run(data, tmp_path):
     run = train(replace(config_of("ppo"), total_steps=2 * 8 * 16), data, tmp_path / "run")
     info = json.loads((tmp_path / "run" / "run.json").read_text())

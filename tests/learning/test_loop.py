@@ -90,6 +90,7 @@ def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_
         train(config, data, tmp_path / "cut", resume=True, seeds=3)
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
     """The toy adds random numbers of its key to its parameters, so what it began with is what a fresh one lacks."""
     former = train(config, data, tmp_path / "former").path

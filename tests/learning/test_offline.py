@@ -288,7 +288,9 @@ def bandit():
         ),
         pytest.param(CqlConfig(network=NETWORK, penalty=1.0, **FAST), True, id="cql"),
         pytest.param(IqlConfig(network=NETWORK, inverse_temperature=10.0, **FAST), True, id="iql"),
-        pytest.param(Td3BcConfig(network=NETWORK, q_weight=100.0, **FAST), False, id="td3"),
+        pytest.param(
+            Td3BcConfig(network=NETWORK, q_weight=100.0, **FAST), False, id="td3", marks=pytest.mark.slow
+        ),
         pytest.param(Td3BcConfig(network=NETWORK, q_weight=0.2, **FAST), True, id="td3_bc"),
     ],
 )
@@ -316,6 +318,7 @@ def test_a_timeout_is_worth_what_follows():
         assert logs["loss/mean_value"] == pytest.approx(worth, rel=0.05)
 
 
+@pytest.mark.slow
 def test_weights_choose_what_is_learned_from(bandit):
     """Only the arms around 0.3 have weight: for all that is learned, or for the policy alone."""
     weights = np.zeros((500, 2))

@@ -104,6 +104,7 @@ def test_the_pendulum_is_gymnasiums():
         assert truncated == (number == 199)
 
 
+@pytest.mark.slow
 def test_sac_swings_up(expert):
     found, _, logs = expert
     assert (found > -200).all(), found
@@ -116,12 +117,14 @@ def test_sac_swings_up(expert):
     assert float(np.asarray(logs["loss/mean_q/n"])[0].max()) == 0.0, "nothing is learned while warming up"
 
 
+@pytest.mark.slow
 def test_ppo_swings_up():
     learner, states, _ = trained(PPO, (), 80_000)
     found, _ = driven(learner.distribution, states.parameters)
     assert (found > -300).all(), found
 
 
+@pytest.mark.slow
 def test_a_clone_swings_up_as_well_as_its_expert(expert):
     best, shown, _ = expert
     learner, states, _ = trained(BC, shown, 20 * BC.steps_per_iteration)

@@ -118,6 +118,7 @@ def test_a_warm_start_clones_and_then_learns(run):
     assert not all(map(same, *moved))
 
 
+@pytest.mark.slow
 def test_networks_go_over_to_another_run(tmp_path):
     """SAC, hotter, from each of them: it gets all the networks that there are, and nothing else."""
     hot = replace(SAC, temperature=0.5).build(Pendulum(), SHOWN, 6)

@@ -69,6 +69,7 @@ def test_a_packed_policy_says_where_it_comes_from_and_not_where_it_lay(run, bank
     )
 
 
+@pytest.mark.slow
 def test_what_a_packed_policy_is_not(run, bank, tmp_path):
     packed = pack_policy(run.path, tmp_path / "packed", bank)
     with pytest.raises(UsageError, match="packed and has no steps; leave out @4"):

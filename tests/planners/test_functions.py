@@ -67,6 +67,7 @@ def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
     assert errors[int(bank.identity[1]), 15].startswith("LookupError: nobody to follow (own_drivers.py:")
 
 
+@pytest.mark.slow
 def test_python_and_jax_make_the_same_episodes(bank):
     """Inside the compiled loop over all steps; both crash where nobody else is, at step 15."""
     rows = jnp.arange(2)

@@ -63,6 +63,7 @@ def moments(bank):
     return jax.vmap(one)(row, step)
 
 
+@pytest.mark.slow
 def test_trimming_changes_nothing_that_is_measured(both):
     one, other = map(moments, both)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), one, other)

@@ -62,6 +62,7 @@ def test_a_step_costs_at_most_in_proportion_to_agents(bank, plain):
     assert few < many < 1.5 * few
 
 
+@pytest.mark.slow
 def test_the_count_would_see_pairs_of_agents(bank):
     class Pairs(Simulator):
         def observe(self, bank, scene, cast=None):
@@ -73,6 +74,7 @@ def test_the_count_would_see_pairs_of_agents(bank):
     assert many - few > 3 * 64 * 64 * 2  # differences and squares of pairs, four times as many
 
 
+@pytest.mark.slow
 def test_what_is_measured_on_request_costs_nothing_where_nobody_asks(bank, monkeypatch):
     asked = set()
 
@@ -153,7 +155,8 @@ def test_one_configuration_is_compiled_once(traffic):
     assert driven(data[:1], [0, 0], trim=False) == driven(data[1:2], [0, 0], trim=False)
 
 
-@pytest.mark.parametrize("part", [pytest.param("reset", marks=pytest.mark.slow), "metrics"])
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["reset", "metrics"])
 def test_parts_are_timed_on_states_as_they_are(part):
     # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])

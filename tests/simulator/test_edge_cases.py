@@ -39,6 +39,7 @@ def on_a_slope(recording, grade):
     return replace(recording, features=features, tracks=replace(recording.tracks, z=z))
 
 
+@pytest.mark.slow
 def test_a_car_that_falls_behind_its_log_on_a_slope_stays_on_the_road():
     # The log drives 18 m/s up a grade of 10 %; a car at its first 2 m/s is 12 m below it at the end, on the same road.
     log = car(0, 0, 0, 18)
@@ -54,6 +55,7 @@ def test_a_car_that_falls_behind_its_log_on_a_slope_stays_on_the_road():
         assert found["collision"] == 1.0 and found["distance"] == pytest.approx(16, abs=0.2)
 
 
+@pytest.mark.slow
 def test_without_a_map_nothing_is_off_the_road():
     recording = straight_road([car(0, 0, 0, 5), car(30, 0, 0, 5)])
     found = metrics(Expert(), bank_of(replace(recording, features=(), route_lanes=())))
@@ -116,7 +118,7 @@ def turning_right(stood_until):
     return replace(recording, tracks=tracks([log]), features=tuple(features))
 
 
-@pytest.mark.parametrize("start", [4, 10])
+@pytest.mark.parametrize("start", [4, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_right_turn_after_a_stop_is_lawful_wherever_the_episode_begins(start):
     bank = bank_of(turning_right(stood_until=8))
     assert metrics(Expert(), bank, LIGHTS, start_step=start)["red_light"] == 0.0

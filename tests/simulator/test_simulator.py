@@ -60,6 +60,7 @@ def test_the_exact_expert_is_clean_and_never_diverges(simulator, world):
     np.testing.assert_allclose(metric(result, "progress_ratio"), 1.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_driven_expert_follows_the_log(world):
     assert metric(episodes(measuring("fde"), Expert(replays=False), world), "fde").max() < 0.2
 
@@ -118,6 +119,7 @@ def test_running_a_red_light(simulator):
     assert metric(episodes(simulator, ConstantVelocity(), late), "red_light")[0] == 0.0
 
 
+@pytest.mark.slow
 def test_idm_stops_for_red_and_behind_a_standing_car(simulator):
     red = episodes(simulator, IdmPlanner(), bank_of(straight_road([car(0, 0, 0, 10)], light=RED)))
     front = np.asarray(red.motion)[0, -1, 0] + 2.4
@@ -150,6 +152,7 @@ def test_shift_and_rotation_change_nothing(simulator):
         np.testing.assert_allclose(metric(one, name), metric(other, name), rtol=2e-3, atol=2e-2, err_msg=name)
 
 
+@pytest.mark.slow
 def test_order_and_padding_of_agents_change_nothing(simulator):
     cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, 0, 3)]
     plain = bank_of(straight_road(cars))
@@ -169,6 +172,7 @@ def test_order_and_padding_of_agents_change_nothing(simulator):
             )
 
 
+@pytest.mark.slow
 def test_step_or_begin_is_step_or_reset(single, world):
     simulator, reset, step = single
     either = jax.jit(simulator.step_or_begin)
@@ -185,6 +189,7 @@ def test_step_or_begin_is_step_or_reset(single, world):
     assert not bool(transition.terminated) and not bool(transition.truncated)
 
 
+@pytest.mark.slow
 def test_two_driven_agents_see_each_other():
     simulator = measuring("collision")
     bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 0, 0, 8)]))
@@ -211,6 +216,7 @@ def test_other_vehicles_as_ego_replay_cleanly(simulator):
     assert metric(result, "fde")[0] < 1e-4 and metric(result, "distance")[0] == pytest.approx(72.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop(single, world):
     simulator, reset, step = single
     action = jnp.array([0.3, -0.1])

@@ -107,6 +107,7 @@ def test_where_every_draw_fails_the_episode_begins_as_logged():
     np.testing.assert_array_equal(drawn.route_m, np.full(16, logged.route_m))
 
 
+@pytest.mark.slow
 def test_a_start_is_free_of_those_who_are_told_where_to_be():
     # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
     bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))

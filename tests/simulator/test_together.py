@@ -127,6 +127,7 @@ def test_a_stack_of_one_is_a_single_agent(bank):
         np.testing.assert_allclose(np.asarray(got, np.float32), np.asarray(expected, np.float32), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_whose_episode_is_over_is_neither_rewarded_nor_judged_any_more(bank):
     simulator = Simulator(Task(observation=GLIMPSE, metrics=("distance", "comfort")))
     crash = bank_of(straight_road([car(0, 0, 0, 10), car(22, 0, 0, 0)]))

@@ -28,6 +28,7 @@ def test_sizes_are_those_of_the_table_or_in_proportion():
         sizes(0)
 
 
+@pytest.mark.slow
 def test_four_sets_that_share_no_map(small):
     path, made, progress = small
     assert sorted(made) == sorted(SPLITS) == sorted(child.name for child in path.iterdir())
@@ -47,6 +48,7 @@ def test_four_sets_that_share_no_map(small):
     assert len(set(seeds)) == len(seeds) and min(seeds) >= RESERVED_SEED
 
 
+@pytest.mark.slow
 def test_a_smaller_benchmark_is_the_beginning_of_the_full_one(small, tmp_path):
     path, *_ = small
     generate_benchmark(tmp_path / "less", Generation(), train=1)
@@ -55,6 +57,7 @@ def test_a_smaller_benchmark_is_the_beginning_of_the_full_one(small, tmp_path):
         assert first.record.tobytes() == again.record.tobytes()
 
 
+@pytest.mark.slow
 def test_the_command_names_benchmark_and_world(tmp_path, capsys):
     out = tmp_path / "sets"
     assert run(Generate(out, benchmark=True, scenarios=1, workers=1)) == 0

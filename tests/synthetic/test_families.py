@@ -245,6 +245,7 @@ def test_ways_by_chance_end_at_the_end_of_a_lane_and_never_repeat_one(family, se
     assert len(forks - used) <= 0.2 * len(forks)
 
 
+@pytest.mark.slow
 def test_chance_draws_many_roads():
     for family in FAMILIES:
         layouts = {len(built(family, seed).lanes) for seed in range(10)}

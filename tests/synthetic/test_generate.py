@@ -137,6 +137,7 @@ def test_nothing_is_left_behind_when_it_fails_half_way(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_command_prints_rate_and_rejections(tmp_path, capsys):
     out = tmp_path / "set"
     assert run(Generate(out, scenarios=2, seed=2, workers=1)) == 0

@@ -139,6 +139,7 @@ def test_many_walkers_move_as_each_would_alone():
             assert np.array_equal(a[:, i], b[:, 0])
 
 
+@pytest.mark.slow
 def test_placed_walkers_are_on_their_ways_and_some_cross_during_the_recording():
     network = street()
     crossing, count = 0, 0

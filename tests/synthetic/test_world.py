@@ -182,6 +182,7 @@ def test_recordings_are_complete():
     assert len(families) >= 6 and families <= {family.name for family, _ in DOMAINS["grid"].families}
 
 
+@pytest.mark.slow
 def test_rare_scenarios_have_one_labelled_event():
     config = dataclasses.replace(EXACT, rare_rate=1.0)
     for index in range(6):
@@ -197,6 +198,7 @@ def test_rare_scenarios_have_one_labelled_event():
     assert not drawn(0, WorldConfig(rare_rate=0.0)).recording.events
 
 
+@pytest.mark.slow
 def test_the_domain_decides_about_roads():
     ring = dataclasses.replace(EXACT, domain="ring")
     widths = {
@@ -260,6 +262,7 @@ def test_settings_that_cannot_be_meant_are_refused(settings, message):
     assert message in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
     tried = []
 
@@ -275,6 +278,7 @@ def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
     assert len(tried) == len(set(tried)) == 12
 
 
+@pytest.mark.slow
 def test_a_recording_that_begins_at_a_critical_moment_is_that_part_of_the_traffic(monkeypatch):
     """Lights, poses and the begin are those of the traffic from the step on that was found critical."""
     kept = {}

@@ -27,6 +27,7 @@ def refused(check, term, words):
     assert "\n" not in str(error.value) and "; " in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_worlds_show_what_terms_look_at():
     found = moments().found
     facts = found.facts
