@@ -212,13 +212,20 @@ assert "jax" not in sys.modules
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, timeout=60)
 
 
+def drivax_process(*call, **options):
+    """The command, stopped by Ctrl-C even where these tests run in the background of a shell, which ignores it."""
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{heed}; from drivax.cli import main; raise SystemExit(main())"
+    command = [sys.executable, "-c", program, *map(str, call)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
+
+
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds child processes in /proc")
 def test_an_interrupt_that_reaches_workers_first_is_one(wire, write_records, tmp_path):
     shard = write_records("src/0.tfrecord", wire.scenario()).read_bytes() * 300
     (tmp_path / "src" / "0.tfrecord").write_bytes(shard)
     (tmp_path / "src" / "1.tfrecord").write_bytes(shard)
-    call = ["-m", "drivax", "convert", str(tmp_path / "src"), str(tmp_path / "set"), "--workers", "2"]
-    process = subprocess.Popen([sys.executable, *call], stderr=subprocess.PIPE, text=True)
+    process = drivax_process("convert", tmp_path / "src", tmp_path / "set", "--workers", 2)
     workers, deadline = [], time.monotonic() + 30
     while len(workers) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -240,17 +247,9 @@ def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
     (tmp_path / "src" / "0.tfrecord").write_bytes(shard)
     for name in "123":
         os.link(tmp_path / "src" / "0.tfrecord", tmp_path / "src" / f"{name}.tfrecord")
-    command = [
-        sys.executable,
-        "-m",
-        "drivax",
-        "convert",
-        str(tmp_path / "src"),
-        str(tmp_path / "set"),
-        "--workers",
-        "2",
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = drivax_process(
+        "convert", tmp_path / "src", tmp_path / "set", "--workers", 2, start_new_session=True
+    )
     deadline = time.monotonic() + 30
     while not list(tmp_path.glob(".set.*")) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -60,7 +60,7 @@ def await_interrupt() -> None:
     Raises:
         KeyboardInterrupt: That was it.
     """
-    time.sleep(2.0)  # a busy machine is late
+    time.sleep(0.3)
 
 
 def _start(free: Any) -> None:
