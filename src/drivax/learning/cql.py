@@ -111,12 +111,12 @@ class Cql(Offline):
         # As in the reference implementation the target has no entropy, though the policy's loss has.
         value = jnp.min(self.q(target["critic"], part.following, then), axis=0)
         goal = td_target(part.reward, value, part.terminated, self.config.gamma)
-        q = self.q(trained["critic"], part.observation, part.action)
-        error = 0.5 * jnp.mean((q - goal) ** 2)
-
         now = self.distribution(policy, part.observation)
         action, log_density = self._sampled(now, following, part.action, sample_key)
-        judged = jnp.moveaxis(self.q(trained["critic"], part.observation, action), 1, 0)
+        # All in one call: an observation is encoded, and its gradient taken, once.
+        found = self.q(trained["critic"], part.observation, jnp.concatenate([part.action[None], action]))
+        q, judged = found[:, 0], jnp.moveaxis(found[:, 1:], 1, 0)
+        error = 0.5 * jnp.mean((q - goal) ** 2)
         densities = jnp.broadcast_to(log_density[:, None], judged.shape)
         penalty = conservative_penalty(judged, densities, q, self.config.penalty_temperature)
         weight, weight_loss = self._weight(trained, penalty)
