@@ -277,6 +277,7 @@ def test_seeds_and_errors_of_a_batch(data):
         vector.step(np.zeros((2, 2)))
 
 
+@pytest.mark.slow
 def test_pictures(data):
     """Ego is drawn where it drove: the picture changes when it brakes, not in size."""
     env = DrivingEnv(data, SMALL, render_mode="rgb_array")

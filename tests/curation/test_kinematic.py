@@ -194,6 +194,7 @@ def test_the_default_weights_rank_the_stopped_car_above_the_oncoming_one(compone
     assert scored[0, NOW] > 0.5 and scored[1].max() < 0.01 and scenarios[0] > 2 * scenarios[1]
 
 
+@pytest.mark.slow
 def test_a_set_larger_than_a_batch_scores_the_same(tmp_path, components, monkeypatch):
     """Batched, against the bank of all."""
     monkeypatch.setattr(scoring, "BATCH", 4)

@@ -115,7 +115,8 @@ def test_each_scout_is_trained_without_its_fold(scouts, data):
     assert sorted(np.bincount(scouts.fold)) == [2, 4, 4]
 
 
-@pytest.mark.parametrize("weighted", ["plain", pytest.param("rarity", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("weighted", ["plain", "rarity"])
 def test_the_table_of_an_ensemble(data, scouts, weighted):
     trained = scouts if weighted == "plain" else train_scouts(replace(TINY, weighted="rarity"), data)
     table = ensemble_table(trained, data)

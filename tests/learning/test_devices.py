@@ -7,23 +7,12 @@ import sys
 import pytest
 
 CASES = [
-    ("bc", "none"),
-    *(
-        pytest.param(*case, marks=pytest.mark.slow)
-        for case in (
-            ("ppo", "two"),
-            ("sac", "two"),
-            ("ppo", "four_and_seeds"),
-            ("sac", "four_and_seeds"),
-            ("sac_observations", "two"),
-            ("bc_sac", "two"),
-            ("driving_ppo", "two"),
-            ("driving_sac", "two"),
-        )
-    ),
-]
+    ("bc", "none"), ("ppo", "two"), ("sac", "two"), ("ppo", "four_and_seeds"), ("sac", "four_and_seeds"),
+    ("sac_observations", "two"), ("bc_sac", "two"), ("driving_ppo", "two"), ("driving_sac", "two"),
+]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "extent"), CASES)
 def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(
     name, extent, repository, monkeypatch

@@ -135,6 +135,7 @@ def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
     train(config, data, run.path, validation=data, resume=True)
 
 
+@pytest.mark.slow
 def test_learning_stops_when_patience_is_up(data, config, tmp_path):
     """The toy always drives alike: the first validation is the best, two more are waited for."""
     patient = replace(config, evaluate_every=1, patience=2, checkpoint_rule="lexicographic")

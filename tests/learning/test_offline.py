@@ -140,6 +140,7 @@ def test_cql_against_numpy(part, improved):
     assert total == pytest.approx(error + 2 * penalty + multiplier + policy + heat, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_published_penalty_puts_the_action_of_the_data_among_the_others(part, improved):
     config = replace(CQL, importance=False, next_actions=False, imitation=0.0)
     learner, trained, target = begun(config)
@@ -359,9 +360,8 @@ RESUMED = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "td3_bc" else pytest.param(name, marks=pytest.mark.slow) for name in RESUMED]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RESUMED)
 def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     """Stopped in the middle, with an odd number of updates behind it, and restored from disk."""
     config, weights = RESUMED[name], np.random.default_rng(0).uniform(size=(500, 2))

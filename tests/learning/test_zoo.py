@@ -42,6 +42,7 @@ def weights(planner):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(planner.parameters)]
 
 
+@pytest.mark.slow
 def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
     packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
     (one, task), (best, _) = load_policy(packed.path, bank), load_policy(run.path, bank, step=4)

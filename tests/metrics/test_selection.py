@@ -179,6 +179,7 @@ def zeros(shapes):
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
+@pytest.mark.slow
 def test_operators_and_that_a_selection_changes_no_value(traced):
     found, empty = random_situations(), zeros(traced["none"].state)
     full, events = episode("full", found, empty)

@@ -173,6 +173,7 @@ def count(config):
     return sum(leaf.size for leaf in jax.tree.leaves(shapes))
 
 
+@pytest.mark.slow
 def test_parameter_counts():
     # agents 4, ego 3, ego_static 2, lights 3, route 2 features to 8 numbers, each with bias and a norm.
     embedding = (4 + 3 + 2 + 3 + 2) * 8 + 5 * (8 + 16)

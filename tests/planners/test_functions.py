@@ -50,6 +50,7 @@ def actions(planner, bank, moments, batched=True):
     return np.asarray(jax.jit(act)(*row))
 
 
+@pytest.mark.slow
 def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
     with raised() as errors:
         python, in_jax = (actions(planner, bank, moments) for planner in (slow_python, slow_jax))

@@ -99,6 +99,7 @@ def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
     np.testing.assert_allclose(steady, 0.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
     spec = group_spec(jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank))

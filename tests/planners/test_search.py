@@ -67,6 +67,7 @@ def test_it_passes_what_stands_in_its_lane_on_the_side_where_there_is_road():
     assert throttle < -0.3 and abs(steering) < 0.01
 
 
+@pytest.mark.slow
 def test_it_knows_nothing_of_the_future():
     bank = bank_of(straight_road([car(0, 0, 0, 10), car(30, 0, 0, 5), PERSON(25, -5, np.pi / 2, 1.0)]))
     other = replace(bank, agents=bank.agents.at[:, 11:, 1:, :7].add(3.0))

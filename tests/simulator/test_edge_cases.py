@@ -64,6 +64,7 @@ def test_without_a_map_nothing_is_off_the_road():
     assert found["collision"] == 0.0
 
 
+@pytest.mark.slow
 def test_another_slot_has_no_route_and_is_paid_for_none():
     bank = bank_of(straight_road([car(0, 0, 0, 8), car(20, 3.7, 0, 9)]))
     found = metrics(Expert(), bank, slot=1)
@@ -118,12 +119,14 @@ def turning_right(stood_until):
     return replace(recording, tracks=tracks([log]), features=tuple(features))
 
 
-@pytest.mark.parametrize("start", [4, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [4, 10])
 def test_a_right_turn_after_a_stop_is_lawful_wherever_the_episode_begins(start):
     bank = bank_of(turning_right(stood_until=8))
     assert metrics(Expert(), bank, LIGHTS, start_step=start)["red_light"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_right_turn_on_red_without_a_stop_is_not():
     recording = turning_right(stood_until=8)
     moving = recording.tracks.velocity + np.array([1.0, 0.0]) * (np.arange(91) < 12)[:, None]
@@ -131,6 +134,7 @@ def test_a_right_turn_on_red_without_a_stop_is_not():
     assert metrics(Expert(), bank_of(still_rolling), LIGHTS, start_step=10)["red_light"] == 1.0
 
 
+@pytest.mark.slow
 def test_a_line_that_was_crossed_before_the_episode_is_not_charged_to_it():
     # Slot 1, which has no route, crosses the red line between steps 9 and 10.
     bank = bank_of(straight_road([car(-60, 0, 0, 10), car(37.9, 0, 0, 10)], light=LightState.STOP))

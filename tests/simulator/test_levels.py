@@ -75,6 +75,7 @@ def test_a_car_on_the_bridge_knows_nothing_of_the_road_below():
     assert found["speeding_max"] == pytest.approx(5.0, abs=1e-3), "10 m/s where the deck allows 5"
 
 
+@pytest.mark.slow
 def test_height_follows_the_map_and_not_the_log():
     """The log stops at the foot of a ramp of 10 %; the car that drives on rises over a car parked 6 m below it."""
 

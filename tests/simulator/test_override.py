@@ -88,6 +88,7 @@ def test_reactive_vehicles_give_way_to_what_is_told_to_stop(bank):
     assert x[-1, 0] - x[-1, 1] - 4.8 == pytest.approx(2.0, abs=1.0) and speed[-1] < 0.8
 
 
+@pytest.mark.slow
 def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
     """At 10 m/s the 5.2 m to its rear end take 0.52 s: the sixth step overlaps, is at fault, and ends the episode."""
     bank = bank_of(straight_road([car(0, 0, 0, 10), car(10, 3.7, 0, 5)]))

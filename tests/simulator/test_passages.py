@@ -229,6 +229,7 @@ def steps_of(flags):
     return (np.flatnonzero(flags) + 11).tolist()
 
 
+@pytest.mark.slow
 def test_every_scene_has_its_lane_changes_and_merges(driven):
     made, _, (facts, _) = driven
     found = {
@@ -238,6 +239,7 @@ def test_every_scene_has_its_lane_changes_and_merges(driven):
     assert found == {name: (changes, merges) for name, (_, changes, merges) in made.items()}
 
 
+@pytest.mark.slow
 def test_they_are_rewarded_once(driven):
     _, _, (facts, terms) = driven
     np.testing.assert_allclose(terms["lane_change"], 0.2 * facts.lane_changed)
@@ -254,6 +256,7 @@ def test_logged_steps_score_as_simulated_ones(driven):
             np.testing.assert_allclose(values, terms[term][row], atol=1e-6, err_msg=f"{name}: {term}")
 
 
+@pytest.mark.slow
 def test_the_state_stays_small(driven):
     _, bank, (facts, _) = driven
     assert facts.ignored is None and facts.strand.dtype == np.int16

@@ -142,6 +142,7 @@ def test_metrics_without_lights_are_undefined(simulator):
     assert metric(result, "nuplan_score")[0] == pytest.approx(1.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_shift_and_rotation_change_nothing(simulator):
     cars = [car(0, 0, 0, 9), car(25, 0.4, 0, 6), car(-12, 3.7, 0, 11), car(40, 3.5, np.pi, 3)]
     here = straight_road(cars, light=RED)

@@ -65,6 +65,7 @@ def test_draws_are_distributed_as_published(speed):
     assert acceleration.min() >= 0.0 and acceleration.max() <= 3.6 and np.abs(curvature).max() <= bound
 
 
+@pytest.mark.slow
 def test_the_second_before_was_driven_with_one_action(open_road):
     scenes = noisy(open_road, 10, keys(64))
     history = scenes.history

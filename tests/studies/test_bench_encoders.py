@@ -17,6 +17,7 @@ TINY = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_command_counts_and_times(capsys, monkeypatch):
     assert main(["bench", "--encoders", "--json", *TINY]) == 0
     found = json.loads(capsys.readouterr().out)

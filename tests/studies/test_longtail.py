@@ -83,6 +83,7 @@ def test_what_is_undecided_says_what_would_decide():
     assert "test recordings" in needed(Crossed(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400))
 
 
+@pytest.mark.slow
 def test_every_curated_agent_has_a_control_of_its_effective_size(data):
     tables = {
         name: curate(name, Wanted(data)) for name in ("kinematic", "action_rarity", "uniform", "oracle")

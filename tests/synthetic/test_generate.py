@@ -25,6 +25,7 @@ def one_worker(tmp_path_factory):
     return path, result, progress
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_writes_the_same_bytes(one_worker, tmp_path):
     path, result, _ = one_worker
     two = generate(tmp_path / "two", SCENARIOS, 5, Generation(workers=2))

@@ -43,7 +43,8 @@ def some(names, *quick):
     return [*quick, *slow]
 
 
-@pytest.mark.parametrize("name", some(TERMS, "own_terms:Crowded"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["own_terms:Crowded", *TERMS])
 def test_right_reward_terms(name):
     check_reward(own_terms.Crowded(5.0) if name.endswith("Crowded") else TERMS.get(name, name))
 
@@ -108,7 +109,8 @@ def test_wrong_metrics():
     refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or text")
 
 
-@pytest.mark.parametrize("name", some(["goal"], "walkers"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["walkers", "goal"])
 def test_right_features(name):
     check_feature(f"own_terms:{name}")
 
@@ -138,6 +140,7 @@ def test_wrong_features(words):
     refused(check_feature, feature, words)
 
 
+@pytest.mark.slow
 def test_an_own_encoder():
     check_encoder("own_terms:MeanConfig")
 
