@@ -179,6 +179,23 @@ def test_the_command(data, tmp_path, capsys):
     assert "2 scenarios, kinematic" in said and "effective sample" in said and "the 1 most critical" in said
     assert max(map(len, said.replace(str(tmp_path), "").splitlines())) < 100
     assert [entry["scenario_id"] for entry in ScenarioSet.open(top).entries] == ["drive-1"]
+    # Other weights and another aggregator, without scoring again.
+    anew = [*command, "--out", str(tmp_path / "anew.npz"), "--again", str(out)]
+    assert main([*anew, "--weights", "urgency", "0.5", "density", "0.25", "--scenario", "max"]) == 0
+    other = read_scores(tmp_path / "anew.npz", data)
+    by_hand = 0.5 * found.components["urgency"] + 0.25 * found.components["density"]
+    np.testing.assert_allclose(other.steps, np.where(found.valid, by_hand, 0.0))
+    np.testing.assert_array_equal(other.scenarios, other.steps.max(axis=1))
+    assert other.combination == Combination({"urgency": 0.5, "density": 0.25}, "max")
+    capsys.readouterr()
+    for wrong, words in (
+        (["--weights", "urgencies", "1"], "there is no component 'urgencies'; did you mean 'urgency'"),
+        (["--scenario", "p101"], "'p101' aggregates no steps"),
+    ):
+        assert main([*anew, "--overwrite", *wrong]) == 2
+        assert words in capsys.readouterr().err
+    assert main(["curate", "published", *anew[2:], "--overwrite"]) == 2
+    assert "is a table of kinematic; say curate kinematic" in capsys.readouterr().err
     assert main([*command, "--out", str(out)]) == 2
     assert main(["curate", "kinematic", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "x")]) == 1
     assert main(["curate", "guesswork", "--data", str(data.path), "--out", str(tmp_path / "x")]) == 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -32,6 +32,8 @@ class Curate:
     Example: drivax curate kinematic --data sets/world --out scores.npz --export sets/critical 500
 
     Example: drivax curate ensemble --data sets/world --out scores.npz --cloning.loss likelihood
+
+    Example: drivax curate kinematic --data sets/world --out near.npz --again scores.npz --weights urgency 1 braking 0.5
     """
 
     method: Annotated[
@@ -55,6 +57,12 @@ class Curate:
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
     """Write the N most critical scenarios as the scenario set TOP, the most critical first."""
+    weights: dict[str, float] | None = None
+    """Weights of the components in place of the method's own: --weights urgency 0.5 braking 0.5."""
+    scenario: str | None = None
+    """How steps become the score of their scenario: max, mean, std, p99, top10, or others of their kind."""
+    again: Path | None = None
+    """Table of METHOD for the same set, whose components are taken instead of scoring again."""
     like: Path | None = None
     """Table of the same set whose scores random_matched deals out."""
     seed: int = 0
@@ -69,7 +77,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and say how scores and weights lie."""
     from drivax import settings
     from drivax.curation.methods import Wanted, curate
-    from drivax.curation.scores import refuse_existing, write_scores
+    from drivax.curation.scores import read_scores, refuse_existing, write_scores
     from drivax.curation.scouts import ScoutsConfig
     from drivax.curation.subset import check_top, write_top
     from drivax.scenario.store import ScenarioSet
@@ -84,16 +92,24 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     data = ScenarioSet.open(args.data)
     if args.export is not None:
         check_top(data, *args.export, overwrite=args.overwrite)
-    with Progress("scoring", "scenarios", len(data)) as bar:
-        wanted = Wanted(
-            data,
-            args.like,
-            args.seed,
-            scouts,
-            progress=lambda done, _: bar.update(done),
-            training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
-        )
-        table = curate(args.method, wanted)
+    if args.again is None:
+        with Progress("scoring", "scenarios", len(data)) as bar:
+            wanted = Wanted(
+                data,
+                args.like,
+                args.seed,
+                scouts,
+                progress=lambda done, _: bar.update(done),
+                training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
+            )
+            table = curate(args.method, wanted)
+    else:
+        table = read_scores(args.again, data)
+        if table.method != args.method:
+            raise UsageError(f"{args.again} is a table of {table.method}", cure=f"say curate {table.method}")
+    other = {"weights": args.weights, "scenario": args.scenario}
+    if other := {name: value for name, value in other.items() if value is not None}:
+        table = table.combined(replace(table.combination, **other))
     write_scores(table, args.out, args.overwrite)
     _tell(table, args.out)
     if args.export is not None:

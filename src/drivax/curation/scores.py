@@ -55,6 +55,11 @@ class ScoreTable:
         """Which steps can be drawn: those at which the log knows what ego did, since it is there one step later too."""
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
 
+    @property
+    def combination(self) -> Combination:
+        """How the components became scores."""
+        return Combination(**self.config["combination"])
+
     def combined(self, combination: Combination) -> ScoreTable:
         """The same components, weighted and aggregated otherwise; nothing is scored again.
 
