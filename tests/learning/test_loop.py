@@ -22,7 +22,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.show.runs import read_runs
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.runs import seed_folders, training_data
+from drivax.tracking.runs import learned_from, seed_folders
 from drivax.tracking.sinks import read_rows
 from toy_learner import Toy, ToyConfig, ToyState
 
@@ -106,7 +106,7 @@ def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
         lacks = parameters - numbers(last_state(fresh))[0]
         np.testing.assert_allclose(lacks, began.parameters, rtol=1e-5)
         assert iteration == 1 and (key == numbers(last_state(fresh))[1]).all()
-        assert training_data(str(path)) == training_data(str(former)), "each set once"
+        assert learned_from(str(path)) == learned_from(str(former)), "each set once"
     # Without a step it is the best; whoever resumes from the very beginning finds the same.
     run = train(replace(onward, begin_from=str(former)), data, tmp_path / "best", validation=data)
     assert run.config(TrainConfig).begin_from == f"{former}@60" and run.info["networks_from"]["step"] == 60

@@ -126,13 +126,13 @@ def test_where_a_planner_was_trained(tmp_path):
     for name, kind in (("policy", "training"), ("judged", "evaluation")):
         RunFolder.create(tmp_path / name, Config(), kind=kind).note(data=data)
     trained = str(tmp_path / "policy")
-    assert runs.training_data(trained) == runs.training_data(f"{trained}@1000") == data
-    assert runs.training_data(str(tmp_path / "judged")) == runs.training_data("idm") == []
-    assert [entry["scenarios"] for entry in runs.training_data("zoo:aggressive")] == [4096]
+    assert runs.learned_from(trained) == runs.learned_from(f"{trained}@1000") == data
+    assert runs.learned_from(str(tmp_path / "judged")) == runs.learned_from("idm") == []
+    assert [entry["scenarios"] for entry in runs.learned_from("zoo:aggressive")] == [4096]
     # What the run learned from whose networks it began with counts too, each set once.
     former = [{"hash": "abc"}, {"path": "sets/b", "hash": "def", "scenarios": 2}]
     RunFolder.open(trained).note(networks_from={"run": "runs/a", "step": 10, "data": former})
-    assert runs.training_data(trained) == [*data, former[1]]
+    assert runs.learned_from(trained) == [*data, former[1]]
 
 
 def test_steps_of_runs():

@@ -21,7 +21,7 @@ from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
-from drivax.tracking.runs import RunFolder, refuse_existing, replacing, training_data
+from drivax.tracking.runs import RunFolder, learned_from, refuse_existing, replacing
 
 #: Columns of the headline, with their short names.
 HEADLINE = {
@@ -100,7 +100,7 @@ def run_evaluation(
             progress=lambda done, total: bar.update(done),
         )
     notes: dict[str, Any] = {"kind": "evaluation", "planner": results.planner, "traffic": results.traffic}
-    if trained := training_data(config.planner):
+    if trained := learned_from(config.planner):
         notes["trained_on"] = trained
     # A folder of that name is always a whole run.
     with replacing(Path(out)) as partial:

@@ -150,7 +150,7 @@ def run_and_step(name: str) -> tuple[str, int | None]:
     return run, int(step) if at else None
 
 
-def training_data(planner: str) -> list[dict[str, Any]]:
+def learned_from(planner: str) -> list[dict[str, Any]]:
     """The data sets that a trained policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``) learned from; none of any other.
 
     Those of the runs that its networks come from are among them.
