@@ -81,33 +81,33 @@ def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
 
 
 def judged() -> dict[str, Any]:
-    """Every preset that `benchmark.py drive` has driven, and the references, with differences in pairs.
-
-    What is stored of presets that have not been driven since stays.
-    """
+    """Every preset that `benchmark.py drive` has driven, and the references, with differences in pairs."""
     found = {name: episodes(name, "log") for name in (*REFERENCES, *learned())}
     driven = {name: one for name, one in found.items() if one is not None}
+    tests = {one.about["test"] for one in driven.values()}
+    if len(tests) != 1:
+        raise SystemExit(f"{len(tests)} test sets instead of one: drive the others anew (benchmark.py drive)")
     told = {
         name: json.loads((POLICIES / name / TRAINING).read_text()) for name in learned() if name in driven
     }
-    result: dict[str, Any] = json.loads(RESULT.read_text())
-    if any(one.about["test"] != result["test"]["hash"] for one in driven.values()):
-        raise SystemExit("other scenarios than those of the stored results: drive the benchmark's test split")
-    result |= {"command": "python benchmarks/learning.py judge", "versions": versions()}
-    result["planners"] |= {
-        name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
+    return {
+        "command": "python benchmarks/learning.py judge",
+        "test": {"scenarios": len(next(iter(driven.values())).segments), "hash": tests.pop()},
+        "training": {name: {key: one[key] for key in ("seconds", "seeds")} for name, one in told.items()},
+        "planners": {
+            name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
+        },
+        "differences": {
+            f"{name} - {other}": {
+                metric: mean(driven[name], metric, driven[other]).as_dict() for metric in CURVES
+            }
+            for name in told
+            for other in ("idm", "bc")
+            if other in driven and other != name
+        },
+        "curves": {name: one["curves"] for name, one in told.items()},
+        "versions": versions(),
     }
-    for name in told:
-        for other in ("idm", "bc"):
-            if other in driven and other != name:
-                result["differences"][f"{name} - {other}"] = {
-                    metric: mean(driven[name], metric, driven[other]).as_dict() for metric in CURVES
-                }
-    result["training"] |= {
-        name: {key: one[key] for key in ("seconds", "seeds")} for name, one in told.items()
-    }
-    result["curves"] |= {name: one["curves"] for name, one in told.items()}
-    return result
 
 
 def _mean(driven: Driven, metric: str) -> dict[str, Any]:
