@@ -107,11 +107,14 @@ def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str,
     }
 
 
-def events(bench: Path, only: list[str], methods: dict[str, Any]) -> dict[str, Any]:
+def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
     """Methods, or all of them, on both test sets, beside those that are known."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
+    hashes = {data.path.name: data.hash for data in sets}
+    if only and stored.get("sets") != hashes:
+        raise SystemExit("what is stored is of other sets: score all methods, without --method")
     truth = Truth.of(sets)
-    methods = dict(methods) if only else {}
+    methods = dict(stored["methods"]) if only else {}
     for name, own, both in scored(sets, bench / "train", only or list(SCORED)):
         methods[name] = found_by(truth, both) | {"draws": draws(own)}
         if "error_rank_correlation" in own.config:
@@ -119,7 +122,6 @@ def events(bench: Path, only: list[str], methods: dict[str, Any]) -> dict[str, A
         if name == "kinematic":
             methods["random_matched"] = found_by(truth, matched(both, 0)) | {"draws": draws(matched(own, 0))}
         print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
-    hashes = {data.path.name: data.hash for data in sets}
     return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL, "methods": methods}
 
 
@@ -294,7 +296,7 @@ def main() -> None:
         PAGE.write_text(filled(PAGE.read_text(), stored))
         return
     made = (
-        events(args.bench, args.method, stored.get("methods", {}))
+        events(args.bench, args.method, stored)
         if args.what == "events"
         else {"speed": speed(args.data, args.count)}
     )

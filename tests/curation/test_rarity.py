@@ -86,7 +86,7 @@ def test_actions_of_the_expert_and_where_they_are_known():
     found = {name: np.asarray(part) for name, part in of_logs(ExpertActions(), bank).items()}
     np.testing.assert_allclose(found["action"][0, :89], 0.0, atol=1e-3)
     np.testing.assert_allclose(found["action"][1, :89], [[1 / 3, 0.0]] * 89, atol=2e-3)
-    assert found["known"].sum(axis=1).tolist() == [90, 90, 29]
+    assert found["known"].sum(axis=1).tolist() == [89, 89, 28]
     steps = rarity_steps(KernelRarity(), found["action"], found["known"])
     assert (steps[found["known"]] > 0).all() and (steps[~found["known"]] == 0).all()
     assert steps[1, 20] > steps[0, 20]  # 90 steps against 118 without acceleration

@@ -196,6 +196,14 @@ def test_the_command(data, tmp_path, capsys):
         assert words in capsys.readouterr().err
     assert main(["curate", "published", *anew[2:], "--overwrite"]) == 2
     assert "is a table of kinematic; say curate kinematic" in capsys.readouterr().err
+    for ignored in (["--seed", "1"], ["--like", str(out)]):
+        assert main([*anew, "--overwrite", *ignored]) == 2
+        assert f"has no such setting; leave out {ignored[0]}" in capsys.readouterr().err
+    assert main([*command, "--out", str(tmp_path / "x"), "--seed", "1"]) == 2
+    assert "kinematic has no such setting; leave out --seed" in capsys.readouterr().err
+    lot = ["curate", "random_matched", *command[2:], "--like", str(out), "--out", str(tmp_path / "x")]
+    assert main([*lot, "--scenario", "max"]) == 2
+    assert "which have no components; give --weights and --scenario to the method" in capsys.readouterr().err
     assert main([*command, "--out", str(out)]) == 2
     assert main(["curate", "kinematic", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "x")]) == 1
     assert main(["curate", "guesswork", "--data", str(data.path), "--out", str(tmp_path / "x")]) == 2

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from drivax.cli import main
 from drivax.curation.methods import ensemble_table
@@ -14,17 +15,22 @@ from drivax.curation.scores import read_scores
 from drivax.curation.scouts import (
     Opinions,
     ScoutsConfig,
+    experience_of,
     folds_of,
     mutual_information,
     train_scouts,
 )
 from drivax.errors import UsageError
+from drivax.learning.driving import Driving
 from drivax.learning.imitation import BcConfig
+from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
 from drivax.networks.entity import EntityConfig
 from drivax.scenario.assemble import assemble
+from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.simulator.simulator import Simulator
 from quick import quick
 from scenes import SMALL, car, straight_road
 
@@ -107,7 +113,16 @@ def test_information_tells_modes_that_a_mean_does_not():
 
 
 @pytest.mark.slow
-def test_each_scout_is_trained_without_its_fold(scouts, data):
+def test_no_scout_draws_from_its_own_fold_and_each_draws_from_all_others(scouts, data):
+    bank = ScenarioBank.from_scenarios(data)
+    _, draws, _ = experience_of(TINY, Driving(Simulator(TINY.task)), bank, scouts.fold)
+    for own in range(TINY.folds):
+        rows, _ = draw(jax.tree.map(lambda part, own=own: part[own], draws), jax.random.key(own), (5_000,))
+        assert set(np.asarray(rows).tolist()) == set(np.flatnonzero(scouts.fold != own).tolist())
+
+
+@pytest.mark.slow
+def test_scouts_tell_what_they_do_about_every_step(scouts, data):
     assert scouts.set_hash == data.hash
     told = scouts.opinions(data)
     assert told.action.shape == (10, 91, 3, 2) and told.information is None
@@ -122,7 +137,10 @@ def test_the_table_of_an_ensemble(data, scouts, weighted):
     table = ensemble_table(trained, data)
     assert table.method == "ensemble" and sorted(table.components) == ["action_0", "action_1"]
     assert 0.0 < table.scenarios.max() <= 1.0
-    assert -1.0 <= table.config["error_rank_correlation"] <= 1.0
+    told = trained.opinions(data)
+    error = told.error(trained.deviation, trained.fold)[told.known]
+    by_hand = scipy.stats.spearmanr(table.steps[told.known], error).statistic
+    assert table.config["error_rank_correlation"] == pytest.approx(by_hand)
     assert table.config["trained_on"] == data.hash
 
 
@@ -132,11 +150,13 @@ def test_the_command_trains_scouts_that_can_disagree_about_modes(data, tmp_path,
     arguments = ["curate", "ensemble", "--data", str(data.path), "--out", str(out), "--folds", "2"]
     arguments += ["--total_steps", "500", "--cloning.batch", "16", "--cloning.updates", "4"]
     arguments += ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
+    arguments += ["--seed", "3"]
     assert main(arguments) == 0
     assert "rank correlation" in capsys.readouterr().out
     table = read_scores(out, data)
     assert list(table.components) == ["information"]
     assert table.config["cloning"]["network"]["distribution"] == "mixture"
+    assert table.config["seed"] == 3
 
 
 def test_what_cannot_be_is_refused(data, tmp_path, capsys):
@@ -157,4 +177,4 @@ def test_what_cannot_be_is_refused(data, tmp_path, capsys):
         )
         == 2
     )
-    assert "kinematic has no settings here; leave out --folds 3" in capsys.readouterr().err
+    assert "kinematic has no such setting; leave out --folds 3" in capsys.readouterr().err

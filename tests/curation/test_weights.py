@@ -51,10 +51,32 @@ def test_mixture_with_uniform():
 def test_clipping_and_floor():
     table = table_of([[0.0, 0.1, 0.1, 0.8, 1.0]])  # the last step leads nowhere
     np.testing.assert_allclose(weights_of(table, plain(), "step")[0], np.array([0, 0.1, 0.1, 0.8, 0]) / 0.25)
-    clipped = np.array([0.0, 0.4, 0.4, 2.0]) / 0.7
+    # 0.8 becomes c = 2 (0 + 0.1 + 0.1 + c) / 4 = 0.2
+    clipped = np.array([0.0, 0.1, 0.1, 0.2]) / 0.1
     np.testing.assert_allclose(weights_of(table, plain(most=2.0), "step")[0, :4], clipped)
     floored = np.array([0.2, 0.3, 0.3, 1.0]) / 0.45
     np.testing.assert_allclose(weights_of(table, plain(floor=0.2), "step")[0, :4], floored)
+
+
+@pytest.mark.parametrize("most", [1.1, 2.0, 10.0])
+def test_no_weight_is_more_than_the_clip(most):
+    """However heavy the tail; the others keep their proportions, and no more is clipped than has to be."""
+    rng = np.random.default_rng(0)
+    for power in (0.5, 1.0, 4.0):
+        score = rng.uniform(0.001, 1.0, (20, 11)) ** power
+        table = table_of(score)
+        weight = weights_of(table, plain(most=most, temperature=0.2), "step")[table.drawn]
+        raw = score[table.drawn] ** 5.0
+        assert weight.max() == pytest.approx(min(most, raw.max() / raw.mean()))
+        below = weight < weight.max() * (1.0 - 1e-9)
+        ratio = weight[below] / raw[below]
+        np.testing.assert_allclose(ratio, ratio[0])
+        assert (weight[~below] <= raw[~below] * ratio[0] * (1.0 + 1e-9)).all()
+
+
+def test_a_clip_that_too_few_steps_can_keep():
+    table = table_of([[0.0, 0.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(weights_of(table, plain(most=2.0), "step")[0, :4], [0, 0, 0, 8])
 
 
 def test_published_weights_tilt_as_the_study_says():

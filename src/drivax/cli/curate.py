@@ -65,8 +65,8 @@ class Curate:
     """Table of METHOD for the same set, whose components are taken instead of scoring again."""
     like: Path | None = None
     """Table of the same set whose scores random_matched deals out."""
-    seed: int = 0
-    """What random_matched deals by."""
+    seed: int | None = None
+    """Of the lot of random_matched, and of an ensemble (default: 0)."""
     config: Path | None = None
     """YAML file with settings of an ensemble; any of them can be given behind as --section.key VALUE."""
     overwrite: bool = False
@@ -83,11 +83,9 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 
-    if args.method != "ensemble" and (overrides or args.config is not None):
-        raise UsageError(
-            f"{args.method} has no settings here", cure="leave out " + " ".join(overrides or ["--config"])
-        )
-    scouts = settings.load(ScoutsConfig, args.config or {}, overrides)
+    _refuse_idle(args, overrides)
+    seed = [] if args.method != "ensemble" or args.seed is None else ["--seed", str(args.seed)]
+    scouts = settings.load(ScoutsConfig, args.config or {}, [*overrides, *seed])
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
@@ -97,7 +95,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
             wanted = Wanted(
                 data,
                 args.like,
-                args.seed,
+                args.seed or 0,
                 scouts,
                 progress=lambda done, _: bar.update(done),
                 training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
@@ -118,6 +116,28 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
             write_top(table, data, count, top, args.overwrite, lambda done, total: bar.update(done))
         print(f"{top}: the {count:,} most critical")
     return 0
+
+
+def _refuse_idle(args: Curate, overrides: Sequence[str]) -> None:
+    """Refuses flags that the method, or a table that is taken again, would ignore."""
+    if args.again is not None:
+        scored = f"{args.again}, which is not scored again,"
+        idle = {"--like": args.like, "--seed": args.seed, "--config": args.config}
+    else:
+        scored = args.method
+        idle = {} if args.method == "ensemble" else {"--config": args.config}
+        if args.method not in ("ensemble", "random_matched"):
+            idle["--seed"] = args.seed
+    given = [flag for flag, value in idle.items() if value is not None]
+    if args.again is not None or args.method != "ensemble":
+        given += overrides
+    if given:
+        raise UsageError(f"{scored} has no such setting", cure="leave out " + " ".join(given))
+    if args.method == "random_matched" and (args.weights is not None or args.scenario is not None):
+        raise UsageError(
+            "random_matched deals out finished scores, which have no components",
+            cure="give --weights and --scenario to the method that it is to be like",
+        )
 
 
 def _tell(table: ScoreTable, out: Path) -> None:

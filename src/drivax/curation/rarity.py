@@ -39,9 +39,13 @@ class ExpertActions:
     space: Physical = field(default_factory=Physical)
 
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Array]:
-        """``action [T, 2]`` within the bounds, and ``known [T]``: ego is there at the step and at the next one."""
+        """``action [T, 2]`` within the bounds, and ``known [T]``: ego is there at the step and at the next two.
+
+        The second of them tells the curvature; without it the action that follows the log is a guess.
+        """
         action = jax.vmap(lambda scene: expert_action(bank, scene, self.space))(log.scene)
-        known = log.valid & jnp.concatenate([log.valid[1:], jnp.zeros(1, bool)])
+        later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
+        known = log.valid & later[1:-1] & later[2:]
         return {"action": jnp.clip(action, -1.0, 1.0), "known": known}
 
 

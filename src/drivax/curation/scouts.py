@@ -231,7 +231,7 @@ def train_scouts(
     fold = folds_of(clusters, config.folds, config.seed)
     bank = ScenarioBank.from_scenarios(data)
     learner = config.cloning.build(environment, bank, config.iterations)
-    experience, draws, deviation = _experience(config, environment, bank, fold)
+    experience, draws, deviation = experience_of(config, environment, bank, fold)
 
     def all_scouts(experience: Experience, draws: Sampler, state: Any) -> Any:
         return jax.vmap(lambda own, one: learner.iterate(replace(experience, critic=own), one))(draws, state)
@@ -247,7 +247,7 @@ def train_scouts(
     return Scouts(config, learner, state.parameters, data.hash, fold, deviation)
 
 
-def _experience(
+def experience_of(
     config: ScoutsConfig, environment: Driving, bank: ScenarioBank, fold: Int[Numbers, " N"]
 ) -> tuple[Experience, Sampler, Float[Numbers, " D"]]:
     """What scouts learn from, how each draws along a leading axis, and the deviation of what experts do."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -25,7 +26,8 @@ class WeightConfig:
     1. ``quantile``: u is the mid-rank of s among all n, over n, in (0, 1): what a score means no longer depends on how
        it is spread, and equal scores have equal weights; ``none``: u = s. Then u + ``floor``.
     2. w = u ** (1 / ``temperature``): 1 leaves it, a higher temperature evens it out, a lower one sharpens it.
-    3. w over the mean of all, clipped to at most ``most``, and over the mean again.
+    3. w clipped so that none is more than ``most`` times the mean of what is then left (where fewer than n / ``most``
+       are above 0, those weigh alike), over that mean.
     4. ``(1 - uniform) w + uniform``: a mixture with uniform sampling, whose mean is 1.
 
     Attributes:
@@ -96,8 +98,21 @@ def _weighted(scores: Float[Array, " n"], config: WeightConfig) -> Float[Array, 
     if not np.isfinite(power.max()):
         return np.zeros(len(score))
     weight = np.exp(power - power.max())
-    weight = np.minimum(weight / weight.mean(), config.most)
+    weight = _capped(weight, config.most)
     return (1.0 - config.uniform) * weight / weight.mean() + config.uniform
+
+
+def _capped(weight: Float[Array, " n"], most: float) -> Float[Array, " n"]:
+    """The weights, the largest of them lowered to one value that is ``most`` times the mean of the result."""
+    count, ordered = len(weight), np.sort(weight)[::-1]
+    if ordered[0] <= most * ordered.mean():
+        return weight
+    # If k are lowered to c, then c = most (k c + rest_k) / n, where rest_k is the sum of the others.
+    lowered = np.arange(min(count, math.ceil(count / most)))
+    rest = np.cumsum(ordered[::-1])[::-1][lowered]
+    cap = most * rest / (count - most * lowered)
+    enough = np.flatnonzero((cap >= ordered[lowered]) & (cap > 0.0))
+    return np.minimum(weight, cap[enough[0]] if len(enough) else ordered[ordered > 0].min())
 
 
 @dataclass(frozen=True)
