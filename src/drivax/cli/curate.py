@@ -120,12 +120,14 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
 
 def _refuse_idle(args: Curate, overrides: Sequence[str]) -> None:
     """Refuses flags that the method, or a table that is taken again, would ignore."""
+    idle: dict[str, object] = {}
     if args.again is not None:
         scored = f"{args.again}, which is not scored again,"
         idle = {"--like": args.like, "--seed": args.seed, "--config": args.config}
     else:
         scored = args.method
-        idle = {} if args.method == "ensemble" else {"--config": args.config}
+        if args.method != "ensemble":
+            idle["--config"] = args.config
         if args.method not in ("ensemble", "random_matched"):
             idle["--seed"] = args.seed
     given = [flag for flag, value in idle.items() if value is not None]
