@@ -26,7 +26,7 @@ import numpy as np
 from drivax import settings
 from drivax.curation.controls import event_kinds, event_steps, matched
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.methods import RARITY, Wanted, curate, ensemble_table, table_of
+from drivax.curation.methods import Wanted, curate, ensemble_table, table_of
 from drivax.curation.published import PublishedConfig
 from drivax.curation.ranking import auc_interval, precision_at_base_rate, roc_auc
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
@@ -149,7 +149,7 @@ def scored(
         for data, found in zip(sets, actions, strict=True):
             known, steps = found["known"], np.zeros(found["known"].shape)
             steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
-            tables.append(table_of(name, vars(config), data, {"rarity": steps}, RARITY))
+            tables.append(table_of(name, vars(config), data, {"rarity": steps}))
         yield name, tables[0], joined(tables)
 
 

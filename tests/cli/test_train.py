@@ -8,6 +8,7 @@ import pytest
 
 from drivax.cli import main
 from drivax.synthetic.generate import Generation, generate
+from drivax.tracking.sinks import read_rows
 
 TINY = {
     "total_steps": 8,
@@ -48,3 +49,33 @@ def test_scores_weigh_what_is_learned_from(place, capsys):
     assert "is of other data" in capsys.readouterr().err and not (place / "other").exists()
     assert trained(place, "set-3", "missing", "--scores", str(place / "none.npz")) != 0
     assert "there are no scores" in capsys.readouterr().err
+
+
+def test_what_does_not_go_together(place, capsys):
+    assert trained(place, "set-3", "none", "--weighting.temperature", "2") == 2
+    assert "--weighting without scores to weight; pass --scores or --agent" in capsys.readouterr().err
+    assert trained(place, "set-3", "none", "--agent", "heuristic") == 2
+    assert "the agent heuristic is trained by cql; use offline/cql" in capsys.readouterr().err
+    call = ["train", "offline/cql", "--data", str(place / "set-3"), "--out", str(place / "none")]
+    assert main([*call, "--agent", "random_matched", "--seeds", "2"]) == 2
+    assert "2 agents random_matched in one program would share one lot" in capsys.readouterr().err
+    other = place / "braking.npz"
+    curate = ["curate", "kinematic", "--data", str(place / "set-3"), "--out", str(other)]
+    assert main([*curate, "--weights", "braking", "1", "--overwrite"]) == 0
+    assert main([*call, "--agent", "heuristic", "--scores", str(other)]) == 1
+    assert "scores of 'kinematic' with combination" in capsys.readouterr().err
+    assert not (place / "none").exists()
+
+
+@pytest.mark.slow
+def test_weighting_changes_what_is_drawn(place):
+    """Kinematic scores, evened out or not: all alike where the whole mixture is uniform."""
+    effective = []
+    curate = ["curate", "kinematic", "--data", str(place / "set-3"), "--out", str(place / "kinematic.npz")]
+    assert main([*curate, "--overwrite"]) == 0
+    for name, share in (("even", "1"), ("steep", "0")):
+        scores = ("--scores", str(place / "kinematic.npz"), "--weighting.uniform", share)
+        assert trained(place, "set-3", name, *scores) == 0
+        effective.append(next(read_rows(place / name / "metrics.jsonl"))["sampler/critic_effective"])
+    # Squares of ranks: an effective share of (2k + 1) / (k + 1)^2 with k = 2.
+    assert effective[1] / effective[0] == pytest.approx(5 / 9, rel=0.05)

@@ -59,6 +59,7 @@ SCENES = {
     "aside": [car(y=0.5, speed=10.0)],
     "kerb": [car(y=-0.5, speed=10.0)],
     "verge": [car(y=-1.2, speed=10.0)],
+    "field": [car(y=-8.0, speed=10.0)],
     "off the map": [car(y=-30.0, speed=10.0)],
     "crowd": [car(speed=10.0), *(car(x=-60.0 - 8.0 * i, y=3.7) for i in range(7))],
     "appears inside": [car(speed=10.0), car(x=1.0, speed=10.0)],
@@ -170,6 +171,8 @@ def test_distances_are_to_segments(components):
     assert components["aside"]["off_road"].max() == 0.0
     assert components["kerb"]["off_road"][NOW] == pytest.approx(1 - 0.35 / 0.75, abs=1e-3)
     assert components["verge"]["off_road"][NOW] == 1.0
+    # Beyond the reach of a query for edges the stored side of the place tells, and off the map nothing does.
+    assert (components["field"]["off_road"] == 1.0).all()
     nowhere = components["off the map"]
     assert nowhere["off_road"].max() == 0.0 and nowhere["lane_deviation"].max() == 0.0
 

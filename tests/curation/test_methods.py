@@ -8,8 +8,10 @@ import pytest
 
 from drivax.cli import main
 from drivax.cli.curate import Curate
+from drivax.curation.combining import Combination
 from drivax.curation.controls import event_kinds, event_steps
-from drivax.curation.methods import METHODS, Wanted, curate
+from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.methods import METHODS, Wanted, curate, refuse_stale
 from drivax.curation.scores import read_scores, write_scores
 from drivax.curation.subset import top_rows, write_top
 from drivax.errors import DataError, UsageError
@@ -112,3 +114,30 @@ def test_what_cannot_be_meant(data, tmp_path):
         curate("kinematics", Wanted(data))
     with pytest.raises(DataError, match="there are no scores"):
         curate("random_matched", Wanted(data, tmp_path / "none.npz"))
+
+
+def test_settings_of_a_method(data, tables, tmp_path, capsys):
+    table = curate("kinematic", Wanted(data, config=KinematicConfig(urgent_s=2.0)))
+    assert table.config["urgent_s"] == 2.0
+    assert table.components["urgency"].max() >= tables["kinematic"].components["urgency"].max()
+    with pytest.raises(
+        UsageError, match="uniform has no settings of the kind KinematicConfig; leave them out"
+    ):
+        curate("uniform", Wanted(data, config=KinematicConfig()))
+    out = tmp_path / "scores.npz"
+    assert main(["curate", "kinematic", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 0
+    np.testing.assert_allclose(read_scores(out, data).steps, table.steps, atol=1e-6)
+    assert main(["curate", "oracle", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 2
+    assert "oracle has no such setting; leave out --urgent_s 2" in capsys.readouterr().err
+
+
+def test_a_table_that_the_method_would_not_make_now_is_stale(data, tables, tmp_path):
+    for name in ("kinematic", "action_rarity", "published", "uniform", "random_matched"):
+        write_scores(tables[name], tmp_path / f"{name}.npz")
+        refuse_stale(read_scores(tmp_path / f"{name}.npz", data))
+    table = tables["kinematic"]
+    with pytest.raises(DataError, match=r"with urgent_s 0\.95, which is 2\.0 here; score again"):
+        refuse_stale(table, KinematicConfig(urgent_s=2.0))
+    for other in (replace(table.combination, scenario="max"), Combination({"urgency": 1.0}, "top10")):
+        with pytest.raises(DataError, match="scores of 'kinematic' with combination"):
+            refuse_stale(table.combined(other))

@@ -131,6 +131,22 @@ def test_scouts_tell_what_they_do_about_every_step(scouts, data):
 
 
 @pytest.mark.slow
+def test_scouts_disagree_where_they_have_seen_little(scouts, tmp_path):
+    """Drives as those that they were cloned from, in between and unseen, and others: turned, fast, hemmed in."""
+    usual = [[car(speed=8.1 + 0.2 * row), car(x=60.0, speed=8.0)] for row in range(4)]
+    strange = [
+        [car(speed=25.0), car(x=12.0), car(x=-8.0, speed=25.0), car(y=3.7, speed=25.0)],
+        [car(speed=0.0, y=1.8), car(x=6.0), car(x=-6.0), car(y=4.5)],
+    ]
+    with ScenarioWriter(tmp_path / "set", SMALL) as writer:
+        for row, cars in enumerate(usual + strange):
+            writer.add(assemble(replace(straight_road(cars), scenario_id=str(row), segment=str(row)), SMALL))
+    told = scouts.opinions(ScenarioSet.open(tmp_path / "set"))
+    found = told.disagreement(scouts.deviation).sum(axis=-1).mean(axis=1)
+    assert found[4:].min() > 3.0 * found[:4].max()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", ["plain", "rarity"])
 def test_the_table_of_an_ensemble(data, scouts, weighted):
     trained = scouts if weighted == "plain" else train_scouts(replace(TINY, weighted="rarity"), data)
@@ -162,19 +178,8 @@ def test_the_command_trains_scouts_that_can_disagree_about_modes(data, tmp_path,
 def test_what_cannot_be_is_refused(data, tmp_path, capsys):
     with pytest.raises(UsageError, match="1 folds"):
         ScoutsConfig(folds=1)
-    assert (
-        main(
-            [
-                "curate",
-                "kinematic",
-                "--data",
-                str(data.path),
-                "--out",
-                str(tmp_path / "s.npz"),
-                "--folds",
-                "3",
-            ]
-        )
-        == 2
-    )
-    assert "kinematic has no such setting; leave out --folds 3" in capsys.readouterr().err
+    call = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "s.npz")]
+    assert main([*call, "--folds", "3"]) == 2
+    assert "folds: there is no such setting; use one of urgent_s" in capsys.readouterr().err
+    assert main([*call[:1], "uniform", *call[2:], "--folds", "3"]) == 2
+    assert "uniform has no such setting; leave out --folds 3" in capsys.readouterr().err

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
+from drivax.learning.config import TrainConfig
+from drivax.learning.cql import CqlConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, Recorded, transitions
+from drivax.learning.loop import usable_steps
+from drivax.learning.ppo import PpoConfig
 from drivax.planners.simple import Expert, logged_motion
 from drivax.scenario.bank import AGENT_VALID, ScenarioBank
 from drivax.simulator.simulator import Simulator
@@ -113,6 +117,20 @@ def test_what_follows_the_weights(bank, experience):
     assert float(both.critic.effective) == pytest.approx(1.6) == float(apart.policy.effective)
     assert float(apart.critic.effective) == pytest.approx(usable.sum())
     np.testing.assert_array_equal(apart.critic.cumulative, experience.critic.cumulative)
+    for made in (both, apart):
+        np.testing.assert_array_equal(made.usable, usable)
+        # What features are normalised by.
+        np.testing.assert_array_equal(made.alike.cumulative, experience.critic.cumulative)
+
+
+def test_steps_that_weights_are_made_for_are_those_that_are_drawn(data):
+    config = TrainConfig(task=DRIVING.task, algorithm=CqlConfig())
+    own = ExperienceConfig().of(DRIVING, ScenarioBank.from_scenarios(data))
+    usable = usable_steps(config, data)
+    np.testing.assert_array_equal(usable, own.expert.usable & ~own.expert.clipped)
+    assert usable.any() and not usable[:, :10].any()
+    with pytest.raises(UsageError, match="PpoConfig learns from no recorded steps"):
+        usable_steps(replace(config, algorithm=PpoConfig()), data)
 
 
 def test_what_cannot_be_learned_from_is_refused(bank):

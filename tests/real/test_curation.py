@@ -91,6 +91,6 @@ def test_scouts_score_recorded_drives(real_data, tmp_path):
     config = ScoutsConfig(
         folds=2, cloning=replace(ScoutsConfig().cloning, batch=16, updates=5), total_steps=160
     )
-    table = curate("ensemble", Wanted(data, scouts=config))
+    table = curate("ensemble", Wanted(data, config=config))
     assert table.steps[table.valid].max() > 0.0
     np.testing.assert_allclose(table.steps[0], table.steps[1], atol=1e-5)

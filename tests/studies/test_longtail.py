@@ -10,6 +10,7 @@ from drivax import settings
 from drivax.cli import main
 from drivax.curation.agents import AGENTS, CURATED, weighted
 from drivax.curation.methods import Wanted, curate
+from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draws_of
 from drivax.errors import UsageError
 from drivax.evaluation.crossed import Crossed
@@ -18,7 +19,7 @@ from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.studies import longtail
 from drivax.studies.longtail_plan import LongtailConfig, Sets
-from drivax.studies.longtail_results import METRICS, Condition, judge, needed, rankings, rates
+from drivax.studies.longtail_results import METRICS, Condition, claims, judge, needed, rankings, rates
 from scenes import SMALL, car, straight_road
 
 SEEDS, SCENARIOS = 5, 400
@@ -83,23 +84,42 @@ def test_what_is_undecided_says_what_would_decide():
     assert "test recordings" in needed(Crossed(0.02, (1e-6, 1e-6), 9e-5, (5, 5), 400))
 
 
-@pytest.mark.slow
-def test_every_curated_agent_has_a_control_of_its_effective_size(data):
-    tables = {
-        name: curate(name, Wanted(data)) for name in ("kinematic", "action_rarity", "uniform", "oracle")
-    }
-    for scale, lot in (("step", "random_matched"), ("scenario", "random_matched_scenario")):
-        drawn = tables["kinematic"].drawn
-        sizes = []
-        for name in (lot, "heuristic" if scale == "step" else "heuristic_scenario"):
-            made = weighted(AGENTS[name], data, tables.__getitem__, WeightConfig(), seed=3)
-            sizes.append(draws_of(made.weights, drawn).effective)
-        assert sizes[0] == pytest.approx(sizes[1], rel=1e-9)
+def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_sizes(data):
+    """Of steps, and of scenarios: from scores that lie together as criticality does, and labels that mostly are 0."""
+    rng, shape = np.random.default_rng(0), (600, 91)
+    found = {}
+    for method in ("kinematic", "action_rarity", "ensemble", "oracle", "uniform"):
+        slow = np.cumsum(rng.normal(size=shape), axis=1) + 8 * rng.normal(size=(shape[0], 1))
+        steps = 1 / (1 + np.exp(-slow / 10))
+        if method == "oracle":
+            steps = ((rng.random((shape[0], 1)) < 0.1) & (np.arange(shape[1]) // 20 == 2)).astype(float)
+        elif method == "uniform":
+            steps = np.ones(shape)
+        ids = tuple(map(str, range(shape[0])))
+        found[method] = ScoreTable(method, {}, "x", ids, np.ones(shape, bool), steps, steps.max(axis=1))
+    usable = np.zeros(shape, bool)
+    usable[:, 10:89] = rng.random((shape[0], 79)) < 0.95
+    pairs = {(c.one, c.other) for c in claims(list(AGENTS)) if AGENTS[c.other].by_lot}
+    assert {one for one, _ in pairs} == {*CURATED, "oracle"}
+    for pair in pairs:
+        own, lot = (
+            draws_of(
+                weighted(AGENTS[name], data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
+                usable,
+            )
+            for name in pair
+        )
+        assert lot.effective == pytest.approx(own.effective, rel=0.02), pair
+        assert lot.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
     assert len(CURATED) == 6 and {AGENTS[name].scale for name in CURATED} == {"step", "scenario"}
+
+
+def test_scores_of_another_method_are_refused(data):
+    table = curate("uniform", Wanted(data))
     with pytest.raises(
-        UsageError, match="scores of 'kinematic' for an agent that is curated by 'action_rarity'"
+        UsageError, match="scores of 'uniform' for an agent that is curated by 'action_rarity'"
     ):
-        weighted(AGENTS["action_rarity"], data, lambda _: tables["kinematic"], WeightConfig())
+        weighted(AGENTS["action_rarity"], data, lambda _: table, WeightConfig())
 
 
 def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():

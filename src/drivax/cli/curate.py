@@ -33,6 +33,8 @@ class Curate:
 
     Example: drivax curate ensemble --data sets/world --out scores.npz --cloning.loss likelihood
 
+    Example: drivax curate kinematic --data sets/world --out sooner.npz --urgent_s 2
+
     Example: drivax curate kinematic --data sets/world --out near.npz --again scores.npz --weights urgency 1 braking 0.5
     """
 
@@ -68,7 +70,7 @@ class Curate:
     seed: int | None = None
     """Of the lot of random_matched, and of an ensemble (default: 0)."""
     config: Path | None = None
-    """YAML file with settings of an ensemble; any of them can be given behind as --section.key VALUE."""
+    """YAML file with settings of METHOD; any of them can be given behind as --key VALUE or --section.key VALUE."""
     overwrite: bool = False
     """Replace OUT if it is a file, and TOP if it is a scenario set."""
 
@@ -76,16 +78,17 @@ class Curate:
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and say how scores and weights lie."""
     from drivax import settings
-    from drivax.curation.methods import Wanted, curate
+    from drivax.curation.methods import METHODS, Wanted, curate
     from drivax.curation.scores import read_scores, refuse_existing, write_scores
-    from drivax.curation.scouts import ScoutsConfig
     from drivax.curation.subset import check_top, write_top
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 
-    _refuse_idle(args, overrides)
-    seed = [] if args.method != "ensemble" or args.seed is None else ["--seed", str(args.seed)]
-    scouts = settings.load(ScoutsConfig, args.config or {}, [*overrides, *seed])
+    config = METHODS[args.method].config
+    _refuse_idle(args, overrides, config is not None)
+    if config is not None:
+        seed = [] if args.method != "ensemble" or args.seed is None else ["--seed", str(args.seed)]
+        config = settings.load(type(config), args.config or {}, [*overrides, *seed])
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
@@ -96,7 +99,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
                 data,
                 args.like,
                 args.seed or 0,
-                scouts,
+                config,
                 progress=lambda done, _: bar.update(done),
                 training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
             )
@@ -118,20 +121,19 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     return 0
 
 
-def _refuse_idle(args: Curate, overrides: Sequence[str]) -> None:
+def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None:
     """Refuses flags that the method, or a table that is taken again, would ignore."""
+    again, scored = args.again is not None, args.method
     idle: dict[str, object] = {}
-    if args.again is not None:
+    if again:
         scored = f"{args.again}, which is not scored again,"
-        idle = {"--like": args.like, "--seed": args.seed, "--config": args.config}
-    else:
-        scored = args.method
-        if args.method != "ensemble":
-            idle["--config"] = args.config
-        if args.method not in ("ensemble", "random_matched"):
-            idle["--seed"] = args.seed
+        idle["--like"] = args.like
+    if again or not settable:
+        idle["--config"] = args.config
+    if again or args.method not in ("ensemble", "random_matched"):
+        idle["--seed"] = args.seed
     given = [flag for flag, value in idle.items() if value is not None]
-    if args.again is not None or args.method != "ensemble":
+    if again or not settable:
         given += overrides
     if given:
         raise UsageError(f"{scored} has no such setting", cure="leave out " + " ".join(given))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,13 +13,13 @@ import tyro
 
 from drivax import settings
 from drivax.curation.agents import AGENTS, weighted
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.methods import Wanted, curate, refuse_stale
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, weights_of
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
-from drivax.learning.loop import train
+from drivax.learning.loop import train, usable_steps
 from drivax.learning.threads import widen_pool
 from drivax.scenario.store import ScenarioSet
 
@@ -54,10 +55,13 @@ class Train:
         Literal[
             "bc", "baseline", "cql_bc", "heuristic", "heuristic_scenario", "ensemble", "ensemble_scenario",
             "action_rarity", "action_rarity_scenario", "random_matched", "random_matched_scenario", "oracle",
+            "random_matched_oracle",
         ]
         | None
     ) = None  # fmt: skip
     """Curation of the agent of that name in the long-tail study: scores DATA first, or takes --scores."""
+    weighting: WeightConfig = field(default_factory=WeightConfig)
+    """How scores become weights; with --scores or --agent."""
     seeds: int = 1
     """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
@@ -95,19 +99,36 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
 
 def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
     """The set, with weights if scores or an agent are asked for."""
-    data = ScenarioSet.open(args.data)
+    data, weighting = ScenarioSet.open(args.data), args.weighting
     if args.agent is None:
         if args.scores is None:
+            if weighting != WeightConfig():
+                raise UsageError("--weighting without scores to weight", cure="pass --scores or --agent")
             return data
-        return WeightedSet(data, weights_of(read_scores(args.scores, data), WeightConfig(), args.scale))
-    agent, scores = AGENTS[args.agent], args.scores
+        table = read_scores(args.scores, data)
+        return WeightedSet(data, weights_of(table, weighting, args.scale, usable_steps(config, data)))
+    agent = AGENTS[args.agent]
     own, wanted = (
         settings.kind_of(type(one.algorithm)) for one in (config, settings.load(TrainConfig, agent.preset))
     )
     if own != wanted:
         raise UsageError(f"the agent {args.agent} is trained by {wanted}", cure=f"use {agent.preset}")
+    if agent.by_lot and args.seeds > 1:
+        raise UsageError(
+            f"{args.seeds} agents {args.agent} in one program would share one lot",
+            cure="train each by itself: --seeds 1 --seed NUMBER",
+        )
+    return weighted(
+        agent, data, partial(_table, args, data), weighting, usable_steps(config, data), config.seed
+    )
 
-    def table(method: str) -> ScoreTable:
-        return curate(method, Wanted(data)) if scores is None else read_scores(scores, data)
 
-    return weighted(agent, data, table, WeightConfig(), seed=config.seed)
+def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
+    """Scores by a method of an agent of the study."""
+    if args.scores is None:
+        return curate(method, Wanted(data))
+    table = read_scores(args.scores, data)
+    # Scores of another method have no settings to compare; who weights refuses them.
+    if table.method == method:
+        refuse_stale(table, file=args.scores)
+    return table

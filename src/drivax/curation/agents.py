@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
+
 from drivax.curation.controls import matched
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import Scale, WeightConfig, weights_of
@@ -35,7 +37,7 @@ class Agent:
 
 
 #: By default weights go by the ranks of scores, so that those of all methods have one distribution at either scale and
-#: one control each is matched to all of them.
+#: one control each is matched to all of them; but for labels, most of which are equal.
 AGENTS: Mapping[str, Agent] = MappingProxyType(
     {
         "bc": Agent("offline/bc"),
@@ -50,14 +52,27 @@ AGENTS: Mapping[str, Agent] = MappingProxyType(
         "random_matched": Agent(method="kinematic", by_lot=True),
         "random_matched_scenario": Agent(method="kinematic", scale="scenario", by_lot=True),
         "oracle": Agent(method="oracle"),
+        "random_matched_oracle": Agent(method="oracle", by_lot=True),
     }
 )
 #: Agents that are curated, whose scores are not those of a control.
 CURATED = tuple(name for name in AGENTS if name.startswith(("heuristic", "ensemble", "action_rarity")))
 
 
+def control_of(name: str) -> str:
+    """The agent whose weights are those of another one, dealt out by lot."""
+    if AGENTS[name].method == "oracle":
+        return "random_matched_oracle"
+    return "random_matched_scenario" if AGENTS[name].scale == "scenario" else "random_matched"
+
+
 def weighted(
-    agent: Agent, data: ScenarioSet, tables: Tables, config: WeightConfig, seed: int = 0
+    agent: Agent,
+    data: ScenarioSet,
+    tables: Tables,
+    config: WeightConfig,
+    usable: np.ndarray | None = None,
+    seed: int = 0,
 ) -> WeightedSet:
     """A set with the weights of an agent.
 
@@ -66,6 +81,7 @@ def weighted(
         data: The set.
         tables: Scores of the set.
         config: How scores become weights.
+        usable: Which steps its training learns from (:func:`~drivax.curation.weights.weights_of`).
         seed: Of the lot, for agents ``by_lot``.
 
     Raises:
@@ -79,4 +95,4 @@ def weighted(
         )
     if agent.by_lot:
         table = matched(table, seed)
-    return WeightedSet(data, weights_of(table, config, agent.scale))
+    return WeightedSet(data, weights_of(table, config, agent.scale, usable))

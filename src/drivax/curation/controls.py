@@ -17,21 +17,26 @@ Array = np.ndarray[Any, Any]
 
 
 def matched(table: ScoreTable, seed: int) -> ScoreTable:
-    """The scores of a table, dealt out anew by lot: among the steps that can be drawn, and among the scenarios.
+    """The scores of a table, dealt out anew by lot: each scenario is given those of another, from a random step on.
 
-    The scores stay the same ones, so that at either scale every weighting of them has the same distribution, and with
-    it the same effective sample size, as the table's own; only what it prefers is chance. (At scenario scale that is
-    exact where equally many steps of all scenarios can be drawn.)
+    What weights prefer is chance then, but how they are spread stays: over all steps, within a scenario, and among
+    scenarios; exactly where equally many steps of all scenarios can be drawn. (A row that is too long is cut, one that
+    is too short begins anew.) Steps that were dealt out one by one would spread over all scenarios alike, and a
+    weighting of single steps would be compared with more scenarios than it sees itself.
 
     Args:
         table: What to match.
         seed: Of the lot.
     """
     rng = np.random.default_rng(seed)
-    steps = table.steps.copy()
-    steps[table.drawn] = rng.permutation(table.steps[table.drawn])
+    drawn, steps, scenarios = table.drawn, table.steps.copy(), table.scenarios.copy()
+    rows = np.flatnonzero(drawn.any(axis=1))
+    for row, other in zip(rows, rng.permutation(rows), strict=True):
+        scores = table.steps[other, drawn[other]]
+        scores = np.roll(scores, rng.integers(len(scores)))
+        steps[row, drawn[row]] = np.resize(scores, int(drawn[row].sum()))
+        scenarios[row] = table.scenarios[other]
     config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
-    scenarios = rng.permutation(table.scenarios)
     return replace(
         table, method="random_matched", config=config, steps=steps, scenarios=scenarios, components={}
     )

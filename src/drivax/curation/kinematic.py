@@ -33,7 +33,7 @@ from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
 from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, filter_operator
 from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import LEVEL_M, lane_distance, left_of_edges, project_on_route
+from drivax.scenario.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
 from drivax.simulator.types import Frame
@@ -189,9 +189,10 @@ def _derivative(signal: Float[Array, " K"], order: int, derivative: int) -> Floa
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
     def one(box: Array, ground: Array) -> Array:
-        inside, known = left_of_edges(bank, log.index, box[:2], corners(box), ground)
-        share = jnp.clip(1.0 - inside / config.edge_m, 0.0, 1.0)
-        return jnp.max(jnp.where(known, share, 0.0))
+        # Where no edge and no stored side tells, a logged car is on the road: on a driveway, or beyond the map.
+        road = jnp.ones(4, bool)
+        beyond = offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
+        return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
 
     return jax.vmap(one)(log.frame.box[:, 0], log.ground_m)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,7 +21,7 @@ from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity,
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.scoring import Progress, score_steps, valid_steps
 from drivax.curation.scouts import Scouts, ScoutsConfig, train_scouts
-from drivax.errors import UsageError
+from drivax.errors import DataError, UsageError
 from drivax.named import nearest
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
@@ -43,11 +44,8 @@ PUBLISHED = Combination(
 )
 #: Rarity: a scenario is as rare as its rarest steps, of which the few very rarest may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
-#: A scenario is as uncertain as its most uncertain second.
-ENSEMBLE_SCENARIO = "top10"
 #: Disagreement above this percentile of a set scores 1.
 _MOST = 99.0
-_ALL = Combination({"all": 1.0})
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,8 @@ class Wanted:
     Attributes:
         data: The set.
         like: Table to match (``random_matched`` only).
-        seed: Of what is drawn by lot.
-        scouts: The ensemble (``ensemble`` only).
+        seed: Of what is drawn by lot (``random_matched`` only; an ensemble has its own).
+        config: Settings of the method, of the type of ``METHODS[name].config``; None: those.
         progress: Called with (scenarios done, scenarios).
         training: Called with (iterations done, iterations) while scouts are trained.
     """
@@ -66,20 +64,31 @@ class Wanted:
     data: ScenarioSet
     like: Path | None = None
     seed: int = 0
-    scouts: ScoutsConfig = field(default_factory=ScoutsConfig)
+    config: Any = None
     progress: Progress | None = None
     training: Progress | None = None
 
 
-#: A method: from what is asked to the table.
-Method = Callable[[Wanted], ScoreTable]
+@dataclass(frozen=True)
+class Method:
+    """A method of curation.
+
+    Attributes:
+        score: From what is asked, with settings, to the table.
+        config: Settings by default; None: it has none.
+        combination: How its components become scores; a text is the aggregator of components that all weigh 1.
+    """
+
+    score: Callable[[Wanted], ScoreTable]
+    config: Any = None
+    combination: Combination | str = "max"
 
 
 def curate(name: str, wanted: Wanted) -> ScoreTable:
     """Scores a set.
 
     Raises:
-        UsageError: There is no such method, or it lacks what it asks for.
+        UsageError: There is no such method, it lacks what it asks for, or has no such settings.
         DataError: It cannot score this set.
     """
     if name not in METHODS:
@@ -89,33 +98,71 @@ def curate(name: str, wanted: Wanted) -> ScoreTable:
             "random_matched needs --like, a table of the same set, and no other method takes it",
             cure="drivax curate random_matched --like SCORES ...",
         )
-    table = METHODS[name](wanted)
+    own = METHODS[name].config
+    if wanted.config is not None and type(wanted.config) is not type(own):
+        raise UsageError(
+            f"{name} has no settings of the kind {type(wanted.config).__name__}",
+            cure="leave them out" if own is None else f"use {type(own).__name__}",
+        )
+    table = METHODS[name].score(replace(wanted, config=own if wanted.config is None else wanted.config))
     if wanted.progress is not None:
         wanted.progress(len(wanted.data), len(wanted.data))
     return table
 
 
-def _heuristic(name: str, config: Any, combination: Combination) -> Method:
+def refuse_stale(table: ScoreTable, config: Any = None, file: Path | None = None) -> None:
+    """Refuses a table that its method would not make now, of the same set.
+
+    Args:
+        table: The table.
+        config: Settings that the method would have; None: those by default.
+        file: Where the table is from.
+
+    Raises:
+        DataError: It was made with other settings, or its components were weighted otherwise.
+    """
+    method, told = METHODS[table.method], dict(table.config)
+    now: dict[str, Any] = {} if method.config is None else plain(method.config if config is None else config)
+    if table.components:
+        now["combination"] = asdict(_combination(method, table.components))
+    # A table that was read has lists where one that was made has tuples.
+    told, now = (json.loads(json.dumps(values)) for values in (told, now))
+    for name, value in now.items():
+        if told.get(name) != value:
+            raise DataError(
+                f"scores of {table.method!r} with {name} {told.get(name)}, which is {value} here",
+                file=file,
+                cure="score again with `drivax curate`",
+            )
+
+
+def _combination(method: Method, components: Iterable[str]) -> Combination:
+    if isinstance(method.combination, Combination):
+        return method.combination
+    return Combination(dict.fromkeys(components, 1.0), method.combination)
+
+
+def _heuristic(name: str) -> Callable[[Wanted], ScoreTable]:
     def score(wanted: Wanted) -> ScoreTable:
-        components = score_steps(wanted.data, config, wanted.progress)
-        return table_of(name, asdict(config), wanted.data, components, combination)
+        components = score_steps(wanted.data, wanted.config, wanted.progress)
+        return table_of(name, plain(wanted.config), wanted.data, components)
 
     return score
 
 
-def _rarity(name: str, config: KernelRarity | PublishedRarity) -> Method:
+def _rarity(name: str) -> Callable[[Wanted], ScoreTable]:
     def score(wanted: Wanted) -> ScoreTable:
         expert = ExpertActions()
         found = score_steps(wanted.data, expert, wanted.progress)
-        components = {"rarity": rarity_steps(config, found["action"], found["known"])}
-        return table_of(name, {**asdict(config), **asdict(expert)}, wanted.data, components, RARITY)
+        components = {"rarity": rarity_steps(wanted.config, found["action"], found["known"])}
+        return table_of(name, plain(wanted.config) | asdict(expert), wanted.data, components)
 
     return score
 
 
 def _ensemble(wanted: Wanted) -> ScoreTable:
     return ensemble_table(
-        train_scouts(wanted.scouts, wanted.data, wanted.training), wanted.data, wanted.progress
+        train_scouts(wanted.config, wanted.data, wanted.training), wanted.data, wanted.progress
     )
 
 
@@ -145,28 +192,26 @@ def ensemble_table(
         components = {f"action_{number}": part for number, part in enumerate(np.moveaxis(parts, -1, 0))}
     else:
         components = {"information": opinions.information / math.log(scouts.config.folds)}
-    combination = Combination(dict.fromkeys(components, 1.0), ENSEMBLE_SCENARIO)
     own = data.hash == scouts.set_hash
     error = opinions.error(scouts.deviation, scouts.fold if own else None)
     about = {
         **plain(scouts.config),
         "trained_on": scouts.set_hash,
         "scale": scale,
-        "error_rank_correlation": None,
     }
-    table = table_of("ensemble", about, data, components, combination)
+    table = table_of("ensemble", about, data, components)
     known = opinions.known
-    about["error_rank_correlation"] = rank_correlation(table.steps[known], error[known])
-    return replace(table, config=about | {"combination": asdict(combination)})
+    told = {"error_rank_correlation": rank_correlation(table.steps[known], error[known])}
+    return replace(table, config={**table.config, **told})
 
 
 def _uniform(wanted: Wanted) -> ScoreTable:
-    return table_of("uniform", {}, wanted.data, {"all": np.ones(_shape(wanted.data))}, _ALL)
+    return table_of("uniform", {}, wanted.data, {"all": np.ones(_shape(wanted.data))})
 
 
 def _oracle(wanted: Wanted) -> ScoreTable:
     components = {"all": event_steps(wanted.data).astype(np.float64)}
-    return table_of("oracle", {}, wanted.data, components, _ALL)
+    return table_of("oracle", {}, wanted.data, components)
 
 
 def _random_matched(wanted: Wanted) -> ScoreTable:
@@ -183,7 +228,6 @@ def table_of(
     config: Mapping[str, Any],
     data: ScenarioSet,
     components: Mapping[str, np.ndarray[Any, Any]],
-    combination: Combination,
 ) -> ScoreTable:
     """The table of a set, from what a method says of every step.
 
@@ -192,25 +236,24 @@ def table_of(
         config: Its configuration, as plain values.
         data: The set.
         components: By name, of every step and in [0, 1].
-        combination: How they become scores.
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
     blank = np.zeros(valid.shape)
-    return ScoreTable(name, config, data.hash, ids, valid, blank, blank[:, 0], components).combined(
-        combination
-    )
+    table = ScoreTable(name, config, data.hash, ids, valid, blank, blank[:, 0], components)
+    return table.combined(_combination(METHODS[name], components))
 
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
-        "kinematic": _heuristic("kinematic", KinematicConfig(), KINEMATIC),
-        "published": _heuristic("published", PublishedConfig(), PUBLISHED),
-        "action_rarity": _rarity("action_rarity", KernelRarity()),
-        "ensemble": _ensemble,
-        "action_rarity_published": _rarity("action_rarity_published", PublishedRarity()),
-        "uniform": _uniform,
-        "random_matched": _random_matched,
-        "oracle": _oracle,
+        "kinematic": Method(_heuristic("kinematic"), KinematicConfig(), KINEMATIC),
+        "published": Method(_heuristic("published"), PublishedConfig(), PUBLISHED),
+        "action_rarity": Method(_rarity("action_rarity"), KernelRarity(), RARITY),
+        # A scenario is as uncertain as its most uncertain second.
+        "ensemble": Method(_ensemble, ScoutsConfig(), "top10"),
+        "action_rarity_published": Method(_rarity("action_rarity_published"), PublishedRarity(), RARITY),
+        "uniform": Method(_uniform),
+        "random_matched": Method(_random_matched),
+        "oracle": Method(_oracle),
     }
 )

@@ -252,7 +252,7 @@ def experience_of(
 ) -> tuple[Experience, Sampler, Float[Numbers, " D"]]:
     """What scouts learn from, how each draws along a leading axis, and the deviation of what experts do."""
     made = ExperienceConfig(mask_clipped=config.cloning.mask_clipped).of(environment, bank)
-    usable = np.asarray(made.expert.usable & ~(made.expert.clipped & config.cloning.mask_clipped))
+    usable = np.asarray(made.usable)
     action = np.asarray(made.expert.action, np.float64)
     weights = usable.astype(np.float64)
     if config.weighted == "rarity":

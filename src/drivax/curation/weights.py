@@ -59,23 +59,26 @@ class WeightConfig:
 PUBLISHED = WeightConfig(normalise="none", floor=0.01, temperature=1.0, most=float("inf"), uniform=0.0)
 
 
-def weights_of(table: ScoreTable, config: WeightConfig, scale: Scale) -> Float[Array, "N T"]:
+def weights_of(
+    table: ScoreTable, config: WeightConfig, scale: Scale, usable: Bool[Array, "N T"] | None = None
+) -> Float[Array, "N T"]:
     """Weights of every step of a set, of mean 1 over the steps that can be drawn.
 
-    Steps that cannot be drawn (``ScoreTable.drawn``) weigh 0. At the scale of scenarios every step of a scenario has
-    the scenario's weight.
+    Other steps weigh 0. At the scale of scenarios every step of a scenario has the scenario's weight.
 
     Args:
         table: The scores.
         config: How scores become weights.
         scale: Whether steps are weighted one by one, or as their scenarios are.
+        usable: Which steps can be drawn, where a training leaves some out (:func:`drivax.learning.loop.usable_steps`);
+            by default all of which the log knows what ego did (``ScoreTable.drawn``).
 
     Raises:
         UsageError: No step can be drawn, or none would have a weight.
     """
-    drawn = table.drawn
+    drawn = table.drawn if usable is None else usable
     if not drawn.any():
-        raise UsageError("no log has two steps on end, so that nothing can be drawn", cure="check the set")
+        raise UsageError("there is no step that can be drawn", cure="check the set")
     weights = np.zeros(drawn.shape)
     if scale == "step":
         weights[drawn] = _weighted(table.steps[drawn], config)
@@ -140,7 +143,7 @@ def draws_of(weights: Float[Array, "N T"], drawn: Bool[Array, "N T"]) -> Draws:
 
     Args:
         weights: Of every step.
-        drawn: Which steps can be drawn (``ScoreTable.drawn``).
+        drawn: Which steps can be drawn, as :func:`weights_of` was told.
     """
     one = weights[drawn]
     some = drawn.any(axis=1)

@@ -95,12 +95,16 @@ class Experience:
     Attributes:
         data: The environment's data.
         expert: What the expert did.
+        usable: Which steps are learned from.
+        alike: Draws these, all alike.
         critic: How steps are drawn that values are learned from.
         policy: How steps are drawn that the policy is improved at; None: the same steps as the critic's.
     """
 
     data: Any
     expert: ExpertSteps
+    usable: Bool[Array, "N T"]
+    alike: Sampler
     critic: Sampler
     policy: Sampler | None = None
 
@@ -139,14 +143,14 @@ class ExperienceConfig:
             DataError: No step can be learned from.
         """
         expert = _expert_steps(recorded(environment), data)
-        usable = np.asarray(expert.usable & ~(expert.clipped & self.mask_clipped))
-        alike = usable.astype(np.float64)
+        usable = expert.usable & ~(expert.clipped & self.mask_clipped)
+        alike = sampler.sampler(np.asarray(usable, np.float64))
         if weights is None:
-            return Experience(data, expert, sampler.sampler(alike))
-        weighted = sampler.sampler(usable * checked_weights(weights, usable.shape))
+            return Experience(data, expert, usable, alike, alike)
+        weighted = sampler.sampler(np.asarray(usable) * checked_weights(weights, usable.shape))
         if self.weighted == "all":
-            return Experience(data, expert, weighted)
-        return Experience(data, expert, sampler.sampler(alike), weighted)
+            return Experience(data, expert, usable, alike, weighted)
+        return Experience(data, expert, usable, alike, alike, weighted)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
@@ -90,6 +91,20 @@ def train(
         journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
         _learn(_Run(config, program, journals, held_out, recorded, networks, say))
     return RunFolder.open(out)
+
+
+def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
+    """Which recorded steps, ``[N, T]``, a training by weight would learn from.
+
+    Weights have to be made for these: to have a mean of 1, say, or an effective size, over what is drawn.
+
+    Raises:
+        UsageError: The algorithm learns from no recorded steps.
+    """
+    environment = config.environment()
+    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
+    return np.asarray(experience.usable)
 
 
 def _refuse(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:

@@ -248,8 +248,8 @@ class Offline:
         return part, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:
-        """Of recorded steps, drawn as values are learned from; the same for every seed."""
-        index, step = draw(data.critic, jax.random.key(0), (_JUDGED // _AT_ONCE, _AT_ONCE))
+        """Of recorded steps, all alike, whatever their weights; the same for every seed."""
+        index, step = draw(data.alike, jax.random.key(0), (_JUDGED // _AT_ONCE, _AT_ONCE))
         observe = partial(recorded(self.environment).observe_recorded, data.data)
         return feature_statistics(jax.lax.map(observe, (index, step)))
 

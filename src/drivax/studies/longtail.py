@@ -15,7 +15,7 @@ from typing import Any
 
 from drivax.curation.agents import AGENTS, weighted
 from drivax.curation.controls import event_kinds
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.methods import Wanted, curate, refuse_stale
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.scoring import score_steps
@@ -24,7 +24,7 @@ from drivax.curation.weights import draws_of
 from drivax.errors import UsageError
 from drivax.evaluation.crossed import crossed_difference
 from drivax.evaluation.stored import read_evaluation
-from drivax.learning.loop import train
+from drivax.learning.loop import train, usable_steps
 from drivax.learning.validation import rank
 from drivax.scenario.store import ScenarioSet
 from drivax.show.criticality import criticality_html
@@ -41,6 +41,7 @@ from drivax.studies.longtail_plan import (
     Job,
     LongtailConfig,
     Sets,
+    Usable,
     run_of,
 )
 from drivax.studies.longtail_results import METRICS, Condition, judge, rankings, rates, summary
@@ -79,18 +80,21 @@ def score(config: LongtailConfig, sets: Sets, out: Path, say: Say) -> dict[str, 
     data, tables = ScenarioSet.open(sets.train), {}
     for method in dict.fromkeys(AGENTS[agent].method for agent in config.agents):
         file = out / SCORES / f"{method}.npz"
+        own = config.scouts if method == "ensemble" else None
         if not file.is_file():
             say(f"scoring by {method}")
-            write_scores(curate(method, Wanted(data, scouts=config.scouts)), file)
+            write_scores(curate(method, Wanted(data, config=own)), file)
         tables[method] = read_scores(file, data)
+        refuse_stale(tables[method], own, file)
     return tables
 
 
 def train_all(
-    config: LongtailConfig, sets: Sets, out: Path, agents: Sequence[str], cores: int | None, say: Say
-) -> None:
+    config: LongtailConfig, sets: Sets, out: Path, agents: Sequence[str], usable: Usable, cores: int | None,
+    say: Say,
+) -> None:  # fmt: skip
     """Trains agents that are not trained yet, each seed by itself on one core."""
-    jobs = [Job(config, sets, out, agent, seed) for seed in range(config.seeds) for agent in agents]
+    jobs = [Job(config, sets, out, agent, seed, usable) for seed in range(config.seeds) for agent in agents]
     waiting = [job for job in jobs if not _done(job)]
     for number, (job, took) in enumerate(one_core_each(_train, waiting, cores), start=1):
         say(f"trained {job.agent}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
@@ -111,7 +115,7 @@ def _train(job: Job) -> float:
 
     train(
         job.config.train_config(job.agent, job.seed),
-        weighted(AGENTS[job.agent], data, table, job.config.weights, job.seed),
+        weighted(AGENTS[job.agent], data, table, job.config.weights, job.usable, job.seed),
         job.run,
         validation=ScenarioSet.open(job.sets.validation),
         resume=bool(Checkpoints(job.run / "checkpoints").steps()),
@@ -147,8 +151,10 @@ def study(
     """
     begin(config, sets, out)
     tables = score(config, sets, out, say)
-    test = test_set(sets, out)
-    train_all(config, sets, out, FIRST, cores, say)
+    data, test = ScenarioSet.open(sets.train), test_set(sets, out)
+    # Of one observation and one action space: whichever agent is asked.
+    usable = usable_steps(config.train_config(FIRST[0], 0), data)
+    train_all(config, sets, out, FIRST, usable, cores, say)
     drive_all(config, out, test, FIRST, say)
     met = conditions(config, out)
     for one in met:
@@ -163,11 +169,10 @@ def study(
             file=out,
             cure="train longer, choose other settings, or pass --anyway",
         )
-    train_all(config, sets, out, config.agents, cores, say)
+    train_all(config, sets, out, config.agents, usable, cores, say)
     drive_all(config, out, test, config.agents, say)
-    results = findings(config, out, test, tables, met)
+    results = findings(config, out, test, tables, usable) | {"conditions": [asdict(one) for one in met]}
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-    data = ScenarioSet.open(sets.train)
     expert = score_steps(data, ExpertActions())
     write_page(results, tables, expert["action"][expert["known"]], out / REPORT)
     tops = {row: tables[name] for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP)}
@@ -217,7 +222,7 @@ def findings(
     out: Path,
     test: ScenarioSet,
     tables: Mapping[str, ScoreTable],
-    met: Sequence[Condition],
+    usable: Usable,
 ) -> dict[str, Any]:
     """Everything that the study found, as plain values."""
     rare, labels = rare_rows(config, test), clusters(test)
@@ -237,15 +242,13 @@ def findings(
             "rare": int(rare.sum()),
             "labelled": bool((event_kinds(test) > 0).any()),
         },
-        "conditions": [asdict(one) for one in met],
         "detectable": detectable(config, out, test),
         "claims": [summary(one) for one in judge(drives, labels, rare, config.agents)],
         "rates": {name: rates(drives[name], labels, rare) for name in ("expert", *config.agents)},
         "draws": {
             name: asdict(
                 draws_of(
-                    weighted(AGENTS[name], data, tables.__getitem__, config.weights).weights,
-                    tables[AGENTS[name].method].drawn,
+                    weighted(AGENTS[name], data, tables.__getitem__, config.weights, usable).weights, usable
                 )
             )
             for name in config.agents

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+
 from drivax import settings
 from drivax.curation.agents import AGENTS
 from drivax.curation.scouts import ScoutsConfig
@@ -13,6 +16,9 @@ from drivax.curation.weights import WeightConfig
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.named import nearest
+
+#: Which recorded steps are learned from.
+Usable = Bool[np.ndarray, "N T"]
 
 #: What has to drive well before anything is compared.
 FIRST = ("baseline", "bc")
@@ -114,6 +120,7 @@ class Job:
     out: Path
     agent: str
     seed: int
+    usable: Usable
 
     @property
     def run(self) -> Path:

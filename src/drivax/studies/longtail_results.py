@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.curation.agents import AGENTS, CURATED
+from drivax.curation.agents import CURATED, control_of
 from drivax.curation.ranking import rank_correlation
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
@@ -103,7 +103,7 @@ def claims(agents: Sequence[str]) -> list[Claim]:
         found.append(Claim(f"{name} collides less than the baseline", name, "baseline"))
         found.append(Claim(f"{name} fails less than the baseline", name, "baseline", "accuracy"))
     for name in curated:
-        lot = "random_matched_scenario" if AGENTS[name].scale == "scenario" else "random_matched"
+        lot = control_of(name)
         if lot in agents:
             found.append(Claim(f"{name} collides less than the same weights dealt out by lot", name, lot))
             found.append(
@@ -115,7 +115,7 @@ def claims(agents: Sequence[str]) -> list[Claim]:
         ("ensemble", "cql_bc", "uncertainty collides less than CQL with imitation"),
         ("cql_bc", "baseline", "CQL with imitation collides less than the baseline"),
         ("oracle", "baseline", "true labels collide less than the baseline"),
-        ("oracle", "random_matched", "true labels collide less than weights dealt out by lot"),
+        ("oracle", control_of("oracle"), "true labels collide less than weights dealt out by lot"),
     ):
         if one in agents and other in agents:
             found.append(Claim(words, one, other))
