@@ -28,7 +28,7 @@ from drivax.curation.controls import event_kinds, event_steps, matched
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.methods import Wanted, curate, ensemble_table, table_of
 from drivax.curation.published import PublishedConfig
-from drivax.curation.ranking import auc_interval, precision_at_base_rate, roc_auc
+from drivax.curation.ranking import auc_interval, bootstrap_intervals, precision_at_base_rate, roc_auc
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.scoring import BATCH, score_steps
@@ -80,8 +80,11 @@ class Truth:
         )
 
     def groups(self) -> dict[str, Any]:
-        """Which scenarios are to be found: all with an event, those that force a reaction, those of every kind."""
-        found = {"all": self.kind > 0, "forced": (self.kind > 0) & (self.severity >= FORCED_MPS2)}
+        """Which scenarios are to be found: all with an event, those that do and do not force a reaction, every kind."""
+        forced = self.severity >= FORCED_MPS2
+        found = {
+            "all": self.kind > 0, "forced": (self.kind > 0) & forced, "mild": (self.kind > 0) & ~forced
+        }  # fmt: skip
         return found | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
 
 
@@ -90,19 +93,23 @@ def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str,
     rows = wanted | (truth.kind == 0)
     label = wanted[rows]
     weight = np.where(label, NATURAL / label.sum(), (1 - NATURAL) / (~label).sum())
-    low, high = auc_interval(scenarios[rows], label)
+    _, precision = bootstrap_intervals(scenarios[rows], label, weight, np.arange(len(label)))
     valid = truth.valid[rows]
     step_label = (truth.during & wanted[:, None])[rows][valid]
     step_weight = np.broadcast_to(weight[:, None], valid.shape)[valid]
     step_scores = steps[rows][valid]
+    scenario = np.broadcast_to(np.arange(len(label))[:, None], valid.shape)[valid]
+    step_auc, step_precision = bootstrap_intervals(step_scores, step_label, step_weight, scenario)
     return {
         "scenarios": int(label.sum()),
         "auc": roc_auc(scenarios[rows], label),
-        "low": low,
-        "high": high,
+        "auc_interval": auc_interval(scenarios[rows], label),
         "precision": precision_at_base_rate(scenarios[rows], label, weight),
+        "precision_interval": precision,
         "step_auc": roc_auc(step_scores, step_label, step_weight),
+        "step_auc_interval": step_auc,
         "step_precision": precision_at_base_rate(step_scores, step_label, step_weight),
+        "step_precision_interval": step_precision,
         "step_rate": float(step_weight[step_label].sum() / step_weight.sum()),
     }
 
@@ -213,14 +220,18 @@ def events_table(stored: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for method, found in stored["methods"].items():
-        for group, words in (("forced", "that force a reaction"), ("all", "all")):
+        for group, words in (("forced", "that force a reaction"), ("mild", "that do not"), ("all", "all")):
             one = found["events"][group]
-            auc = f"{one['auc']:.3f} [{one['low']:.3f}, {one['high']:.3f}]"
-            lines.append(
-                f"| `{method}` | {words} ({one['scenarios']}) | {auc} | {one['precision']:.2f} | "
-                f"{one['step_auc']:.3f} | {one['step_precision']:.2f} |"
-            )
+            measures = (("auc", 3), ("precision", 2), ("step_auc", 3), ("step_precision", 2))
+            cells = " | ".join(told(one, *measure) for measure in measures)
+            lines.append(f"| `{method}` | {words} ({one['scenarios']}) | {cells} |")
     return "\n".join(lines)
+
+
+def told(one: dict[str, Any], measure: str, digits: int) -> str:
+    """A measure with its interval."""
+    low, high = one[f"{measure}_interval"]
+    return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
@@ -231,7 +242,7 @@ def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
     lines.append("|---|---|" + "---|" * len(methods))
     for kind in kinds:
         ones = [found["events"][kind] for found in methods.values()]
-        cells = " | ".join(f"{one[measure]:.{digits}f}" for one in ones)
+        cells = " | ".join(told(one, measure, digits) for one in ones)
         lines.append(f"| `{kind}` | {ones[0]['scenarios']} | {cells} |")
     return "\n".join(lines)
 

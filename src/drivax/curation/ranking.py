@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.stats import norm, rankdata
 
 from drivax.errors import UsageError
@@ -26,12 +26,7 @@ def roc_auc(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> 
         UsageError: There is nothing to be found, or nothing else.
     """
     _check(labels)
-    weights = np.ones(len(scores)) if weights is None else weights
-    values, place = np.unique(scores, return_inverse=True)
-    found = np.bincount(place, weights * labels, len(values))
-    other = np.bincount(place, weights * ~labels, len(values))
-    below = np.cumsum(other) - other
-    return float(np.sum(found * (below + other / 2)) / (found.sum() * other.sum()))
+    return _auc(*_masses(_places(scores), labels, np.ones(len(scores)) if weights is None else weights))
 
 
 def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> tuple[float, float]:
@@ -64,12 +59,72 @@ def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | N
         UsageError: There is nothing to be found, or nothing else.
     """
     _check(labels)
-    weights = np.ones(len(scores)) if weights is None else weights
-    values, place = np.unique(-scores, return_inverse=True)
-    every = np.bincount(place, weights, len(values))
-    found = np.bincount(place, weights * labels, len(values))
+    return _precision(*_masses(_places(scores), labels, np.ones(len(scores)) if weights is None else weights))
+
+
+def bootstrap_intervals(
+    scores: Numbers,
+    labels: Labels,
+    weights: Numbers,
+    clusters: Int[np.ndarray[Any, Any], " n"],
+    resamples: int = 500,
+    confidence: float = 0.95,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Intervals of :func:`roc_auc` and :func:`precision_at_base_rate`, by percentiles of a cluster bootstrap.
+
+    Whole clusters are drawn with replacement (Davison and Hinkley, Bootstrap Methods, 1997, 3.8): those in which there
+    is something to be found and those in which there is nothing apart, so that the base rate stays.
+
+    Args:
+        scores: Of everything.
+        labels: What is to be found.
+        weights: How much each counts.
+        clusters: What belongs together: the scenario of a step.
+        resamples: How often.
+        confidence: Of both intervals.
+
+    Raises:
+        UsageError: There is nothing to be found, or nothing else.
+    """
+    _check(labels)
+    place, rng = _places(scores), np.random.default_rng(0)
+    number, cluster = np.unique(clusters, return_inverse=True)
+    holds = np.bincount(cluster, labels, len(number)) > 0
+    kinds = [np.flatnonzero(holds), np.flatnonzero(~holds)]
+    found = []
+    for _ in range(resamples):
+        drawn = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds if len(kind)])
+        times = np.bincount(drawn, minlength=len(number))[cluster]
+        masses = _masses(place, labels, weights * times)
+        found.append((_auc(*masses), _precision(*masses)))
+    tail = (1.0 - confidence) / 2
+    low, high = np.quantile(found, (tail, 1.0 - tail), axis=0)
+    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+
+
+def _places(scores: Numbers) -> Int[np.ndarray[Any, Any], " n"]:
+    """Rank of every score among the different ones, the lowest first."""
+    return np.unique(scores, return_inverse=True)[1]
+
+
+def _masses(
+    place: Int[np.ndarray[Any, Any], " n"], labels: Labels, weights: Numbers
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Weight of what is to be found, and of the rest, by score."""
+    count = int(place.max()) + 1
+    return np.bincount(place, weights * labels, count), np.bincount(place, weights * ~labels, count)
+
+
+def _auc(found: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
+    below = np.cumsum(other) - other
+    return float(np.sum(found * (below + other / 2)) / (found.sum() * other.sum()))
+
+
+def _precision(found: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
+    found, every = found[::-1], (found + other)[::-1]
     wanted = found.sum()
-    taken = np.clip((wanted - (np.cumsum(every) - every)) / every, 0.0, 1.0)
+    left = wanted - (np.cumsum(every) - every)
+    taken = np.clip(np.divide(left, every, out=np.zeros_like(every), where=every > 0), 0.0, 1.0)
     return float(np.sum(found * taken) / wanted)
 
 
