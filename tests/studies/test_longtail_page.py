@@ -9,10 +9,11 @@ from drivax.studies.longtail_page import write_page
 from drivax.studies.longtail_results import METRICS
 
 RATE = {metric: {"mean": 0.1234, "low": 0.1, "high": 0.15} for metric in METRICS}
-CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "metric": "collision", "rows": "all"}
+CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group": "lot", "metric": "collision",
+    "rows": "ordinary"}  # fmt: skip
 RESULTS = {
-    "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True},
-    "conditions": [{"agent": "baseline", "progress": 0.93, "change": 0.004, "met": True}],
+    "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True, "share": 0.05},
+    "conditions": [{"agent": "baseline", "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": True}],
     "detectable": dict.fromkeys(METRICS, 0.031),
     "claims": [
         {
@@ -24,12 +25,13 @@ RESULTS = {
             "interval": None, "p": None, "adjusted": None, "change": None,
         },
     ],
-    "rates": {name: {"all": RATE, "rare": RATE} for name in ("expert", "baseline")},
+    "rates": {name: {"ordinary": RATE, "rare": RATE} for name in ("expert", "baseline")},
     "draws": {"baseline": dict.fromkeys(("effective", "effective_scenarios", "tilt", "largest", "concentration"), 1.0)},
     "rankings": [
         {"one": "kinematic", "other": "ensemble", "rho": 0.41, "overlap": 0.2, "orthogonal": "contradicted"}
     ],
     "mean_q": {"collision": {"difference": 0.2, "interval": [0.1, 0.3]}},
+    "mean_q_agrees": 2,
 }  # fmt: skip
 
 
@@ -61,6 +63,8 @@ def test_it_says_what_was_found(page):
     assert "The conditions of the comparison are not met" not in text
     assert "kinematic and ensemble" in text and "+0.41" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
+    assert "Than the same weights dealt out by lot" in text and "Than the baseline" not in text
+    assert "of which they are 5.0%" in text and "the same checkpoint of 2 of the 5 seeds" in text
     assert "Common scenarios" not in text  # there are none in these results
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -28,16 +29,20 @@ class Agent:
         method: What its steps are drawn by (:data:`~drivax.curation.methods.METHODS`).
         scale: Whether steps are weighted one by one, or as their scenarios are.
         by_lot: Whether the scores are dealt out anew by lot: the control of ``method``.
+        weights: How scores become weights, in place of what is asked for.
     """
 
     preset: str = "offline/cql"
     method: str = "uniform"
     scale: Scale = "step"
     by_lot: bool = False
+    weights: WeightConfig | None = None
 
 
+#: Of labels: three draws in ten go to steps of an event. If so much does not help, curation hardly can.
+_LABELS = WeightConfig(normalise="none", temperature=1.0, most=math.inf, uniform=0.7)
 #: By default weights go by the ranks of scores, so that those of all methods have one distribution at either scale and
-#: one control each is matched to all of them; but for labels, most of which are equal.
+#: one control each is matched to all of them; but for labels, which are 0 or 1.
 AGENTS: Mapping[str, Agent] = MappingProxyType(
     {
         "bc": Agent("offline/bc"),
@@ -51,8 +56,8 @@ AGENTS: Mapping[str, Agent] = MappingProxyType(
         "action_rarity_scenario": Agent(method="action_rarity", scale="scenario"),
         "random_matched": Agent(method="kinematic", by_lot=True),
         "random_matched_scenario": Agent(method="kinematic", scale="scenario", by_lot=True),
-        "oracle": Agent(method="oracle"),
-        "random_matched_oracle": Agent(method="oracle", by_lot=True),
+        "oracle": Agent(method="oracle", weights=_LABELS),
+        "random_matched_oracle": Agent(method="oracle", by_lot=True, weights=_LABELS),
     }
 )
 #: Agents that are curated, whose scores are not those of a control.
@@ -80,7 +85,7 @@ def weighted(
         agent: The agent.
         data: The set.
         tables: Scores of the set.
-        config: How scores become weights.
+        config: How scores become weights, unless the agent has its own way.
         usable: Which steps its training learns from (:func:`~drivax.curation.weights.weights_of`).
         seed: Of the lot, for agents ``by_lot``.
 
@@ -94,5 +99,5 @@ def weighted(
             cure=f"drivax curate {agent.method} --data {data.path} --out SCORES",
         )
     if agent.by_lot:
-        table = matched(table, seed)
-    return WeightedSet(data, weights_of(table, config, agent.scale, usable))
+        table = matched(table, seed, usable)
+    return WeightedSet(data, weights_of(table, agent.weights or config, agent.scale, usable))

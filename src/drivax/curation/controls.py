@@ -16,7 +16,7 @@ from drivax.synthetic.events import EventKind
 Array = np.ndarray[Any, Any]
 
 
-def matched(table: ScoreTable, seed: int) -> ScoreTable:
+def matched(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
     """The scores of a table, dealt out anew by lot: each scenario is given those of another, from a random step on.
 
     What weights prefer is chance then, but how they are spread stays: over all steps, within a scenario, and among
@@ -27,9 +27,11 @@ def matched(table: ScoreTable, seed: int) -> ScoreTable:
     Args:
         table: What to match.
         seed: Of the lot.
+        usable: Which steps can be drawn (:func:`drivax.curation.weights.weights_of`).
     """
     rng = np.random.default_rng(seed)
-    drawn, steps, scenarios = table.drawn, table.steps.copy(), table.scenarios.copy()
+    drawn = table.drawn if usable is None else usable
+    steps, scenarios = table.steps.copy(), table.scenarios.copy()
     rows = np.flatnonzero(drawn.any(axis=1))
     for row, other in zip(rows, rng.permutation(rows), strict=True):
         scores = table.steps[other, drawn[other]]

@@ -1,12 +1,13 @@
 """Differences between agents that were trained several times: seeds and scenarios are both drawn by chance.
 
-A difference that other seeds, or other scenarios, would not show again is none; the variances of both are added.
+A difference that other seeds, or other scenarios, would not show again is none: the variances of both are added.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,13 @@ from jaxtyping import Bool, Float64
 from scipy import special
 
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import dense, totals
+from drivax.evaluation.clusters import dense
 
 #: Values of the agents of one kind, one column per scenario.
 Values = Float64[np.ndarray, "agent scenario"]
 #: Those of another kind, of whom there may be more or fewer.
 Others = Float64[np.ndarray, "other_agent other_scenario"]
+Weights = Float64[np.ndarray, " scenario"]
 #: What is wanted of a comparison that has not been made yet.
 _CONFIDENCE, _POWER = 0.95, 0.80
 _MOST = 10**6
@@ -29,11 +31,13 @@ _MOST = 10**6
 class Crossed:
     """A mean difference of two kinds of agents, several agents of each, all of which drove the same scenarios.
 
-    The standard error adds what the choice of seeds and the choice of scenarios contribute,
-    ``se^2 = s_a^2 / K_a + s_b^2 / K_b + v``: variances of the means of agents, and of the mean over scenarios by
-    clusters, ``v = C / (C - 1) sum((S_c - m n_c)^2) / n^2`` (a ratio of totals; Cochran, Sampling Techniques, 1977,
-    section 6.3). What seeds and scenarios do together is in both, so that the error is rather too large (Owen, Ann.
-    Appl. Stat. 1, 2007). Degrees of freedom are those of Satterthwaite (Biometrics Bulletin 2, 1946).
+    The squared standard error adds what the choice of seeds and the choice of scenarios contribute, and takes away once
+    what is in both: ``se^2 = s_a^2 / K_a + s_b^2 / K_b + v - e_a - e_b``. These are the variances of the means of
+    agents; the variance of the mean over scenarios by clusters, ``v = C / (C - 1) sum((S_c - m W_c)^2) / W^2`` (a ratio
+    of totals; Cochran, Sampling Techniques, 1977, section 6.3); and of each kind what seeds and scenarios do together,
+    ``e = C / (C - 1) sum(R_kc^2) / (K (K - 1) W^2)`` with totals ``R_kc`` of the residuals of a two-way layout (Owen,
+    Ann. Appl. Stat. 1, 2007). It is never taken below the larger of the two. Degrees of freedom are those of
+    Satterthwaite (Biometrics Bulletin 2, 1946).
 
     Attributes:
         difference: The mean difference.
@@ -41,6 +45,7 @@ class Crossed:
         scenarios: What the choice of scenarios adds.
         agents: Agents of each kind.
         clusters: Clusters of scenarios.
+        both: What is in both, by kind of agent.
     """
 
     difference: float
@@ -48,11 +53,13 @@ class Crossed:
     scenarios: float
     agents: tuple[int, int]
     clusters: int
+    both: tuple[float, float] = (0.0, 0.0)
 
     @property
     def error(self) -> float:
         """Standard error."""
-        return math.sqrt(sum(self.seeds) + self.scenarios)
+        seeds = sum(self.seeds)
+        return math.sqrt(max(seeds + self.scenarios - sum(self.both), seeds, self.scenarios))
 
     @property
     def freedom(self) -> float:
@@ -80,29 +87,45 @@ class Crossed:
             _quantile(self.freedom, (1.0 + confidence) / 2.0) + _quantile(self.freedom, power)
         )
 
-    def seeds_needed(self, power: float = _POWER) -> int | None:
-        """Seeds of each kind with which this difference would be found on as many scenarios; None: no number of them.
+    def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
+        """Seeds of each kind, more than now, with which this difference would be found; None: no number of them."""
+        return self._least(self._with_seeds, max(self.agents), power, confidence)
 
-        As if both variances stayed what they are here.
-        """
-        each = sum(part * count for part, count in zip(self.seeds, self.agents, strict=True))
-        return self._least(lambda number: (each / number, self.scenarios), min(self.agents), power)
+    def clusters_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
+        """Clusters, more than now, with which as many seeds would find this difference; None: no number of them."""
+        return self._least(self._with_clusters, self.clusters, power, confidence)
 
-    def clusters_needed(self, power: float = _POWER) -> int | None:
-        """Clusters of scenarios with which as many seeds would find this difference; None: no number of them."""
-        whole = self.scenarios * self.clusters
-        return self._least(lambda number: (sum(self.seeds), whole / number), self.clusters, power)
+    def _with_seeds(self, number: int) -> Crossed:
+        """With so many seeds of each kind, as if they varied as these."""
+        shares = [count / number for count in self.agents]
+        seeds, both = (
+            [x * share for x, share in zip(xs, shares, strict=True)] for xs in (self.seeds, self.both)
+        )
+        alone = max(self.scenarios - sum(self.both), 0.0)
+        return replace(
+            self, seeds=(seeds[0], seeds[1]), both=(both[0], both[1]), scenarios=alone + sum(both),
+            agents=(number, number),
+        )  # fmt: skip
 
-    def _least(self, parts: Any, begin: int, power: float) -> int | None:
-        """By the normal distribution: with so many more seeds the t distribution is one."""
-        wanted = float(special.ndtri((1.0 + _CONFIDENCE) / 2.0) + special.ndtri(power))
+    def _with_clusters(self, number: int) -> Crossed:
+        """With so many clusters, as if they varied as these."""
+        share = self.clusters / number
+        both = [x * share for x in self.both]
+        seeds = [max(x - own, 0.0) + own * share for x, own in zip(self.seeds, self.both, strict=True)]
+        return replace(
+            self, seeds=(seeds[0], seeds[1]), both=(both[0], both[1]), scenarios=self.scenarios * share,
+            clusters=number,
+        )  # fmt: skip
 
+    def _least(
+        self, at: Callable[[int], Crossed], present: int, power: float, confidence: float
+    ) -> int | None:
         def found(number: int) -> bool:
-            return abs(self.difference) >= wanted * math.sqrt(sum(parts(number)))
+            return abs(self.difference) >= at(number).detectable(power, confidence)
 
         if self.difference == 0.0 or not found(_MOST):
             return None
-        low, high = 1, begin
+        low, high = present, present + 1
         while not found(high):
             low, high = high, 2 * high
         while high - low > 1:
@@ -111,27 +134,32 @@ class Crossed:
         return high
 
 
-def crossed_mean(values: Values, clusters: Any = None) -> Crossed:
+def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None = None) -> Crossed:
     """The mean of one kind of agents, with an error as that of :func:`crossed_difference`; one agent alone is certain.
+
+    Of differences between the same agents, one row per agent, it is a comparison in pairs.
 
     Args:
         values: One row per agent, one column per scenario; scenarios that some agent leaves undefined are left out.
         clusters: Labels of the clusters of scenarios; None: every scenario is its own.
+        weights: How much each scenario counts; None: all alike.
 
     Raises:
         UsageError: There are fewer than two clusters of scenarios that all define.
     """
     twice = values if len(values) > 1 else np.repeat(values, 2, axis=0)
-    return crossed_difference(twice, np.zeros((2, values.shape[1])), clusters)
+    return crossed_difference(twice, np.zeros((2, values.shape[1])), clusters, weights)
 
 
-def crossed_difference(a: Values, b: Others, clusters: Any = None) -> Crossed:
+def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed:
     """The difference of the means of two kinds of agents.
 
     Args:
         a: One row per agent, one column per scenario; scenarios that some agent leaves undefined are left out.
         b: The other kind's, in the same scenarios.
         clusters: Labels of the clusters of scenarios; None: every scenario is its own.
+        weights: How much each scenario counts, as where some kinds were drawn more often than they occur; those of 0
+            are left out. None: all alike.
 
     Raises:
         UsageError: There are fewer than two agents of a kind, or clusters of scenarios that all define.
@@ -139,46 +167,56 @@ def crossed_difference(a: Values, b: Others, clusters: Any = None) -> Crossed:
     if a.shape[1] != b.shape[1]:
         raise UsageError("agents drove different scenarios", cure="give one value per agent and scenario")
     labels = dense(clusters, a.shape[1], "cluster")
-    keep = _defined(a, b)
+    weight, keep = _counted(a, b, weights)
     labels = np.unique(labels[keep], return_inverse=True)[1]
     if min(len(a), len(b)) < 2 or not keep.any() or labels.max() < 1:
         raise UsageError(
             "nothing to tell chance by",
             cure="train two seeds or more of each, and drive two recordings or more",
         )
-    first, second = a[:, keep], b[:, keep]
-    apart = first.mean(axis=0) - second.mean(axis=0)
-    sums, counts = totals(apart, labels)
-    mean, number = float(apart.mean()), len(counts)
-    apart_by = float(np.square(sums - mean * counts).sum() / counts.sum() ** 2)
-    scenarios = number / (number - 1) * apart_by
-    seeds = tuple(float(one.mean(axis=1).var(ddof=1)) / len(one) for one in (first, second))
-    return Crossed(mean, (seeds[0], seeds[1]), scenarios, (len(a), len(b)), number)
+    share, number = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
+    more = number / (number - 1)
+    kinds = [one[:, keep] for one in (a, b)]
+    apart = kinds[0].mean(axis=0) - kinds[1].mean(axis=0)
+    mean = float(apart @ share)
+    scenarios = more * float(np.square(np.bincount(labels, share * (apart - mean), number)).sum())
+    seeds, both = [], []
+    for one in kinds:
+        agents, count = one @ share, len(one)
+        seeds.append(float(agents.var(ddof=1)) / count)
+        rest = (one - agents[:, None] - one.mean(axis=0) + agents.mean()) * share
+        totals = np.stack([np.bincount(labels, row, number) for row in rest])
+        both.append(more * float(np.square(totals).sum()) / (count * (count - 1)))
+    return Crossed(mean, (seeds[0], seeds[1]), scenarios, (len(a), len(b)), number, both=(both[0], both[1]))
 
 
-def relative_change(a: Values, b: Others, clusters: Any = None) -> tuple[float, float, float] | None:
-    """``mean(a) / mean(b) - 1`` and its interval, by the error of the logarithm of the ratio (delta method).
+def log_ratio(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed | None:
+    """``ln(mean(a) / mean(b))`` with its error (delta method).
 
     Args:
         a: As for :func:`crossed_difference`, of values that are at least 0.
         b: The same.
         clusters: The same.
+        weights: The same.
 
     Returns:
-        Change, low, high; None where a mean is not above 0.
+        The logarithm as ``difference``; None where a mean is not above 0.
     """
-    keep = _defined(a, b)
-    means = [float(one[:, keep].mean()) for one in (a, b)] if keep.any() else [0.0, 0.0]
+    weight, keep = _counted(a, b, weights)
+    if not keep.any():
+        return None
+    means = [float(np.average(one[:, keep].mean(axis=0), weights=weight[keep])) for one in (a, b)]
     if min(means) <= 0.0:
         return None
-    scaled = crossed_difference(a / means[0], b / means[1], clusters)
-    half = _quantile(scaled.freedom, (1.0 + _CONFIDENCE) / 2.0) * scaled.error
-    ratio = means[0] / means[1]
-    return ratio - 1.0, ratio * math.exp(-half) - 1.0, ratio * math.exp(half) - 1.0
+    scaled = crossed_difference(a / means[0], b / means[1], clusters, weights)
+    return replace(scaled, difference=math.log(means[0] / means[1]))
 
 
-def _defined(a: Values, b: Others) -> Bool[np.ndarray, " scenario"]:
-    return np.asarray(~np.isnan(np.concatenate([a, b])).any(axis=0))
+def _counted(
+    a: Values, b: Others, weights: Weights | None
+) -> tuple[Float64[np.ndarray, " scenario"], Bool[np.ndarray, " scenario"]]:
+    weight = np.ones(a.shape[1]) if weights is None else np.asarray(weights, np.float64)
+    return weight, np.asarray(~np.isnan(np.concatenate([a, b])).any(axis=0) & (weight > 0.0))
 
 
 def _finite(freedom: float) -> float:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from drivax.curation.agents import AGENTS, weighted
-from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate, refuse_stale
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
@@ -22,13 +21,24 @@ from drivax.curation.scoring import score_steps
 from drivax.curation.subset import top_rows
 from drivax.curation.weights import draws_of
 from drivax.errors import UsageError
-from drivax.evaluation.crossed import crossed_difference
 from drivax.evaluation.stored import read_evaluation
+from drivax.learning.config import TrainConfig
+from drivax.learning.experience import WeightedSet
+from drivax.learning.folders import hashes
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.validation import rank
 from drivax.scenario.store import ScenarioSet
 from drivax.show.criticality import criticality_html
-from drivax.studies.longtail_drives import Say, clusters, drive_all, driven, rare_rows, test_set
+from drivax.studies.longtail_drives import (
+    Say,
+    chosen_steps,
+    clusters,
+    drive_all,
+    driven,
+    ordinary_share,
+    rare_rows,
+    test_set,
+)
 from drivax.studies.longtail_page import write_page
 from drivax.studies.longtail_plan import (
     BY_MEAN_Q,
@@ -42,9 +52,20 @@ from drivax.studies.longtail_plan import (
     LongtailConfig,
     Sets,
     Usable,
+    drive_of,
     run_of,
 )
-from drivax.studies.longtail_results import METRICS, Condition, judge, rankings, rates, summary
+from drivax.studies.longtail_results import (
+    METRICS,
+    Condition,
+    claims,
+    cost_of_rule,
+    detectable,
+    judge,
+    rankings,
+    rates,
+    summary,
+)
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.runs import RunFolder, write_text
 from drivax.tracking.sinks import read_rows
@@ -101,21 +122,39 @@ def train_all(
 
 
 def _done(job: Job) -> bool:
-    config = job.config.train_config(job.agent, job.seed)
-    last = config.iterations * config.algorithm.steps_per_iteration
-    return last in Checkpoints(job.run / "checkpoints").steps()
+    """Whether a training has come to its end.
+
+    Raises:
+        UsageError: It was another training.
+    """
+    steps = Checkpoints(job.run / "checkpoints").steps()
+    driven_already = drive_of(job.out, job.agent, job.seed).is_dir()
+    if not steps and not driven_already:
+        return False
+    config, folder = job.train_config, RunFolder.open(job.run)
+    now = hashes(ScenarioSet.open(job.sets.validation), _weighted(job).weights)
+    if folder.config(TrainConfig) != config or any(folder.info.get(name) != one for name, one in now.items()):
+        raise UsageError(
+            "was trained with other settings or weights than this study asks for", file=job.run,
+            cure=f"remove it and {drive_of(job.out, job.agent, job.seed)}; both are made anew",
+        )  # fmt: skip
+    return driven_already or config.iterations * config.algorithm.steps_per_iteration in steps
 
 
-def _train(job: Job) -> float:
-    began = time.perf_counter()
+def _weighted(job: Job) -> WeightedSet:
     data = ScenarioSet.open(job.sets.train)
 
     def table(method: str) -> ScoreTable:
         return read_scores(job.out / SCORES / f"{method}.npz", data)
 
+    return weighted(AGENTS[job.agent], data, table, job.config.weights, job.usable, job.seed)
+
+
+def _train(job: Job) -> float:
+    began = time.perf_counter()
     train(
-        job.config.train_config(job.agent, job.seed),
-        weighted(AGENTS[job.agent], data, table, job.config.weights, job.usable, job.seed),
+        job.train_config,
+        _weighted(job),
         job.run,
         validation=ScenarioSet.open(job.sets.validation),
         resume=bool(Checkpoints(job.run / "checkpoints").steps()),
@@ -156,10 +195,9 @@ def study(
     usable = usable_steps(config.train_config(FIRST[0], 0), data)
     train_all(config, sets, out, FIRST, usable, cores, say)
     drive_all(config, out, test, FIRST, say)
-    met = conditions(config, out)
+    met, least = conditions(config, out), _detectable(config, sets, out)
     for one in met:
         say(one.words())
-    least = detectable(config, out, test)
     say(
         "smallest difference that will be found: " + ", ".join(f"{name} {x:.3f}" for name, x in least.items())
     )
@@ -171,8 +209,28 @@ def study(
         )
     train_all(config, sets, out, config.agents, usable, cores, say)
     drive_all(config, out, test, config.agents, say)
-    results = findings(config, out, test, tables, usable) | {"conditions": [asdict(one) for one in met]}
+    results = findings(config, sets, out, tables, usable) | {
+        "conditions": [asdict(one) for one in met],
+        "detectable": least,
+    }
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+    _show(results, data, tables, out)
+    say(f"wrote {out / REPORT}")
+    return results
+
+
+def _detectable(config: LongtailConfig, sets: Sets, out: Path) -> dict[str, float]:
+    """See :func:`detectable`: of the claims against the baseline."""
+    test = test_set(sets, out)
+    drove, imitated = (driven(config, out, name) for name in FIRST)
+    together = max([claim.group for claim in claims(config.agents)].count("baseline"), 1)
+    return detectable(
+        drove, imitated, clusters(test), rare_rows(config, test), ordinary_share(sets), together
+    )
+
+
+def _show(results: Mapping[str, Any], data: ScenarioSet, tables: Mapping[str, ScoreTable], out: Path) -> None:
+    """Writes the report, and the player of the most critical drives."""
     expert = score_steps(data, ExpertActions())
     write_page(results, tables, expert["action"][expert["known"]], out / REPORT)
     tops = {row: tables[name] for name in _SHOWN if name in tables for row in top_rows(tables[name], _TOP)}
@@ -183,8 +241,6 @@ def study(
         title="most critical drives",
         beside=[criticality_html(table, row) for row, table in tops.items()],
     )
-    say(f"wrote {out / REPORT}")
-    return results
 
 
 def conditions(config: LongtailConfig, out: Path) -> list[Condition]:
@@ -207,44 +263,28 @@ def _score(row: Mapping[str, float]) -> float:
     return found[0]
 
 
-def detectable(config: LongtailConfig, out: Path, test: ScenarioSet) -> dict[str, float]:
-    """The smallest difference that the study finds with a probability of 80 %, if others vary as the baseline.
-
-    By its own seeds against ``bc``, whose variation stands for that of the others; known before the others learn.
-    """
-    one, other = (driven(config, out, name) for name in FIRST)
-    labels = clusters(test)
-    return {name: crossed_difference(one[name], other[name], labels).detectable() for name in METRICS}
-
-
 def findings(
-    config: LongtailConfig,
-    out: Path,
-    test: ScenarioSet,
-    tables: Mapping[str, ScoreTable],
-    usable: Usable,
+    config: LongtailConfig, sets: Sets, out: Path, tables: Mapping[str, ScoreTable], usable: Usable
 ) -> dict[str, Any]:
-    """Everything that the study found, as plain values."""
-    rare, labels = rare_rows(config, test), clusters(test)
+    """Everything that the study found in the end, as plain values."""
+    data, test = ScenarioSet.open(sets.train), test_set(sets, out)
+    rare, labels, share = rare_rows(config, test), clusters(test), ordinary_share(sets)
     drives = {name: driven(config, out, name) for name in (*config.agents, BY_MEAN_Q)}
     expert = read_evaluation(out / DRIVES / "expert").metrics
     drives["expert"] = {name: expert[name][None] for name in METRICS}
-    data = ScenarioSet.open(Path(RunFolder.open(out).info["data"][0]["path"]))
-    rule = {
-        name: crossed_difference(drives[BY_MEAN_Q][name], drives["baseline"][name], labels)
-        for name in METRICS
-    }
+    by_mean_q = drives[BY_MEAN_Q]
+    steps = [chosen_steps(run_of(out, "baseline", seed)) for seed in range(config.seeds)]
     return {
         "about": {
             "seeds": config.seeds,
             "train": len(data),
             "test": len(test),
             "rare": int(rare.sum()),
-            "labelled": bool((event_kinds(test) > 0).any()),
+            "labelled": share is not None,
+            "share": share,
         },
-        "detectable": detectable(config, out, test),
-        "claims": [summary(one) for one in judge(drives, labels, rare, config.agents)],
-        "rates": {name: rates(drives[name], labels, rare) for name in ("expert", *config.agents)},
+        "claims": [summary(one) for one in judge(drives, labels, rare, config.agents, share)],
+        "rates": {name: rates(drives[name], labels, rare, share) for name in ("expert", *config.agents)},
         "draws": {
             name: asdict(
                 draws_of(
@@ -254,8 +294,6 @@ def findings(
             for name in config.agents
         },
         "rankings": rankings(tables),
-        "mean_q": {
-            name: {"difference": one.difference, "interval": list(one.interval())}
-            for name, one in rule.items()
-        },
+        "mean_q": cost_of_rule(by_mean_q, drives["baseline"], labels, rare, share),
+        "mean_q_agrees": sum(one == other for one, other in steps),
     }

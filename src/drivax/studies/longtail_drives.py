@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +12,18 @@ from jaxtyping import Bool, Float
 
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate
+from drivax.errors import UsageError
 from drivax.evaluation.clusters import recordings
 from drivax.evaluation.runs import EvaluationConfig, run_evaluation
 from drivax.evaluation.stored import read_evaluation
 from drivax.learning.policies import load_policy
+from drivax.learning.validation import rank
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.sizes import Sizes
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.studies.longtail_plan import BY_MEAN_Q, DRIVES, TEST, LongtailConfig, Sets, drive_of, run_of
+from drivax.tracking.runs import RunFolder
 from drivax.tracking.sinks import read_rows
 
 #: What critics expect of the policy on held-out steps: by it the published study chose its checkpoints.
@@ -53,6 +58,12 @@ def rare_rows(config: LongtailConfig, test: ScenarioSet) -> Bool[np.ndarray, " n
     return scores >= np.quantile(scores, 1.0 - config.rare)
 
 
+def ordinary_share(sets: Sets) -> float | None:
+    """Share of scenarios with an event in ordinary traffic: in the first test set; None where nothing is labelled."""
+    labelled = event_kinds(ScenarioSet.open(sets.test[0])) > 0
+    return float(labelled.mean()) if labelled.any() else None
+
+
 def drive_all(config: LongtailConfig, out: Path, test: ScenarioSet, agents: Sequence[str], say: Say) -> None:
     """Drives the test set with the expert and with all agents that have not driven it yet."""
     sizes = Sizes.used(test)
@@ -65,10 +76,11 @@ def drive_all(config: LongtailConfig, out: Path, test: ScenarioSet, agents: Sequ
             run = run_of(out, agent, seed)
             asked: list[tuple[str, int | None]] = [(agent, None)]
             if agent == "baseline":
-                asked.append((BY_MEAN_Q, highest_mean_q(run)))
+                asked.append((BY_MEAN_Q, chosen_steps(run)[0]))
             for name, step in asked:
                 folder = drive_of(out, name, seed)
                 if folder.is_dir():
+                    _refuse_older(folder, run)
                     continue
                 planner, task = load_policy(run, bank, step=step)
                 told = str(run) if step is None else f"{run}@{step}"
@@ -76,10 +88,25 @@ def drive_all(config: LongtailConfig, out: Path, test: ScenarioSet, agents: Sequ
                 say(f"drove {name}, seed {seed}")
 
 
-def highest_mean_q(run: Path) -> int:
-    """The step of the validation at which critics expected most."""
+def _refuse_older(folder: Path, run: Path) -> None:
+    """Refuses a drive that is older than the run that it is said to be of.
+
+    Raises:
+        UsageError: The agent was trained anew since.
+    """
+    drove, began = (datetime.fromisoformat(RunFolder.open(one).info["started"]) for one in (folder, run))
+    if drove < began:
+        raise UsageError(
+            "is older than the run that drove it", file=folder, cure="remove it; it is driven anew"
+        )
+
+
+def chosen_steps(run: Path) -> tuple[int, int]:
+    """The steps of the validations at which critics expected most, and at which the policy drove best."""
     rows = [row for row in read_rows(run / "metrics.jsonl") if MEAN_Q in row]
-    return int(max(rows, key=lambda row: row[MEAN_Q])["step"])
+    expected = max(rows, key=lambda row: row[MEAN_Q])
+    best = max(rows, key=lambda row: rank("score", row) or (-math.inf,))
+    return int(expected["step"]), int(best["step"])
 
 
 def driven(config: LongtailConfig, out: Path, agent: str) -> dict[str, Float[np.ndarray, "seed scenario"]]:

@@ -40,8 +40,10 @@ class LongtailConfig:
         validations: Times that each is validated by driving; the best checkpoint is tested.
         weights: How scores become weights, the same way for all.
         scouts: The ensemble.
-        progress: ``baseline`` and ``bc`` have to make this share of the expert's progress on the validation set.
-        flat: And their score may change by no more from the third to the last quarter of their validations.
+        progress: Every seed of ``baseline`` and ``bc`` has to make this share of the expert's progress on the
+            validation set.
+        flat: And their scores may change by no more, mean over seeds, from the third to the last quarter of their
+            validations.
         rare: Share of the test scenarios that count as rare, by the kinematic heuristic, where none are labelled.
     """
 
@@ -72,8 +74,8 @@ class LongtailConfig:
         config = settings.load(TrainConfig, AGENTS[agent].preset, self.training)
         config = replace(config, seed=seed, total_steps=self.total_steps or config.total_steps)
         every = max(config.iterations // self.validations, 1)
-        # All of the baseline's stay: the one with the highest mean Q is driven, too.
-        keep = config.iterations // every + 1 if agent == "baseline" else config.keep
+        # All of the baseline's stay, those of interruptions too: the one with the highest mean Q is driven.
+        keep = config.iterations if agent == "baseline" else config.keep
         return replace(config, evaluate_every=every, checkpoint_every=every, keep=keep)
 
 
@@ -84,8 +86,8 @@ class Sets:
     Attributes:
         train: What is learned from.
         validation: What chooses checkpoints.
-        test: What is driven in the end, one or several; of a labelled set all scenarios with an event are taken, and
-            as many without.
+        test: What is driven in the end, one or several; of labelled sets all scenarios with an event are taken, and as
+            many without. How often events occur in ordinary traffic, the first of them says.
     """
 
     train: Path
@@ -126,6 +128,11 @@ class Job:
     def run(self) -> Path:
         """Its run folder."""
         return run_of(self.out, self.agent, self.seed)
+
+    @property
+    def train_config(self) -> TrainConfig:
+        """Its settings."""
+        return self.config.train_config(self.agent, self.seed)
 
 
 def run_of(out: Path, agent: str, seed: int) -> Path:

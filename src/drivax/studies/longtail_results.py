@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from typing import Any, Literal
 
@@ -14,14 +15,18 @@ from drivax.curation.agents import CURATED, control_of
 from drivax.curation.ranking import rank_correlation
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
-from drivax.evaluation.crossed import Crossed, crossed_difference, crossed_mean, relative_change
+from drivax.evaluation.crossed import Crossed, crossed_difference, crossed_mean, log_ratio
 from drivax.evaluation.hypotheses import holm
+from drivax.evaluation.statistics import wilson
 
 Values = Float[np.ndarray, "seed scenario"]
 #: By metric.
 Driven = Mapping[str, Values]
 Rows = Bool[np.ndarray, " scenario"]
+Counts = Float[np.ndarray, " scenario"]
 Verdict = Literal["supported", "contradicted", "undecided"]
+#: Against the baseline, against a lot, in common and in rare scenarios, in other failures, between methods.
+Group = Literal["baseline", "lot", "where", "failures", "methods"]
 
 #: What is reported of every agent, and whether more of it is better.
 METRICS = {
@@ -43,13 +48,17 @@ class Condition:
     Attributes:
         agent: Its name.
         progress: Share of the expert's progress on the validation set at the chosen checkpoints, mean over seeds.
+        least: The same of the worst seed.
         change: Of the validation score, from the third to the last quarter of the validations, mean over seeds.
-        met: Whether both are as they should be.
+        moved: How far it changes either way, mean over seeds.
+        met: Whether every seed makes progress enough, and seeds move little.
     """
 
     agent: str
     progress: float
+    least: float
     change: float
+    moved: float
     met: bool
 
     @classmethod
@@ -57,20 +66,27 @@ class Condition:
         cls, agent: str, curves: Sequence[Mapping[str, Sequence[float]]], least: float, flat: float
     ) -> Condition:
         """From the validations of every seed: ``score`` and ``progress`` in their order."""
-        progress, change = [], []
+        progress, changes = [], []
         for curve in curves:
             scores = np.asarray(curve["score"])
             quarter = max(len(scores) // 4, 1)
             progress.append(curve["progress"][int(scores.argmax())])
-            change.append(scores[-quarter:].mean() - scores[-2 * quarter : -quarter].mean())
-        made, moved = float(np.mean(progress)), float(np.mean(change))
-        return cls(agent, made, moved, bool(made >= least and abs(moved) <= flat))
+            changes.append(scores[-quarter:].mean() - scores[-2 * quarter : -quarter].mean())
+        moved = float(np.abs(changes).mean())
+        return cls(
+            agent,
+            progress=float(np.mean(progress)),
+            least=min(progress),
+            change=float(np.mean(changes)),
+            moved=moved,
+            met=bool(min(progress) >= least and moved <= flat),
+        )
 
     def words(self) -> str:
         """One line."""
         return (
-            f"{self.agent}: {self.progress:.0%} of the expert's progress, score moves by {self.change:+.3f}: "
-            f"{'good enough' if self.met else 'NOT good enough'}"
+            f"{self.agent}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score moves by "
+            f"{self.change:+.3f} ({self.moved:.3f} either way): {'good enough' if self.met else 'NOT good enough'}"
         )
 
 
@@ -82,16 +98,18 @@ class Claim:
         words: The claim.
         one: The agent that is said to be better.
         other: The one that it is compared with.
+        group: Claims whose p-values are adjusted together.
         metric: In what.
-        rows: ``all``, ``common`` or ``rare`` scenarios.
-        change: Relative change that is claimed; None: only the direction is.
+        rows: ``ordinary``, ``common`` or ``rare`` scenarios.
+        change: Relative change that is claimed, at least; None: only the direction is.
     """
 
     words: str
     one: str
     other: str
+    group: Group
     metric: str = "collision"
-    rows: str = "all"
+    rows: str = "ordinary"
     change: float | None = None
 
 
@@ -99,31 +117,43 @@ def claims(agents: Sequence[str]) -> list[Claim]:
     """All claims about these agents: those of the published study, and those that its controls would have asked."""
     found = []
     curated = [name for name in CURATED if name in agents]
-    for name in curated:
-        found.append(Claim(f"{name} collides less than the baseline", name, "baseline"))
-        found.append(Claim(f"{name} fails less than the baseline", name, "baseline", "accuracy"))
-    for name in curated:
-        lot = control_of(name)
-        if lot in agents:
-            found.append(Claim(f"{name} collides less than the same weights dealt out by lot", name, lot))
-            found.append(
-                Claim(f"{name} collides less than weights by lot where it is rare", name, lot, rows="rare")
-            )
-    for one, other, words in (
-        ("ensemble", "heuristic", "uncertainty collides less than the heuristic"),
-        ("action_rarity", "heuristic", "action rarity collides less than the heuristic"),
-        ("ensemble", "cql_bc", "uncertainty collides less than CQL with imitation"),
-        ("cql_bc", "baseline", "CQL with imitation collides less than the baseline"),
-        ("oracle", "baseline", "true labels collide less than the baseline"),
-        ("oracle", control_of("oracle"), "true labels collide less than weights dealt out by lot"),
-    ):
-        if one in agents and other in agents:
-            found.append(Claim(words, one, other))
-    if "ensemble" in agents:
-        found.append(
-            Claim("uncertainty cuts collisions 2.9 times", "ensemble", "baseline", change=PUBLISHED_CHANGE)
+    for name in (*curated, "cql_bc", "oracle"):
+        found.append(Claim(f"{name} collides less than the baseline", name, "baseline", "baseline"))
+    # A third of the collisions, or fewer: the ratio of the published rates.
+    found.append(
+        Claim(
+            f"ensemble has {1 + PUBLISHED_CHANGE:.0%} of the baseline's collisions or fewer",
+            "ensemble",
+            "baseline",
+            "baseline",
+            change=PUBLISHED_CHANGE,
         )
-    return found
+    )
+    for name in (*curated, "oracle"):
+        lot = control_of(name)
+        found.append(Claim(f"{name} collides less than its weights dealt out by lot", name, lot, "lot"))
+    for name in curated:
+        for rows in ("common", "rare"):
+            words = f"{name} collides less than the baseline in {rows} scenarios"
+            found.append(Claim(words, name, "baseline", "where", rows=rows))
+        words = f"{name} collides less than its weights dealt out by lot in rare scenarios"
+        found.append(Claim(words, name, control_of(name), "where", rows="rare"))
+        words = f"{name} fails less than the baseline"
+        found.append(Claim(words, name, "baseline", "failures", "accuracy"))
+    for one, other in (
+        ("ensemble", "heuristic"),
+        ("ensemble", "action_rarity"),
+        ("ensemble", "cql_bc"),
+        ("action_rarity", "heuristic"),
+    ):
+        found.append(Claim(f"{one} collides less than {other}", one, other, "methods"))
+    for name in ("heuristic", "ensemble", "action_rarity"):
+        whole = f"{name}_scenario"
+        words = f"{name} by step collides less at fault than by scenario"
+        found.append(Claim(words, name, whole, "methods", "at_fault_collision"))
+        words = f"{name} by scenario gets further than by step"
+        found.append(Claim(words, whole, name, "methods", "progress_ratio"))
+    return [claim for claim in found if claim.one in agents and claim.other in agents]
 
 
 @dataclass(frozen=True)
@@ -132,15 +162,18 @@ class Judged:
 
     Attributes:
         claim: The claim.
-        found: The difference, one agent minus the other; None where a kind of scenario does not occur.
+        found: What is tested against 0: the difference, one agent minus the other; of a claim about a size the
+            logarithm of the ratio over the claimed one. None where a kind of scenario, or a ratio, does not exist.
+        difference: The difference.
         change: The relative change with its interval, where there is one.
-        adjusted: P-value, adjusted for the number of all claims (Holm).
+        adjusted: P-value, adjusted for the number of claims in its group (Holm).
         verdict: What it comes to.
-        needed: Where undecided: how many seeds, or recordings, would find a difference of this size.
+        needed: Where undecided: how many seeds, or recordings, would find what was found.
     """
 
     claim: Claim
     found: Crossed | None
+    difference: Crossed | None
     change: tuple[float, float, float] | None
     adjusted: float | None
     verdict: Verdict
@@ -148,7 +181,11 @@ class Judged:
 
 
 def judge(
-    driven: Mapping[str, Driven], clusters: Sequence[str], rare: Rows, agents: Sequence[str]
+    driven: Mapping[str, Driven],
+    clusters: Sequence[str],
+    rare: Rows,
+    agents: Sequence[str],
+    share: float | None = None,
 ) -> list[Judged]:
     """Judges every claim.
 
@@ -157,39 +194,65 @@ def judge(
         clusters: Recording of every scenario.
         rare: Which scenarios are rare.
         agents: Whom claims are about.
+        share: Of rare scenarios in ordinary traffic (:func:`counts`).
     """
     labels = np.asarray(clusters)
     made = []
     for claim in claims(agents):
-        rows = which(claim.rows, rare)
-        one, other = (driven[name][claim.metric][:, rows] for name in (claim.one, claim.other))
-        found = crossed_difference(one, other, labels[rows]) if np.unique(labels[rows]).size > 1 else None
-        change = relative_change(one, other, labels[rows]) if found is not None else None
-        made.append((claim, found, change))
-    adjusted = holm([None if found is None else found.p for _, found, _ in made])
+        weights = counts(claim.rows, rare, share)
+        one, other = (driven[name][claim.metric] for name in (claim.one, claim.other))
+        difference = ratio = None
+        if _several(np.concatenate([one, other]), labels, weights):
+            difference = crossed_difference(one, other, labels, weights)
+            ratio = log_ratio(one, other, labels, weights)
+        found = difference
+        if claim.change is not None:
+            found = ratio and replace(ratio, difference=ratio.difference - math.log1p(claim.change))
+        made.append((claim, found, difference, ratio))
+    groups = [claim.group for claim, *_ in made]
+    adjusted: dict[int, float | None] = {}
+    for group in set(groups):
+        places = [place for place, name in enumerate(groups) if name == group]
+        ps = holm([None if made[place][1] is None else made[place][1].p for place in places])
+        adjusted |= dict(zip(places, ps, strict=True))
     return [
-        _judged(claim, found, change, p) for (claim, found, change), p in zip(made, adjusted, strict=True)
+        _judged(claim, found, difference, ratio, adjusted[place], groups.count(claim.group))
+        for place, (claim, found, difference, ratio) in enumerate(made)
     ]
 
 
 def _judged(
-    claim: Claim, found: Crossed | None, change: tuple[float, float, float] | None, p: float | None
+    claim: Claim,
+    found: Crossed | None,
+    difference: Crossed | None,
+    ratio: Crossed | None,
+    p: float | None,
+    together: int,
 ) -> Judged:
+    change = None
+    if ratio is not None:
+        low, high = ratio.interval()
+        change = (math.expm1(ratio.difference), math.expm1(low), math.expm1(high))
     if found is None or p is None:
-        return Judged(claim, found, change, p, "undecided", "there are no such scenarios")
-    sign = METRICS[claim.metric] * found.difference
+        why = "there are no such scenarios" if difference is None else "one of them never collides: no ratio"
+        return Judged(claim, found, difference, change, p, "undecided", why)
     verdict: Verdict = "undecided"
     if p < _LEVEL:
-        verdict = "supported" if sign > 0 else "contradicted"
-    if claim.change is not None and change is not None and claim.change < change[1]:
-        # So large an effect as was claimed is beyond the interval.
-        verdict = "contradicted"
-    return Judged(claim, found, change, p, verdict, "" if verdict != "undecided" else needed(found))
+        verdict = "supported" if METRICS[claim.metric] * found.difference > 0 else "contradicted"
+    words = "" if verdict != "undecided" else needed(found, together)
+    return Judged(claim, found, difference, change, p, verdict, words)
 
 
-def needed(found: Crossed) -> str:
-    """How many seeds or recordings would decide, in words."""
-    seeds, recordings = found.seeds_needed(), found.clusters_needed()
+def needed(found: Crossed, together: int) -> str:
+    """How many seeds or recordings would decide, in words.
+
+    Args:
+        found: What is tested.
+        together: How many claims are adjusted together; the strictest of their levels counts.
+    """
+    confidence = level(together)
+    seeds = found.seeds_needed(confidence=confidence)
+    recordings = found.clusters_needed(confidence=confidence)
     ways = [f"{seeds:,} seeds each"] if seeds is not None else []
     ways += [f"{recordings:,} test recordings"] if recordings is not None else []
     if ways:
@@ -197,25 +260,85 @@ def needed(found: Crossed) -> str:
     return "neither seeds nor recordings alone would find a difference of this size"
 
 
-def which(rows: str, rare: Rows) -> Rows:
-    """The scenarios of a name."""
-    return {"all": np.ones_like(rare), "common": ~rare, "rare": rare}[rows]
+def level(together: int) -> float:
+    """Confidence at which the first of so many claims is tested (Holm)."""
+    return 1.0 - _LEVEL / together
 
 
-def rates(driven: Driven, clusters: Sequence[str], rare: Rows) -> dict[str, dict[str, dict[str, Any]]]:
-    """Of one agent: by kind of scenario and metric the mean over seeds and scenarios, with its interval."""
+def detectable(
+    baseline: Driven, other: Driven, clusters: Sequence[str], rare: Rows, share: float | None, together: int
+) -> dict[str, float]:
+    """The smallest differences that a study finds with a probability of 80 %, known before the others learn.
+
+    As if two kinds of agents had seeds that vary as the baseline's, and differed by scenario as the baseline and ``bc``
+    do; at the level of the first of the claims that are adjusted together.
+
+    Args:
+        baseline: What the baseline's seeds did.
+        other: What those of ``bc`` did.
+        clusters: Recording of every scenario.
+        rare: Which scenarios are rare.
+        share: Of rare scenarios in ordinary traffic.
+        together: How many claims.
+    """
+    labels, weights, found = np.asarray(clusters), counts("ordinary", rare, share), {}
+    for name in METRICS:
+        if _several(np.concatenate([baseline[name], other[name]]), labels, weights):
+            two = crossed_difference(baseline[name], other[name], labels, weights)
+            (seeds, _), (both, _) = two.seeds, two.both
+            alike = replace(two, seeds=(seeds, seeds), both=(both, both))
+            found[name] = alike.detectable(confidence=level(together))
+    return found
+
+
+def counts(rows: str, rare: Rows, share: float | None) -> Counts:
+    """How much each scenario of the test counts.
+
+    Args:
+        rows: ``common`` or ``rare`` ones alone; or ``ordinary``: rare ones as often as in ordinary traffic, of which
+            the test may hold more.
+        rare: Which scenarios are rare.
+        share: Of rare scenarios in ordinary traffic; None: as in the test.
+    """
+    if rows != "ordinary":
+        return (rare if rows == "rare" else ~rare).astype(np.float64)
+    if share is None or rare.all() or not rare.any():
+        return np.ones(len(rare))
+    return np.where(rare, share / rare.sum(), (1.0 - share) / (~rare).sum())
+
+
+def _several(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> bool:
+    """Whether more than one recording counts in which everybody's value is defined."""
+    return np.unique(labels[(weights > 0.0) & ~np.isnan(values).any(axis=0)]).size > 1
+
+
+def rates(
+    driven: Driven, clusters: Sequence[str], rare: Rows, share: float | None = None
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Of one agent: by kind of scenario and metric the mean over seeds and scenarios, with its interval.
+
+    Metrics that hardly any scenario defines are left out.
+    """
     labels = np.asarray(clusters)
-    return {
-        kind: {metric: _rate(crossed_mean(driven[metric][:, rows], labels[rows])) for metric in METRICS}
-        for kind in ("all", "common", "rare")
-        if np.unique(labels[rows := which(kind, rare)]).size > 1
-    }
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for kind in ("ordinary", "common", "rare"):
+        weights = counts(kind, rare, share)
+        defined = {name: driven[name] for name in METRICS if _several(driven[name], labels, weights)}
+        if defined:
+            found[kind] = {name: _rate(one, labels, weights) for name, one in defined.items()}
+    return found
 
 
-def _rate(found: Crossed) -> dict[str, float]:
-    """Mean and interval, within what all of these metrics lie in."""
+def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict[str, float]:
+    """Mean, interval within what all of these metrics lie in, and how many scenarios it is of."""
+    found = crossed_mean(values, labels, weights)
     low, high = np.clip(found.interval(), 0.0, 1.0)
-    return {"mean": found.difference, "low": float(low), "high": float(high)}
+    if found.error == 0.0 and found.difference in (0.0, 1.0):
+        # Never or always: chance is that of as many recordings.
+        wide = wilson(found.difference * found.clusters, found.clusters)
+        low, high = wide.low or 0.0, wide.high or 0.0
+    number = int(((weights > 0.0) & ~np.isnan(values).any(axis=0)).sum())
+    return {"mean": found.difference, "low": float(low), "high": float(high), "scenarios": number}
 
 
 def rankings(tables: Mapping[str, ScoreTable]) -> list[dict[str, Any]]:
@@ -238,14 +361,35 @@ def rankings(tables: Mapping[str, ScoreTable]) -> list[dict[str, Any]]:
 
 def summary(judged: Judged) -> dict[str, Any]:
     """As plain values."""
-    found = judged.found
+    difference = judged.difference
     return {
         "claim": asdict(judged.claim),
         "verdict": judged.verdict,
         "needed": judged.needed,
-        "difference": None if found is None else found.difference,
-        "interval": None if found is None else list(found.interval()),
-        "p": None if found is None else found.p,
+        "difference": None if difference is None else difference.difference,
+        "interval": None if difference is None else list(difference.interval()),
+        "p": None if judged.found is None else judged.found.p,
         "adjusted": judged.adjusted,
         "change": None if judged.change is None else list(judged.change),
     }
+
+
+def cost_of_rule(
+    chosen: Driven, best: Driven, clusters: Sequence[str], rare: Rows, share: float | None
+) -> dict[str, Any]:
+    """What other checkpoints of the very same runs cost, in pairs: by metric the difference and its interval.
+
+    Args:
+        chosen: What the seeds did with the checkpoints in question.
+        best: What they did with those that were taken, in the same order.
+        clusters: Recording of every scenario.
+        rare: Which scenarios are rare.
+        share: Of rare scenarios in ordinary traffic.
+    """
+    labels, weights, found = np.asarray(clusters), counts("ordinary", rare, share), {}
+    for name in METRICS:
+        apart = chosen[name] - best[name]
+        if _several(apart, labels, weights):
+            one = crossed_mean(apart, labels, weights)
+            found[name] = {"difference": one.difference, "interval": list(one.interval())}
+    return found
