@@ -1,5 +1,6 @@
 """The long-tail study: verdicts on results that are known, and the whole study on a few scenarios."""
 
+import importlib
 import json
 from dataclasses import asdict, replace
 
@@ -270,7 +271,7 @@ def here(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_whole_study(data, tmp_path, here, capsys):
+def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     out = tmp_path / "study"
     sets = ["--data", str(data.path), "--validation", str(data.path), "--test", str(data.path)]
     arguments = ["study", "longtail", *sets, "--out", str(out), *TINY]
@@ -278,7 +279,7 @@ def test_the_whole_study(data, tmp_path, here, capsys):
     assert "does not drive well enough" in capsys.readouterr().err
     assert main([*arguments, "--anyway"]) == 0
     told = capsys.readouterr()
-    assert "undecided" in told.out and "trained random_matched, seed 1" in told.err
+    assert "undecided" in told.out and "trained and drove random_matched, seed 1" in told.err
     results = json.loads((out / "results.json").read_text())
     assert (
         results["about"]["test"] == 4 and results["about"]["rare"] == 2
@@ -291,6 +292,21 @@ def test_the_whole_study(data, tmp_path, here, capsys):
     # Everything is there: nothing is trained or driven again.
     assert main([*arguments, "--anyway"]) == 0
     assert "trained" not in capsys.readouterr().err
+    # And so where only what was kept of it is.
+    monkeypatch.syspath_prepend(repository / "benchmarks")
+    script = importlib.import_module("longtail")
+    monkeypatch.setattr(script, "KEPT", tmp_path / "kept")
+    script.keep(out)
+    script.restore(tmp_path / "restored")
+    assert not list((tmp_path / "restored").rglob("checkpoints"))
+    for file in (tmp_path / "restored").rglob("run.json"):
+        assert str(tmp_path) not in file.read_text()
+    arguments[arguments.index(str(out))] = str(tmp_path / "restored")
+    assert main([*arguments, "--anyway"]) == 0
+    assert "trained" not in capsys.readouterr().err
+    again = json.loads((tmp_path / "restored" / "results.json").read_text())
+    assert again == results
+    arguments[arguments.index(str(tmp_path / "restored"))] = str(out)
     # What was trained with other weights, or drove before it was trained, belongs to no study.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
     told, drive = json.loads(run.read_text()), out / "drives" / "heuristic" / "seed-0" / "run.json"

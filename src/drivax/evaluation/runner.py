@@ -151,7 +151,7 @@ def evaluate_scenarios(
     trial.refuse_absent(names, np.array([scenario.agent_valid[start_step, 0] for scenario in scenarios]))
     numbers = identities([(row["dataset"], row["scenario_id"]) for row in names])
     total, sizes = len(scenarios), sizes or Sizes.used(scenarios)
-    one = ScenarioBank.from_scenarios(scenarios[:1], trim=sizes).nbytes
+    one = prepared(simulator.traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes)).nbytes
     size = min(batch or scenarios_at_a_time(one, lanes(), free_memory(jax.devices()[0])), total)
     parts: list[Episodes] = []
     with raised() as errors, telling_out_of_memory(size):

@@ -56,11 +56,12 @@ def collision_section(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def strata_tables(runs: Sequence[Evaluation], tags: Tags) -> list[Table]:
-    """One table for each of the tags that the scenarios have, over the runs that drove them."""
+def strata_tables(runs: Sequence[Evaluation], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
+    """One table for each of the tags that the scenarios have, over the runs that drove them; with more metrics."""
     driven = [run for run in runs if any(key in tags for key in run.scenarios)]
     known = {name for words in tags.values() for name in words}
-    metrics = [name for name in KEY_METRICS if any(name in run.metrics for run in driven)]
+    wanted = dict.fromkeys((*KEY_METRICS, *more))
+    metrics = [name for name in wanted if any(name in run.metrics for run in driven)]
     return [strata_table(driven, tags, tag, metrics) for tag in STRATA if tag in known]
 
 

@@ -43,7 +43,8 @@ def write_tables(
         out: The folder.
         data: The scenario set that was driven, where it has moved.
         overwrite: Replace existing files.
-        metrics: In ``results`` and ``differences`` beside the usual ones: columns of ``episodes.csv``, or a set.
+        metrics: In ``results``, ``differences`` and ``by-TAG`` beside the usual ones: columns of ``episodes.csv``, or a
+            set.
 
     Returns:
         The files.
@@ -56,7 +57,7 @@ def write_tables(
     if not evaluations:
         raise UsageError("no evaluation was given", cure="name run folders of drivax evaluate")
     texts = {}
-    for table in _tables(evaluations, data, exported(evaluations, metrics)):
+    for table in _tables(evaluations, data, metrics):
         texts[f"{table.name}.csv"] = csv_text(table)
         texts[f"{table.name}.md"] = markdown(table, evaluations)
         texts[f"{table.name}.tex"] = latex(table, evaluations)
@@ -88,13 +89,15 @@ def exported(runs: Sequence[Evaluation], more: Sequence[str] = ()) -> list[str]:
     return [*first, *(name for name in rest if name not in first)] or names
 
 
-def _tables(runs: Sequence[Evaluation], data: Path | None, metrics: Sequence[str]) -> list[Table]:
+def _tables(runs: Sequence[Evaluation], data: Path | None, asked: Sequence[str]) -> list[Table]:
+    usual, metrics = exported(runs), exported(runs, asked)
     tables = [results_table(runs, metrics)]
     if len(runs) > 1:
         tables.append(differences_table(runs[-1], runs[:-1], metrics))
     if any("collision_type" in run.metrics for run in runs):
         tables.append(collisions_table(runs))
-    tables += strata_tables(runs, DrivenSet(runs[-1], data).tags())
+    more = [name for name in metrics if name not in usual]
+    tables += strata_tables(runs, DrivenSet(runs[-1], data).tags(), more)
     return tables + transfer_tables(runs)
 
 

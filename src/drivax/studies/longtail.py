@@ -33,8 +33,10 @@ from drivax.studies.longtail_drives import (
     Say,
     chosen_steps,
     clusters,
-    drive_all,
+    drive,
+    drive_expert,
     driven,
+    has_driven,
     ordinary_share,
     rare_rows,
     test_set,
@@ -110,26 +112,20 @@ def score(config: LongtailConfig, sets: Sets, out: Path, say: Say) -> dict[str, 
     return tables
 
 
-def train_all(
-    config: LongtailConfig, sets: Sets, out: Path, agents: Sequence[str], usable: Usable, cores: int | None,
-    say: Say,
-) -> None:  # fmt: skip
-    """Trains agents that are not trained yet, each seed by itself on one core."""
-    jobs = [Job(config, sets, out, agent, seed, usable) for seed in range(config.seeds) for agent in agents]
+def make_all(jobs: Sequence[Job], cores: int | None, say: Say) -> None:
+    """Trains agents that are not trained yet and drives the test set with them, each seed by itself on one core."""
     waiting = [job for job in jobs if not _done(job)]
-    for number, (job, took) in enumerate(one_core_each(_train, waiting, cores), start=1):
-        say(f"trained {job.agent}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
+    for number, (job, took) in enumerate(one_core_each(_make, waiting, cores), start=1):
+        say(f"trained and drove {job.agent}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
 
 
 def _done(job: Job) -> bool:
-    """Whether a training has come to its end.
+    """Whether an agent has driven.
 
     Raises:
-        UsageError: It was another training.
+        UsageError: It was trained otherwise, or anew since.
     """
-    steps = Checkpoints(job.run / "checkpoints").steps()
-    driven_already = drive_of(job.out, job.agent, job.seed).is_dir()
-    if not steps and not driven_already:
+    if not (job.run / "config.yaml").is_file():
         return False
     config, folder = job.train_config, RunFolder.open(job.run)
     now = hashes(ScenarioSet.open(job.sets.validation), _weighted(job).weights)
@@ -138,7 +134,7 @@ def _done(job: Job) -> bool:
             "was trained with other settings or weights than this study asks for", file=job.run,
             cure=f"remove it and {drive_of(job.out, job.agent, job.seed)}; both are made anew",
         )  # fmt: skip
-    return driven_already or config.iterations * config.algorithm.steps_per_iteration in steps
+    return has_driven(job.out, job.agent, job.seed)
 
 
 def _weighted(job: Job) -> WeightedSet:
@@ -150,16 +146,13 @@ def _weighted(job: Job) -> WeightedSet:
     return weighted(AGENTS[job.agent], data, table, job.config.weights, job.usable, job.seed)
 
 
-def _train(job: Job) -> float:
-    began = time.perf_counter()
-    train(
-        job.train_config,
-        _weighted(job),
-        job.run,
-        validation=ScenarioSet.open(job.sets.validation),
-        resume=bool(Checkpoints(job.run / "checkpoints").steps()),
-        overwrite=True,
-    )
+def _make(job: Job) -> float:
+    began, config = time.perf_counter(), job.train_config
+    steps = Checkpoints(job.run / "checkpoints").steps()
+    if config.iterations * config.algorithm.steps_per_iteration not in steps:
+        validation = ScenarioSet.open(job.sets.validation)
+        train(config, _weighted(job), job.run, validation=validation, resume=bool(steps), overwrite=not steps)
+    drive(job.out, job.agent, job.seed)
     return time.perf_counter() - began
 
 
@@ -193,8 +186,11 @@ def study(
     data, test = ScenarioSet.open(sets.train), test_set(sets, out)
     # Of one observation and one action space: whichever agent is asked.
     usable = usable_steps(config.train_config(FIRST[0], 0), data)
-    train_all(config, sets, out, FIRST, usable, cores, say)
-    drive_all(config, out, test, FIRST, say)
+    drive_expert(out, test)
+    jobs = [
+        Job(config, sets, out, agent, seed, usable) for seed in range(config.seeds) for agent in config.agents
+    ]
+    make_all([job for job in jobs if job.agent in FIRST], cores, say)
     met, least = conditions(config, out), _detectable(config, sets, out)
     for one in met:
         say(one.words())
@@ -207,8 +203,7 @@ def study(
             file=out,
             cure="train longer, choose other settings, or pass --anyway",
         )
-    train_all(config, sets, out, config.agents, usable, cores, say)
-    drive_all(config, out, test, config.agents, say)
+    make_all(jobs, cores, say)
     results = findings(config, sets, out, tables, usable) | {
         "conditions": [asdict(one) for one in met],
         "detectable": least,

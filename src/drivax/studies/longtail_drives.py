@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from drivax.learning.policies import load_policy
 from drivax.learning.validation import rank
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.sizes import Sizes
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.studies.longtail_plan import BY_MEAN_Q, DRIVES, TEST, LongtailConfig, Sets, drive_of, run_of
 from drivax.tracking.runs import RunFolder
@@ -64,28 +63,42 @@ def ordinary_share(sets: Sets) -> float | None:
     return float(labelled.mean()) if labelled.any() else None
 
 
-def drive_all(config: LongtailConfig, out: Path, test: ScenarioSet, agents: Sequence[str], say: Say) -> None:
-    """Drives the test set with the expert and with all agents that have not driven it yet."""
-    sizes = Sizes.used(test)
-    expert = out / DRIVES / "expert"
-    if not expert.is_dir():
-        run_evaluation(EvaluationConfig("expert"), make_planner("expert"), test, expert, sizes=sizes)
+def drive_expert(out: Path, test: ScenarioSet) -> None:
+    """Drives the test set with the expert, unless it has."""
+    folder = out / DRIVES / "expert"
+    if not folder.is_dir():
+        run_evaluation(EvaluationConfig("expert"), make_planner("expert"), test, folder)
+
+
+def drive(out: Path, agent: str, seed: int) -> None:
+    """Drives the test set with an agent, unless it has; with the baseline by other checkpoints, too."""
+    test, run = ScenarioSet.open(out / TEST), run_of(out, agent, seed)
     bank = ScenarioBank.from_scenarios([test[0]])
-    for agent in agents:
-        for seed in range(config.seeds):
-            run = run_of(out, agent, seed)
-            asked: list[tuple[str, int | None]] = [(agent, None)]
-            if agent == "baseline":
-                asked.append((BY_MEAN_Q, chosen_steps(run)[0]))
-            for name, step in asked:
-                folder = drive_of(out, name, seed)
-                if folder.is_dir():
-                    _refuse_older(folder, run)
-                    continue
-                planner, task = load_policy(run, bank, step=step)
-                told = str(run) if step is None else f"{run}@{step}"
-                run_evaluation(EvaluationConfig(told), planner, test, folder, task=task, sizes=sizes)
-                say(f"drove {name}, seed {seed}")
+    for name in names(agent):
+        folder = drive_of(out, name, seed)
+        if not folder.is_dir():
+            step = chosen_steps(run)[0] if name == BY_MEAN_Q else None
+            planner, task = load_policy(run, bank, step=step)
+            told = str(run) if step is None else f"{run}@{step}"
+            run_evaluation(EvaluationConfig(told), planner, test, folder, task=task)
+
+
+def has_driven(out: Path, agent: str, seed: int) -> bool:
+    """Whether an agent has driven the test set.
+
+    Raises:
+        UsageError: It was trained anew since.
+    """
+    folders = [drive_of(out, name, seed) for name in names(agent)]
+    for folder in folders:
+        if folder.is_dir():
+            _refuse_older(folder, run_of(out, agent, seed))
+    return all(folder.is_dir() for folder in folders)
+
+
+def names(agent: str) -> tuple[str, ...]:
+    """What the drives of an agent are called."""
+    return (agent, BY_MEAN_Q) if agent == "baseline" else (agent,)
 
 
 def _refuse_older(folder: Path, run: Path) -> None:
