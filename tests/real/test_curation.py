@@ -11,6 +11,7 @@ from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.logged import of_logs
 from drivax.curation.methods import Wanted, curate
 from drivax.curation.published import PublishedConfig
+from drivax.curation.scores import read_scores
 from drivax.curation.scouts import ScoutsConfig
 from drivax.datasets.womd_scenario import WomdScenario
 from drivax.scenario.assemble import assemble
@@ -61,22 +62,32 @@ def test_jerk_of_a_recorded_drive_is_that_of_scipy(recording, bank):
     assert found[-1] == found[-2]
 
 
-def test_three_commands_find_the_most_critical_scenarios(real_data, repository, tmp_path, monkeypatch):
-    """The page for data engineers, command by command, on a recording instead of a folder of them."""
+@pytest.mark.parametrize(
+    ("recordings", "found", "wanted"),
+    [("womd/motion_data_one_scenario.tfrecord", 1, 1), ("scenarionet", 12, 5)],
+    ids=["womd", "scenarionet"],
+)
+def test_three_commands_find_the_most_critical_scenarios(
+    recordings, found, wanted, real_data, repository, tmp_path, monkeypatch
+):
+    """The page for data engineers, command by command, on the recordings at hand."""
     pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
     page = (repository / "docs/guide/critical-scenarios.md").read_text()
     block = page.split("```bash\n")[1].split("```")[0]
-    recording = real_data / "womd/motion_data_one_scenario.tfrecord"
-    lines = [line.replace("womd/training", str(recording)) for line in block.splitlines()]
-    lines = [line.replace(" 500", " 1") for line in lines]
-    assert len(lines) == 3 and str(recording) in lines[0] and lines[1].endswith("sets/critical 1")
+    lines = [line.replace("womd/training", str(real_data / recordings)) for line in block.splitlines()]
+    lines = [line.replace(" 500", f" {wanted}") for line in lines]
+    assert len(lines) == 3 and recordings in lines[0] and lines[1].endswith(f"sets/critical {wanted}")
     monkeypatch.chdir(tmp_path)
     for line in lines:
         assert main(line.split()[1:]) == 0
-    kept, critical = ScenarioSet.open("sets/womd"), ScenarioSet.open("sets/critical")
-    assert [one.id for one in critical] == [one.id for one in kept]
+    whole, critical = ScenarioSet.open("sets/womd"), ScenarioSet.open("sets/critical")
+    assert (len(whole), len(critical)) == (found, wanted)
+    table = read_scores(tmp_path / "scores" / "womd.npz", whole)
+    order = np.argsort(-table.scenarios, kind="stable")[:wanted]
+    assert [one.id for one in critical] == [table.scenario_ids[row] for row in order]
+    assert len(set(table.scenarios)) == found
     assert critical.manifest["source"]["part_of"]["method"] == "kinematic"
-    assert "rank 1 of 1 by kinematic" in (tmp_path / "critical.html").read_text()
+    assert f"rank 1 of {found} by kinematic" in (tmp_path / "critical.html").read_text()
 
 
 @pytest.mark.slow
