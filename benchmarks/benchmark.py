@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -84,7 +84,11 @@ def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
     if name == BOX:
         return [(RandomActions(), Task(actions=Published()))]
     folders = learned().get(name)
-    return [load_policy(folder, bank) for folder in folders] if folders else [find_planner(name, bank)]
+    if not folders:
+        return [find_planner(name, bank)]
+    # Of one name, all seeds are driven by one program.
+    loaded = [load_policy(folder, bank) for folder in folders]
+    return [(replace(planner, name=name), task) for planner, task in loaded]
 
 
 def until_failure(results: Results) -> Metrics:

@@ -3,6 +3,7 @@
 import importlib
 import json
 from dataclasses import asdict, replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from drivax.studies.longtail_plan import LongtailConfig, Sets
 from drivax.studies.longtail_results import (
     METRICS,
     Condition,
+    Group,
     claims,
     cost_of_rule,
     detectable,
@@ -307,6 +309,12 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     again = json.loads((tmp_path / "restored" / "results.json").read_text())
     assert again == results
     arguments[arguments.index(str(tmp_path / "restored"))] = str(out)
+    blocks = [f"claims {group}" for group in get_args(Group)]
+    blocks += ["conditions", "detectable", "draws", "rankings", "mean q"]
+    blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
+    page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
+    assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
+    assert "heuristic collides less than its weights dealt out by lot" in page
     # What was trained with other weights, or drove before it was trained, belongs to no study.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
     told, drive = json.loads(run.read_text()), out / "drives" / "heuristic" / "seed-0" / "run.json"
