@@ -117,7 +117,7 @@ def claims(results: dict[str, Any], group: str) -> list[str]:
                     one["claim"]["words"],
                     "" if found is None else f"{one['difference']:+.3f} [{found[0]:+.3f}, {found[1]:+.3f}]",
                     "" if change is None else "{:+.0%} [{:+.0%}, {:+.0%}]".format(*change),
-                    "" if one["adjusted"] is None else f"{one['adjusted']:.3f}",
+                    "" if one["adjusted"] is None else f"{one['adjusted']:.3f}".replace("0.000", "<0.001"),
                     f"{one['verdict']}{': ' + one['needed'] if one['needed'] else ''}",
                 ]
             )

@@ -63,7 +63,7 @@ def test_it_says_what_was_found(page):
     assert "The conditions of the comparison are not met" not in text
     assert "kinematic and ensemble" in text and "+0.41" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
-    assert "Than the same weights dealt out by lot" in text and "Than the baseline" not in text
+    assert "Better than the same weights dealt out by lot?" in text and "than the baseline?" not in text
     assert "of which they are 5.0%" in text and "the same checkpoint of 2 of the 5 seeds" in text
     assert "Common scenarios" not in text  # there are none in these results
 

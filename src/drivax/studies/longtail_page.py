@@ -21,17 +21,20 @@ _SHORT = {
 }  # fmt: skip
 _KINDS = {"ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios"}
 _GROUPS = {
-    "baseline": "Than the baseline",
-    "lot": "Than the same weights dealt out by lot",
-    "where": "In common and in rare scenarios",
-    "failures": "Other failures",
-    "methods": "Among themselves",
+    "baseline": "Better than the baseline?",
+    "lot": "Better than the same weights dealt out by lot?",
+    "where": "In common, and in rare scenarios?",
+    "failures": "Fewer failures of any kind?",
+    "methods": "One method better than another?",
 }
 _SIGNS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
 #: Cells of the map of actions along either dimension, and its size in pixels.
 _CELLS, _SIZE = 48, 336
 _STYLE = """
 table.wide td, table.wide th { text-align: left; }
+table.wide th[scope=row] { min-width: 19em; }
+table.wide td:nth-child(n+3):nth-child(-n+6) { white-space: nowrap; }
+h3 { margin-top: 1.5em; }
 .map rect { stroke: none; }
 .map text { font-size: 11px; fill: var(--soft); }
 """
@@ -150,7 +153,7 @@ def _verdict(one: Mapping[str, Any]) -> tuple[str, ...]:
         f"{one['difference']:+.3f} [{low_high[0]:+.3f}, {low_high[1]:+.3f}]"
     )  # fmt: skip
     change = "" if one["change"] is None else "{:+.0%} [{:+.0%}, {:+.0%}]".format(*one["change"])
-    p = "" if one["adjusted"] is None else f"{one['adjusted']:.3f}"
+    p = "" if one["adjusted"] is None else f"{one['adjusted']:.3f}".replace("0.000", "<0.001")
     verdict = _SIGNS[one["verdict"]]
     return claim["words"], _SHORT[claim["metric"]], difference, change, p, verdict, one["needed"]
 
