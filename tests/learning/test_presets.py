@@ -68,7 +68,8 @@ def test_published_numbers():
 def test_published_numbers_of_offline_algorithms():
     """CQL's as the long-tail study has them, the others' as their papers."""
     cql = settings.load(TrainConfig, "published/cql").algorithm
-    assert (cql.penalty, cql.gamma, cql.tau, cql.batch, cql.actions) == (2.0, 0.9, 0.005, 512, 10)
+    # The study's penalty weighs 2 beside whole squared errors, which are halved here.
+    assert (cql.penalty, cql.gamma, cql.tau, cql.batch, cql.actions) == (1.0, 0.9, 0.005, 512, 10)
     assert (cql.policy_rate, cql.critic_rate, cql.gradient_norm) == (1e-5, 3e-5, 1.0)
     assert not cql.importance and not cql.next_actions and cql.temperature_rate == 0.0
     assert settings.load(TrainConfig, "published/cql").total_steps == 510_000 * 512
@@ -91,3 +92,8 @@ def test_offline_presets_differ_in_the_algorithm_alone():
         assert replace(config, algorithm=found[0].algorithm) == found[0]
         assert config.algorithm.network == found[0].algorithm.network
         assert config.algorithm.steps_per_iteration == found[0].algorithm.steps_per_iteration
+
+
+def test_imitation_is_all_that_is_added_to_the_baseline_of_the_study():
+    alone, both = (settings.load(TrainConfig, f"offline/{name}").algorithm for name in ("cql", "cql_bc"))
+    assert both.imitation > 0.0 and replace(both, imitation=0.0) == alone
