@@ -100,7 +100,8 @@ def _fill_head(record: Record, recording: Recording, origin: Float[Array, "3"], 
     record["scenario_id"] = recording.scenario_id.encode()
     record["dataset"] = recording.dataset.encode()
     record["segment"] = recording.segment.encode()
-    record["origin"] = origin
+    # To a micrometre: the last bits depend on the processor where recordings are computed.
+    record["origin"] = np.round(origin, 6) + 0.0
     record["dt_s"] = step_seconds(recording.timestamps_s)[0]
     record["current_step"] = recording.current_step
     record["steps"] = len(recording.timestamps_s)

@@ -90,7 +90,8 @@ def road_rows(
         length=span,
         kind=kind,
         limit=np.array(limits, dtype=np.float64)[roads.feature[owner]] if len(owner) else np.zeros(0),
-        curvature=turn / (span * 2 / 3),
+        # A straight road has 0, not the last bit of an angle or the sign of it: those depend on the processor.
+        curvature=np.round(turn / (span * 2 / 3), 6) + 0.0,
         overflow={"road_rows": lost} if lost else {},
     )
 
