@@ -14,16 +14,18 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import re
 import shutil
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+from drivax.studies import longtail_page
 from drivax.studies.longtail_drives import has_driven, names
 from drivax.studies.longtail_plan import DRIVES, RESULTS, RUNS, SCORES, drive_of, run_of
 from drivax.studies.longtail_results import Group
-from learning_tables import interval, table
+from learning_tables import table
 
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "benchmarks" / "results" / "longtail"
@@ -64,107 +66,21 @@ def restore(study: Path) -> None:
 def filled(page: str, results: dict[str, Any]) -> str:
     """The page with its tables as the study found them."""
     parts = {
-        "conditions": conditions(results),
-        "detectable": detectable(results),
-        "draws": draws(results),
-        "rankings": rankings(results),
-        "mean q": mean_q(results),
-        **{f"claims {group}": claims(results, group) for group in get_args(Group)},
-        **{f"rates {kind}": rates(results, kind) for kind in ("ordinary", "common", "rare")},
+        "conditions": longtail_page.conditions(results),
+        "draws": longtail_page.draws(results),
+        "rankings": longtail_page.rankings(results),
+        "mean q": longtail_page.mean_q(results),
+        **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(Group)},
+        **{f"rates {kind}": longtail_page.rates(results, kind) for kind in ("ordinary", "common", "rare")},
+        "detectable": (
+            ("metric", "smallest difference"),
+            [(f"`{name}`", f"{least:.3f}") for name, least in results["detectable"].items()],
+        ),
     }
-    for name, lines in parts.items():
+    for name, cells in parts.items():
         before, rest = page.split(BEGIN.format(name))
-        page = "\n".join([before + BEGIN.format(name), "", *lines, "", END + rest.split(END, 1)[1]])
+        page = "\n".join([before + BEGIN.format(name), "", *table(*cells), "", END + rest.split(END, 1)[1]])
     return page
-
-
-def conditions(results: dict[str, Any]) -> list[str]:
-    """How well drives what everything is compared with."""
-    heads = [
-        "agent",
-        "share of the expert's progress",
-        "worst seed",
-        "score, third to last quarter",
-        "either way",
-        "met",
-    ]
-    rows = [
-        [
-            f"`{one['agent']}`", f"{one['progress']:.1%}", f"{one['least']:.1%}", f"{one['change']:+.3f}",
-            f"{one['moved']:.3f}", "yes" if one["met"] else "no",
-        ]
-        for one in results["conditions"]
-    ]  # fmt: skip
-    return table(heads, rows)
-
-
-def detectable(results: dict[str, Any]) -> list[str]:
-    """The smallest difference that is found, by metric."""
-    return table(
-        ["metric", "smallest difference"],
-        [[f"`{name}`", f"{x:.3f}"] for name, x in results["detectable"].items()],
-    )
-
-
-def claims(results: dict[str, Any], group: str) -> list[str]:
-    """Verdicts of a group."""
-    rows = []
-    for one in results["claims"]:
-        if one["claim"]["group"] == group:
-            change, found = one["change"], one["interval"]
-            rows.append(
-                [
-                    one["claim"]["words"],
-                    "" if found is None else f"{one['difference']:+.3f} [{found[0]:+.3f}, {found[1]:+.3f}]",
-                    "" if change is None else "{:+.0%} [{:+.0%}, {:+.0%}]".format(*change),
-                    "" if one["adjusted"] is None else f"{one['adjusted']:.3f}".replace("0.000", "<0.001"),
-                    f"{one['verdict']}{': ' + one['needed'] if one['needed'] else ''}",
-                ]
-            )
-    return table(["claim", "difference", "relative", "adjusted p", "verdict"], rows)
-
-
-def rates(results: dict[str, Any], kind: str) -> list[str]:
-    """How every agent drove."""
-    found = {agent: one[kind] for agent, one in results["rates"].items()}
-    metrics = list(found["baseline"])
-    rows = [[f"`{agent}`", *(interval(one[metric]) for metric in metrics)] for agent, one in found.items()]
-    return table(["agent", *(f"`{metric}`" for metric in metrics)], rows)
-
-
-def draws(results: dict[str, Any]) -> list[str]:
-    """How weights lie."""
-    names = {
-        "effective": "effective sample", "effective_scenarios": "of scenarios", "tilt": "tilt", "largest": "largest",
-        "concentration": "draws from 5 %",
-    }  # fmt: skip
-    rows = [
-        [f"`{agent}`", *(f"{one[name]:.2f}" for name in names)] for agent, one in results["draws"].items()
-    ]
-    return table(["agent", *names.values()], rows)
-
-
-def rankings(results: dict[str, Any]) -> list[str]:
-    """How alike methods rank scenarios."""
-    rows = [
-        [
-            f"`{one['one']}`, `{one['other']}`",
-            f"{one['rho']:+.2f}",
-            f"{one['overlap']:.0%}",
-            one["orthogonal"],
-        ]
-        for one in results["rankings"]
-    ]
-    return table(["methods", "rank correlation", "same among the top 5 %", "they are orthogonal"], rows)
-
-
-def mean_q(results: dict[str, Any]) -> list[str]:
-    """What choosing by the highest mean Q costs."""
-    rows = [
-        [f"`{name}`", "{:+.3f} [{:+.3f}, {:+.3f}]".format(one["difference"], *one["interval"])]
-        for name, one in results["mean_q"].items()
-    ]
-    return table(["metric", "by mean Q minus by driving"], rows)
 
 
 def _agents(study: Path) -> Iterator[tuple[str, int]]:
@@ -177,18 +93,23 @@ def _pack(folders: list[Path], study: Path, out: Path) -> None:
     with tarfile.open(out, "w:xz") as packed:
         for file in (folder / name for folder in folders for name in FILES):
             if file.is_file():
-                content = file.read_bytes()
-                if file.name == "run.json":
-                    content = _without_paths(json.loads(content))
+                content = _without_paths(file)
                 about = tarfile.TarInfo(str(file.relative_to(study)))
                 about.size = len(content)
                 packed.addfile(about, io.BytesIO(content))
 
 
-def _without_paths(told: dict[str, Any]) -> bytes:
-    """``run.json``, its data by name; the command would tell where the study lies."""
-    data = [entry | {"path": Path(entry["path"]).name} for entry in told["data"]]
-    return (json.dumps({name: told[name] for name in told if name != "command"} | {"data": data})).encode()
+def _without_paths(file: Path) -> bytes:
+    """What a file says, with data and runs by name: where they lie is the machine's own affair."""
+    if file.name == "run.json":
+        told = json.loads(file.read_bytes())
+        told.pop("command")
+        for entry in (*told["data"], *told.get("trained_on", ())):
+            entry["path"] = Path(entry["path"]).name
+        return json.dumps(told).encode()
+    if file.name == "config.yaml":
+        return re.sub(rf"(?m)^(planner: ).*/({RUNS}/)", r"\1\2", file.read_text()).encode()
+    return file.read_bytes()
 
 
 def main() -> None:

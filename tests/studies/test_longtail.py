@@ -301,8 +301,10 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     script.keep(out)
     script.restore(tmp_path / "restored")
     assert not list((tmp_path / "restored").rglob("checkpoints"))
-    for file in (tmp_path / "restored").rglob("run.json"):
-        assert str(tmp_path) not in file.read_text()
+    kept = [file for file in (tmp_path / "restored").rglob("*") if file.is_file()]
+    assert {file.name for file in kept} == {"config.yaml", "run.json", "metrics.jsonl", "episodes.csv"}
+    for file in kept:
+        assert str(tmp_path.parent) not in file.read_text(), file
     arguments[arguments.index(str(out))] = str(tmp_path / "restored")
     assert main([*arguments, "--anyway"]) == 0
     assert "trained" not in capsys.readouterr().err

@@ -58,7 +58,7 @@ def write_page(
         _section("Before the comparison", _conditions(results)),
         _section("Verdicts", _verdicts(results)),
         _section("How the agents drove", "".join(_rates(results, kind) for kind in _KINDS)),
-        _section("How the weights lie", _draws(results)),
+        _section("How the weights lie", _table(*draws(results))),
         _section("Are the methods different?", _rankings(results)),
         _section("Choosing checkpoints by the highest mean Q", _mean_q(results)),
         _section("Scores", _scores(scored)),
@@ -98,7 +98,12 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") 
     return f"<div class=scroll><table class='{kind}'><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
 
 
-def _conditions(results: Mapping[str, Any]) -> str:
+#: Heads and rows of a table.
+Cells = tuple[Sequence[str], Sequence[Sequence[str]]]
+
+
+def conditions(results: Mapping[str, Any]) -> Cells:
+    """How well drives what everything is compared with."""
     rows = [
         (
             one["agent"],
@@ -110,20 +115,62 @@ def _conditions(results: Mapping[str, Any]) -> str:
         )
         for one in results["conditions"]
     ]
-    found = ", ".join(f"{_SHORT[name]} {value:.3f}" for name, value in results["detectable"].items())
-    return (
-        _table(
-            (
-                "agent",
-                "progress of the expert's",
-                "worst seed",
-                "score, third to last quarter",
-                "either way",
-                "good enough",
-            ),
-            rows,
+    heads = (
+        "agent", "progress of the expert's", "worst seed", "score, third to last quarter", "either way", "good enough"
+    )  # fmt: skip
+    return heads, rows
+
+
+def verdicts(results: Mapping[str, Any], group: str) -> Cells:
+    """What became of the claims of a group."""
+    rows = [_verdict(one) for one in results["claims"] if one["claim"]["group"] == group]
+    return ("claim", "metric", "difference", "relative", "adjusted p", "verdict", "what would decide"), rows
+
+
+def rates(results: Mapping[str, Any], kind: str) -> Cells:
+    """How every agent drove scenarios of a kind."""
+    found = {name: rates[kind] for name, rates in results["rates"].items() if kind in rates}
+    metrics = [name for name in METRICS if any(name in rates for rates in found.values())]
+    rows = [(name, *(_mean(rates.get(metric)) for metric in metrics)) for name, rates in found.items()]
+    return ("agent", *(_SHORT[name] for name in metrics)), rows
+
+
+def draws(results: Mapping[str, Any]) -> Cells:
+    """How the weights of every agent lie."""
+    names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
+    heads = ("agent", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
+    return heads, [
+        (agent, *(f"{one[name]:.2f}" for name in names)) for agent, one in results["draws"].items()
+    ]
+
+
+def rankings(results: Mapping[str, Any]) -> Cells:
+    """How alike methods rank scenarios."""
+    rows = [
+        (
+            f"{one['one']} and {one['other']}",
+            f"{one['rho']:+.2f}",
+            f"{one['overlap']:.0%}",
+            _SIGNS[one["orthogonal"]],
         )
-        + "<p>The smallest difference in ordinary traffic that so many seeds and scenarios find with a probability of "
+        for one in results["rankings"]
+    ]
+    return ("methods", "rank correlation", "same among the top 5 %", "“they are orthogonal”"), rows
+
+
+def mean_q(results: Mapping[str, Any]) -> Cells:
+    """What choosing checkpoints by the highest mean Q costs."""
+    rows = [
+        (_SHORT[name], f"{one['difference']:+.3f} [{one['interval'][0]:+.3f}, {one['interval'][1]:+.3f}]")
+        for name, one in results["mean_q"].items()
+    ]
+    return ("metric", "by mean Q minus by driving"), rows
+
+
+def _conditions(results: Mapping[str, Any]) -> str:
+    found = ", ".join(f"{_SHORT[name]} {value:.3f}" for name, value in results["detectable"].items())
+    return _table(*conditions(results)) + (
+        "<p>The smallest difference in ordinary traffic that so many seeds and scenarios find with a probability of "
         "80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
         f"{escape(found)}. Learning rates fall to the end, so that a score that stands still is that of this "
         "budget.</p>"
@@ -131,12 +178,8 @@ def _conditions(results: Mapping[str, Any]) -> str:
 
 
 def _verdicts(results: Mapping[str, Any]) -> str:
-    heads = ("claim", "metric", "difference", "relative", "adjusted p", "verdict", "what would decide")
-    parts = []
-    for group, title in _GROUPS.items():
-        rows = [_verdict(one) for one in results["claims"] if one["claim"]["group"] == group]
-        if rows:
-            parts.append(f"<h3>{title}</h3>" + _table(heads, rows, "wide"))
+    tables = {title: verdicts(results, group) for group, title in _GROUPS.items()}
+    parts = [f"<h3>{title}</h3>" + _table(*cells, "wide") for title, cells in tables.items() if cells[1]]
     return "".join(parts) + (
         "<p><small>Differences are means over seeds and scenarios with 95 % intervals; both seeds and recordings are "
         "drawn by chance (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). "
@@ -159,54 +202,28 @@ def _verdict(one: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _rates(results: Mapping[str, Any], kind: str) -> str:
-    found = {name: rates[kind] for name, rates in results["rates"].items() if kind in rates}
-    if not found:
+    cells, share = rates(results, kind), results["about"]["share"]
+    if not cells[1]:
         return ""
-    metrics = [name for name in METRICS if any(name in rates for rates in found.values())]
-    rows = [(name, *(_mean(rates.get(metric)) for metric in metrics)) for name, rates in found.items()]
-    share = results["about"]["share"]
     note = "" if kind != "ordinary" or share is None else (
         f"<p><small>Scenarios with an event count as in ordinary traffic, of which they are {share:.1%}.</small></p>"
     )  # fmt: skip
-    return f"<h3>{_KINDS[kind]}</h3>" + _table(("agent", *(_SHORT[name] for name in metrics)), rows) + note
+    return f"<h3>{_KINDS[kind]}</h3>" + _table(*cells) + note
 
 
 def _mean(rate: Mapping[str, float] | None) -> str:
     return "" if rate is None else f"{rate['mean']:.3f} [{rate['low']:.3f}, {rate['high']:.3f}]"
 
 
-def _draws(results: Mapping[str, Any]) -> str:
-    names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
-    heads = ("agent", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
-    rows = [(agent, *(f"{one[name]:.2f}" for name in names)) for agent, one in results["draws"].items()]
-    return _table(heads, rows)
-
-
 def _rankings(results: Mapping[str, Any]) -> str:
-    rows = [
-        (
-            f"{one['one']} and {one['other']}",
-            f"{one['rho']:+.2f}",
-            f"{one['overlap']:.0%}",
-            _SIGNS[one["orthogonal"]],
-        )
-        for one in results["rankings"]
-    ]
-    return _table(
-        ("methods", "rank correlation", "same among the top 5 %", "“they are orthogonal”"), rows
-    ) + (
+    return _table(*rankings(results)) + (
         f"<p><small>Of the scores of the training scenarios. Below ±{UNRELATED} rankings are called unrelated, above "
         f"±{RELATED} related. Two rankings by lot have 5 % of their top 5 % in common.</small></p>"
     )
 
 
 def _mean_q(results: Mapping[str, Any]) -> str:
-    found = results["mean_q"]
-    rows = [
-        (_SHORT[name], f"{one['difference']:+.3f} [{one['interval'][0]:+.3f}, {one['interval'][1]:+.3f}]")
-        for name, one in found.items()
-    ]
-    return _table(("metric", "by mean Q minus by driving"), rows) + (
+    return _table(*mean_q(results)) + (
         "<p><small>The baseline's checkpoints with the highest mean Q on held-out steps, as the published study takes "
         "them, against those with the best validation score, on the test set: the same runs, seed by seed. Both rules "
         f"take the same checkpoint of {results['mean_q_agrees']} of the {results['about']['seeds']} "
