@@ -16,6 +16,7 @@ from drivax.curation.scouts import (
     Opinions,
     ScoutsConfig,
     experience_of,
+    fit,
     folds_of,
     mutual_information,
     train_scouts,
@@ -113,12 +114,33 @@ def test_information_tells_modes_that_a_mean_does_not():
 
 
 @pytest.mark.slow
-def test_no_scout_draws_from_its_own_fold_and_each_draws_from_all_others(scouts, data):
-    bank = ScenarioBank.from_scenarios(data)
-    _, draws, _ = experience_of(TINY, Driving(Simulator(TINY.task)), bank, scouts.fold)
-    for own in range(TINY.folds):
-        rows, _ = draw(jax.tree.map(lambda part, own=own: part[own], draws), jax.random.key(own), (5_000,))
-        assert set(np.asarray(rows).tolist()) == set(np.flatnonzero(scouts.fold != own).tolist())
+@pytest.mark.parametrize("weighted", ["plain", "rarity"])
+def test_a_scout_learns_from_all_recordings_but_those_of_its_fold(scouts, data, weighted):
+    """What the expert did there is replaced: the scout whose fold it is learns the same, all others something else."""
+    config = replace(TINY, weighted=weighted)
+    environment, bank = Driving(Simulator(config.task)), ScenarioBank.from_scenarios(data)
+    experience, _ = experience_of(config, environment, bank)
+    learner = config.cloning.build(environment, bank, config.iterations)
+    before = fit(config, learner, experience, scouts.fold)
+    for own in range(config.folds):
+        action = jnp.where((scouts.fold == own)[:, None, None], 0.9, experience.expert.action)
+        altered = replace(experience, expert=replace(experience.expert, action=action))
+        after = fit(config, learner, altered, scouts.fold)
+        same = jax.tree.map(lambda old, new: np.asarray(jax.vmap(jnp.array_equal)(old, new)), before, after)
+        same = np.all(jax.tree.leaves(same), axis=0)
+        assert same.tolist() == [scout == own for scout in range(config.folds)]
+
+
+@pytest.mark.slow
+def test_all_recordings_are_drawn_for_the_scouts(scouts, data):
+    environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
+    experience, _ = experience_of(TINY, environment, bank)
+    rows, steps = draw(experience.critic, jax.random.key(0), (30_000,))
+    usable = np.asarray(experience.usable)
+    assert usable[np.asarray(rows), np.asarray(steps)].all()
+    shares = np.bincount(scouts.fold[np.asarray(rows)]) / 30_000
+    wanted = [usable[scouts.fold == own].sum() / usable.sum() for own in range(TINY.folds)]
+    np.testing.assert_allclose(shares, wanted, atol=0.01)
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """Scouts: an ensemble of cloned drivers that have seen different recordings. Where they disagree, data are scarce.
 
 Each scout leaves one fold of the recordings out; all are trained side by side in one program, and differ in their first
-parameters, too. Deep ensembles: Lakshminarayanan et al. 2017, arXiv 1612.01474.
+parameters, too. They look at the same steps, drawn and observed once for all; each leaves those of its own fold out of
+its loss, so that what it learns from is drawn as it would be for it alone. Deep ensembles: Lakshminarayanan et al. 2017, arXiv 1612.01474.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from drivax.curation.scoring import Progress, each_batch
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import recordings
 from drivax.learning.driving import Driving
-from drivax.learning.experience import Experience, ExperienceConfig, recorded
-from drivax.learning.imitation import Bc, BcConfig
-from drivax.learning.sampler import Sampler, sampler
+from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
+from drivax.learning.imitation import Bc, BcConfig, updated
+from drivax.learning.sampler import draw, sampler
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
@@ -52,10 +53,10 @@ class ScoutsConfig:
 
     Attributes:
         folds: How many scouts; each leaves out every so manieth recording, chosen by lot.
-        cloning: How each is trained. With ``loss: mse`` scouts disagree by the variance of what they would do; with
+        cloning: How each is trained; of every ``batch`` each scout leaves out the steps of its own fold. With ``loss: mse`` scouts disagree by the variance of what they would do; with
             ``likelihood`` by how much their distributions differ, so that ``network.distribution: mixture`` can
             disagree about modes.
-        total_steps: Recorded steps that each learns from, rounded up to whole iterations of ``cloning``.
+        total_steps: Recorded steps that are drawn for all of them, rounded up to whole iterations of ``cloning``.
         weighted: ``plain``: all steps alike; ``rarity``: drawn by inverse density of the expert's action, clipped
             (:class:`~drivax.curation.rarity.KernelRarity` with its exponent at 1).
         task: What scouts see, and what actions are.
@@ -230,33 +231,71 @@ def train_scouts(
     clusters = recordings(*columns)
     fold = folds_of(clusters, config.folds, config.seed)
     bank = ScenarioBank.from_scenarios(data)
+    experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)
-    experience, draws, deviation = experience_of(config, environment, bank, fold)
-
-    def all_scouts(experience: Experience, draws: Sampler, state: Any) -> Any:
-        return jax.vmap(lambda own, one: learner.iterate(replace(experience, critic=own), one))(draws, state)
-
-    iterate = jax.jit(all_scouts, donate_argnums=2)
-    keys = jax.random.split(jax.random.key(config.seed), config.folds)
-    state = jax.jit(jax.vmap(learner.init, (None, 0)))(bank, keys)
-    for done in range(config.iterations):
-        state, logs = iterate(experience, draws, state)
-        jax.block_until_ready(logs)
-        if say is not None:
-            say(done + 1, config.iterations)
-    return Scouts(config, learner, state.parameters, data.hash, fold, deviation)
+    parameters = fit(config, learner, experience, fold, say)
+    return Scouts(config, learner, parameters, data.hash, fold, deviation)
 
 
 def experience_of(
-    config: ScoutsConfig, environment: Driving, bank: ScenarioBank, fold: Int[Numbers, " N"]
-) -> tuple[Experience, Sampler, Float[Numbers, " D"]]:
-    """What scouts learn from, how each draws along a leading axis, and the deviation of what experts do."""
+    config: ScoutsConfig, environment: Driving, bank: ScenarioBank
+) -> tuple[Experience, Float[Numbers, " D"]]:
+    """What scouts learn from and how it is drawn, and the deviation of what experts do."""
     made = ExperienceConfig(mask_clipped=config.cloning.mask_clipped).of(environment, bank)
     usable = np.asarray(made.usable)
     action = np.asarray(made.expert.action, np.float64)
-    weights = usable.astype(np.float64)
     if config.weighted == "rarity":
         weights = rarity_steps(KernelRarity(temper=1.0), action, usable)
-    samplers = [sampler(weights * (fold != own)[:, None]) for own in range(config.folds)]
-    draws = jax.tree.map(lambda *parts: jnp.stack(parts), *samplers)
-    return made, draws, np.maximum(action[usable].std(axis=0), 1e-6)
+        made = replace(made, critic=sampler(np.where(usable, weights, 0.0)))
+    return made, np.maximum(action[usable].std(axis=0), 1e-6)
+
+
+def fit(
+    config: ScoutsConfig,
+    learner: Bc,
+    experience: Experience,
+    fold: Int[Numbers, " N"],
+    say: Callable[[int, int], None] | None = None,
+) -> Any:
+    """Parameters of all scouts, along a leading axis.
+
+    Args:
+        config: What they are.
+        learner: What one is.
+        experience: What they learn from.
+        fold: Of every scenario.
+        say: Called with (iterations done, iterations).
+    """
+    environment, cloning, own = recorded(learner.environment), config.cloning, jnp.arange(config.folds)
+
+    def update(
+        experience: Experience, fold: Array, trained: tuple[Any, Any], key: Array
+    ) -> tuple[tuple[Any, Any], dict[str, Array]]:
+        places = draw(experience.critic, key, (cloning.batch,))
+        observation, action, _ = moments(environment, experience, places)
+
+        def one(own: Array, trained: tuple[Any, Any]) -> tuple[tuple[Any, Any], dict[str, Array]]:
+            def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
+                policy = learner.distribution(parameters, observation)
+                return cloning.of_moments(policy, action, fold[places[0]] != own)
+
+            return updated(trained, learner.optimiser, loss)
+
+        # One after the other: on CPUs products of stacked small matrices take thrice as long.
+        return jax.lax.map(lambda each: one(*each), (own, trained))
+
+    @partial(jax.jit, donate_argnums=2)
+    def iterate(experience: Experience, fold: Array, trained: tuple[Any, Any], key: Array) -> tuple[Any, Any]:
+        keys = jax.random.split(key, cloning.updates)
+        return jax.lax.scan(partial(update, experience, fold), trained, keys)[0]
+
+    network_key, key = jax.random.split(jax.random.key(config.seed))
+    keys = jax.random.split(network_key, config.folds)
+    state = jax.jit(jax.vmap(learner.init, (None, 0)))(experience.data, keys)
+    trained = (state.parameters, state.optimiser)
+    for done in range(config.iterations):
+        trained = iterate(experience, jnp.asarray(fold), trained, jax.random.fold_in(key, done))
+        jax.block_until_ready(trained)
+        if say is not None:
+            say(done + 1, config.iterations)
+    return trained[0]

@@ -76,17 +76,21 @@ class Cloning:
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """The loss on random moments, and what to log: it, the mean error of the mode, the share left out."""
         observation, action, clipped = _moments(environment, data, key, self.batch)
-        policy = act(parameters, observation)
+        return self.of_moments(act(parameters, observation), action, ~(clipped & self.mask_clipped))
+
+    def of_moments(
+        self, policy: Distribution, action: Float[Array, "B D"], counts: Bool[Array, " B"]
+    ) -> tuple[Float[Array, ""], dict[str, Array]]:
+        """The loss of a policy at moments that count, where the expert did this, and what to log."""
         error = policy.mode() - action
         squared = self.loss == "mse"
         loss = jnp.mean(error**2, axis=-1) if squared else -policy.log_prob(policy.choice_of(action))
-        counts = (~clipped if self.mask_clipped else jnp.ones_like(clipped)).astype(jnp.float32)
-        share = 1.0 / jnp.maximum(counts.sum(), 1.0)
+        share = 1.0 / jnp.maximum(counts.sum(dtype=jnp.float32), 1.0)
         mean = jnp.sum(loss * counts) * share
         logs = {
             "imitation": mean,
             "imitation_error": jnp.sum(jnp.mean(jnp.abs(error), axis=-1) * counts) * share,
-            "left_out": 1.0 - counts.mean(),
+            "left_out": 1.0 - counts.mean(dtype=jnp.float32),
         }
         return mean, logs
 
@@ -100,11 +104,7 @@ class Cloning:
         """One iteration's updates of (parameters, optimiser's state), and the means of what the loss logs."""
 
         def update(trained: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            parameters, state = trained
-            (_, logs), gradient = jax.value_and_grad(loss, has_aux=True)(parameters, key)
-            logs["imitation_gradient_norm"] = optax.tree.norm(gradient)
-            change, state = optimiser.update(gradient, state, parameters)
-            return (optax.apply_updates(parameters, change), state), logs
+            return updated(trained, optimiser, lambda parameters: loss(parameters, key))
 
         trained, logs = jax.lax.scan(update, trained, jax.random.split(key, self.updates))
         return trained, {f"loss/{name}": value.mean() for name, value in logs.items()}
@@ -189,6 +189,19 @@ class Bc:
         if isinstance(data, Experience):
             logs |= data.sizes()
         return BcState(*trained, key, state.iteration + 1), logs
+
+
+def updated(
+    trained: tuple[Any, Any],
+    optimiser: optax.GradientTransformation,
+    loss: Callable[[Any], tuple[Array, dict[str, Array]]],
+) -> tuple[tuple[Any, Any], dict[str, Array]]:
+    """(Parameters, optimiser's state) after one update, and what the loss logs."""
+    parameters, state = trained
+    (_, logs), gradient = jax.value_and_grad(loss, has_aux=True)(parameters)
+    logs["imitation_gradient_norm"] = optax.tree.norm(gradient)
+    change, state = optimiser.update(gradient, state, parameters)
+    return (optax.apply_updates(parameters, change), state), logs
 
 
 def _moments(
