@@ -22,9 +22,10 @@ import numpy as np
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results, interval_of
+from drivax.evaluation.crossed import agents_interval, difference_interval
+from drivax.evaluation.results import RATES, Results, interval_of
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.statistics import Interval, crossed_bootstrap
+from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
 from drivax.planners.planner import Planner
@@ -151,11 +152,24 @@ def episodes(name: str, kind: str) -> Driven | None:
 
 
 def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval:
-    """Mean, or mean difference scenario by scenario; several seeds are drawn like segments."""
-    if against is None and len(driven.values[metric]) == 1:
-        return interval_of(metric, driven.values[metric][0], driven.segments)
-    other = None if against is None else against.values[metric]
-    return crossed_bootstrap(driven.values[metric], driven.segments, against=other, seed=0)
+    """Mean, or mean difference scenario by scenario; several seeds are drawn by chance as segments are."""
+    own, segments = driven.values[metric].astype(np.float64), driven.segments
+    if against is None:
+        if len(own) == 1:
+            return interval_of(metric, own[0], segments)
+        return agents_interval(own, segments, rate=metric in RATES)
+    other = against.values[metric].astype(np.float64)
+    if len(own) == len(other) == 1:
+        return paired_bootstrap(own[0], other[0], segments, seed=0)
+    return difference_interval(own, other, segments)[0]
+
+
+def change(driven: Driven, metric: str, before: Driven) -> Interval:
+    """Mean of what changes, scenario by scenario, for the very same agents."""
+    apart = driven.values[metric].astype(np.float64) - before.values[metric]
+    if len(apart) == 1:
+        return bootstrap_mean(apart[0], driven.segments, seed=0)
+    return agents_interval(apart, driven.segments)
 
 
 def judged() -> dict[str, Any]:
@@ -181,7 +195,8 @@ def judged() -> dict[str, Any]:
         "planners": planners,
         "reactive": {
             name: {
-                metric: mean(driven[name, "idm"], metric, driven[name, "log"]).as_dict() for metric in COLUMNS
+                metric: change(driven[name, "idm"], metric, driven[name, "log"]).as_dict()
+                for metric in COLUMNS
             }
             for name in planners
             if name != BOX and {(name, kind) for kind in TRAFFIC} <= driven.keys()

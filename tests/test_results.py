@@ -3,7 +3,6 @@
 import importlib
 import json
 import types
-from functools import partial
 
 import numpy as np
 import pytest
@@ -90,7 +89,6 @@ def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
     few = {name: name for name in (*benchmark.COMPARED, "collision", "offroad")}
     monkeypatch.setattr(benchmark, "COLUMNS", few)
-    monkeypatch.setattr(benchmark, "crossed_bootstrap", partial(benchmark.crossed_bootstrap, resamples=100))
     for seed in ("seed-0", "seed-1"):
         (tmp_path / "policies" / "bc" / seed).mkdir(parents=True)
     columns = dict.fromkeys((*benchmark.COLUMNS, *benchmark.UNTIL), np.array([[0.0, 1.0, np.nan]]))

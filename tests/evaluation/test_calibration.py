@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drivax.evaluation.crossed import certain, crossed_difference
 from drivax.evaluation.hypotheses import (
     holm,
     mcnemar,
@@ -96,3 +97,24 @@ def test_holm_keeps_the_whole_family_at_its_level():
         return min(holm(ps))
 
     assert 0.02 <= rejected(p) <= 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seeds", "others"), [(3, 1), (3, 3), (2, 2)])
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
+def test_seeds_that_differ_are_no_difference(seeds, others, spread):
+    """Both kinds of policies are drawn from one distribution; one with a single seed is exactly its mean.
+
+    Where seeds hardly differ it rejects less. With two degrees of freedom Satterthwaite's are an approximation.
+    """
+
+    def p(rng, trial):
+        scene = scenes(rng)
+
+        def kind(number):
+            means = spread * rng.normal(size=(number, 1)) * (number > 1)
+            return certain(scene + means + np.stack([noise(rng) for _ in range(number)]))
+
+        return crossed_difference(kind(seeds), kind(others), CLUSTERS).p
+
+    assert 0.005 <= rejected(p) <= (0.08 if others == 1 else 0.06)

@@ -167,26 +167,70 @@ def test_splits_give_each_planner_its_own_scenarios(split):
     assert found.sensitivity.needed == pytest.approx(expected, rel=0.01)
 
 
-def test_seeds_are_averaged_and_resampled():
-    seeds = [table(f"seed-{n}", 0.03 * n, seed=3 + n) for n in range(3)]
-    seeds = [dataclasses.replace(one, folder=Path("runs/bc") / one.name) for one in seeds]
-    found = compare(PLAN, seeds, [table("two")])
-    mean = np.mean([one.metrics["vmax_score"] for one in seeds], axis=0)
-    other = table("two").metrics["vmax_score"]
+def seeds_of(*shifts, folder="runs/bc", first=3, **more):
+    """Evaluations of the seeds of a policy, each better by another shift."""
+    tables = [table(f"seed-{n}", shift, seed=first + n, **more) for n, shift in enumerate(shifts)]
+    return [dataclasses.replace(one, folder=Path(folder) / one.name) for one in tables]
+
+
+def test_seeds_and_scenarios_both_vary():
+    seeds, others = seeds_of(0.0, 0.03, 0.06), [table("two")]
+    found = compare(PLAN, seeds, others)
     assert found.names[0] == "bc" and found.folders[0] == Path("runs/bc")
-    assert found.primary.difference.mean == pytest.approx((mean - other).mean())
-    assert found.primary.difference.n == N
-    alone = paired_bootstrap(mean, other, resamples=400, seed=0)
-    width = found.primary.difference.high - found.primary.difference.low
-    assert width > 1.3 * (alone.high - alone.low), "seeds that differ widen it"
-    # The test alone, which does not know that seeds differ, would be sure.
-    assert found.primary.evidence.p < 0.05 and (found.primary.winner is None) == (
-        found.primary.difference.low <= 0
+    rows = np.stack([one.metrics["vmax_score"] for one in seeds])
+    other = others[0].metrics["vmax_score"]
+    apart = rows.mean(axis=0) - other
+    one = found.primary
+    assert one.difference.mean == pytest.approx(apart.mean()) and one.difference.n == N
+    # By hand: every scenario is its own recording, and the other planner is certain.
+    rest = rows - rows.mean(axis=1, keepdims=True) - rows.mean(axis=0) + rows.mean()
+    agents = rows.mean(axis=1).var(ddof=1) / 3
+    scenarios, both = apart.var(ddof=1) / N, (rest**2).sum() / (N * (N - 1) * 3 * 2)
+    square = max(agents + scenarios - both, agents, scenarios)
+    freedom = square**2 / (agents**2 / 2 + scenarios**2 / (N - 1))
+    half = scipy.stats.t.ppf(0.975, freedom) * np.sqrt(square)
+    assert (one.difference.low, one.difference.high) == pytest.approx(
+        (apart.mean() - half, apart.mean() + half)
     )
+    assert one.evidence.p == pytest.approx(2 * scipy.stats.t.sf(abs(apart.mean()) / np.sqrt(square), freedom))
+    assert (one.winner is None) == (one.difference.low <= 0 <= one.difference.high)
     spread = found.seeds[0]
-    assert spread.means == pytest.approx([one.metrics["vmax_score"].mean() for one in seeds])
+    assert spread.means == pytest.approx(rows.mean(axis=1))
     assert spread.interquartile.low < spread.interquartile.mean < spread.interquartile.high
     assert found.seeds[1] is None and found.secondary[0].a.n == N, "shares of several seeds are no 0 or 1"
+
+
+def test_seeds_that_differ_decide_nothing_however_many_scenarios():
+    """Either seed alone would be sure; and no number of scenarios would do."""
+    others, plan = [table("two")], dataclasses.replace(PLAN, smallest_difference=0.05)
+    seeds = seeds_of(-0.2, 0.3)
+    alone = [compare(plan, [seed], others).decision.recommendation for seed in seeds]
+    assert alone == ["B", "A"]
+    found = compare(plan, seeds, others)
+    assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "seeds")
+    assert found.sensitivity.needed is None and found.sensitivity.power < 0.2
+    assert found.primary.a.low < found.primary.a.mean < found.primary.a.high
+
+
+def test_seeds_that_agree_are_told_apart_or_said_to_be_alike():
+    others = seeds_of(0.0, 0.0, 0.0, folder="runs/other", first=9)
+    assert compare(PLAN, seeds_of(0.3, 0.3, 0.3), others).decision.recommendation == "A"
+    plan = dataclasses.replace(PLAN, smallest_difference=0.5)
+    found = compare(plan, seeds_of(0.0, 0.0, 0.001), others)
+    assert (found.decision.recommendation, found.decision.because) == ("no difference", "power")
+    assert found.sensitivity.needed == N
+
+
+def test_seeds_on_one_recording_tell_nothing():
+    found = compare(PLAN, seeds_of(0.0, 0.1, per_recording=N), [table("two", per_recording=N)])
+    assert found.primary.evidence.p is None and found.primary.winner is None and found.sensitivity is None
+    assert found.primary.difference.low is None and found.primary.difference.mean is not None
+
+
+def test_a_split_takes_no_seeds():
+    plan = dataclasses.replace(PLAN, split="random")
+    with pytest.raises(UsageError, match="one evaluation"):
+        compare(plan, seeds_of(0.0, 0.1), [table("two")])
 
 
 def test_everything_is_plain_json():

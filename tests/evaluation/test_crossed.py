@@ -8,7 +8,14 @@ import pytest
 from scipy import stats
 
 from drivax.errors import UsageError
-from drivax.evaluation.crossed import Crossed, crossed_difference, crossed_mean, log_ratio
+from drivax.evaluation.crossed import (
+    Crossed,
+    agents_interval,
+    crossed_difference,
+    crossed_mean,
+    log_ratio,
+)
+from drivax.evaluation.statistics import Interval, wilson
 
 
 def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, both=0.0, shift=0.0):
@@ -198,3 +205,27 @@ def test_undefined_scenarios_are_left_out_and_too_little_is_refused():
         crossed_difference(a, b, ["one"] * 3)
     with pytest.raises(UsageError, match="different scenarios"):
         crossed_difference(a, b[:, :2])
+
+
+def test_intervals_of_agents():
+    rng = np.random.default_rng(0)
+    values, clusters = (rng.random((3, 60)) < 0.3).astype(np.float64), np.arange(60) // 2
+    values[0, 5] = np.nan
+    found, wanted = agents_interval(values, clusters), crossed_mean(values, clusters)
+    assert (found.mean, found.low, found.high) == pytest.approx((wanted.difference, *wanted.interval()))
+    assert found.n == 59
+    # A rate lies within 0 and 1, and is never certain.
+    few = np.zeros((2, 20))
+    few[0, 0] = 1.0
+    assert agents_interval(few).low < 0.0 == agents_interval(few, rate=True).low
+    never = agents_interval(np.zeros((3, 60)), clusters, rate=True)
+    assert never == replace(wilson(0, 30), n=60)
+    assert agents_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)
+    assert agents_interval(np.full((2, 3), np.nan)).mean is None
+
+
+def test_power_is_that_of_what_is_detectable():
+    rng = np.random.default_rng(1)
+    found = crossed_difference(rng.normal(size=(3, 80)) + rng.normal(size=(3, 1)), rng.normal(size=(3, 80)))
+    assert found.power(found.detectable(0.8)) == pytest.approx(0.8)
+    assert found.power(0.0) < 0.05 and Crossed(0.1, (0.0, 0.0), 0.0, (2, 2), 9).power(0.1) == 1.0

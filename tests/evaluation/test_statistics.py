@@ -11,7 +11,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.statistics import (
     Interval,
     bootstrap_mean,
-    crossed_bootstrap,
+    interquartile_bootstrap,
     interquartile_mean,
     paired_bootstrap,
     rate,
@@ -187,31 +187,17 @@ def test_the_impossible_is_refused_in_one_line(call):
     assert "\n" not in str(caught.value) and caught.value.cure
 
 
-def test_crossed_bootstrap_draws_agents_and_clusters():
-    values = np.array([[0.0, 1.0, 4.0, 2.0], [3.0, 1.0, np.nan, 7.0]])
-    clusters = ["a", "a", "b", "c"]
-    columns = [[0, 1], [2], [3]]
-    means = []
-    for agents in itertools.product(range(2), repeat=2):
-        for drawn in itertools.product(range(3), repeat=3):
-            seen = [values[agent, at] for agent in agents for cluster in drawn for at in columns[cluster]]
-            means.append(np.nanmean(seen) if not np.isnan(seen).all() else np.nan)
-    found = crossed_bootstrap(values, clusters, resamples=20_000, seed=1)
-    assert found.mean == pytest.approx(18 / 7) and found.n == 7
-    low, high = np.nanquantile(means, [0.025, 0.975])
-    assert (found.low, found.high) == pytest.approx((low, high), abs=0.15)
-
-
-def test_crossed_bootstrap_of_agents_that_agree_is_that_of_their_episodes():
+def test_an_interquartile_bootstrap_of_agents_that_agree_is_that_of_their_episodes():
     row = np.random.default_rng(0).normal(size=60)
-    one, alone = crossed_bootstrap([row, row, row], seed=0), bootstrap_mean(row, seed=0)
+    one, alone = interquartile_bootstrap([row, row, row], seed=0), bootstrap_mean(row, seed=0)
     assert one.mean == pytest.approx(alone.mean)
     assert (one.low, one.high) == pytest.approx((alone.low, alone.high), abs=0.02)
     # Agents that differ widen it, and nothing defined is nothing.
-    assert crossed_bootstrap([row - 1, row, row + 1], seed=0).low < one.low - 0.3
-    assert crossed_bootstrap([[None, None]], seed=0) == Interval(None, None, None, 0)
+    assert interquartile_bootstrap([row - 1, row, row + 1], seed=0).low < one.low - 0.2
+    assert interquartile_bootstrap([[None, None]], seed=0) == Interval(None, None, None, 0)
+    assert interquartile_bootstrap([[1.0, 2.0]], ["a", "a"], seed=0) == Interval(1.5, None, None, 2)
     with pytest.raises(UsageError, match="different episodes"):
-        crossed_bootstrap([[1.0, 2.0], [1.0]], seed=0)
+        interquartile_bootstrap([[1.0, 2.0], [1.0]], seed=0)
 
 
 def test_stratified_bootstrap_is_the_exact_distribution():
@@ -282,9 +268,9 @@ def test_interquartile_mean_by_hand():
     assert interquartile_mean([7.0]) == pytest.approx(7.0) and interquartile_mean([None]) is None
 
 
-def test_crossed_bootstrap_of_interquartile_means_is_the_exact_distribution():
+def test_an_interquartile_bootstrap_is_the_exact_distribution():
     values = np.array([[0.0, 2.0], [1.0, 5.0], [8.0, 9.0]])
-    found = crossed_bootstrap(values, confidence=0.8, resamples=20_000, across="interquartile_mean", seed=0)
+    found = interquartile_bootstrap(values, confidence=0.8, resamples=20_000, seed=0)
     assert found.mean == pytest.approx(interquartile_mean(values.mean(axis=1))) and found.n == 6
     means = [
         interquartile_mean([values[a, list(drawn)].mean() for a in agents])
@@ -292,22 +278,3 @@ def test_crossed_bootstrap_of_interquartile_means_is_the_exact_distribution():
     ]  # fmt: skip
     assert found.low == pytest.approx(np.quantile(means, 0.1), abs=0.06)
     assert found.high == pytest.approx(np.quantile(means, 0.9), abs=0.06)
-
-
-@pytest.mark.slow
-def test_crossed_bootstrap_against_others_draws_their_agents_too():
-    values, others = np.array([[0.0, 2.0], [3.0, 5.0]]), np.array([[1.0, 1.0], [0.0, 4.0], [2.0, 6.0]])
-    differences = [
-        values[list(a)][:, list(drawn)].mean() - others[list(b)][:, list(drawn)].mean()
-        for a in itertools.product(range(2), repeat=2) for b in itertools.product(range(3), repeat=3)
-        for drawn in itertools.product(range(2), repeat=2)
-    ]  # fmt: skip
-    found = crossed_bootstrap(values, against=others, confidence=0.8, resamples=20_000, seed=0)
-    assert found.mean == pytest.approx(2.5 - 14 / 6) and found.n == 4
-    assert found.low == pytest.approx(np.quantile(differences, 0.1), abs=0.1)
-    assert found.high == pytest.approx(np.quantile(differences, 0.9), abs=0.1)
-    # One agent on each side: a paired bootstrap.
-    rng = np.random.default_rng(0)
-    a, b = rng.normal(1, 1, 80), rng.normal(0, 1, 80)
-    one, pairs = crossed_bootstrap([a], against=[b], seed=0), paired_bootstrap(a, b, seed=0)
-    assert (one.mean, one.low, one.high) == pytest.approx((pairs.mean, pairs.low, pairs.high), abs=0.02)

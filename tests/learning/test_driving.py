@@ -11,6 +11,12 @@ from drivax.errors import UsageError
 from drivax.learning.collector import collect
 from drivax.learning.driving import Driving, _draw
 from drivax.learning.environment import Environment
+from drivax.learning.imitation import BcConfig
+from drivax.learning.ppo import PpoConfig
+from drivax.learning.replay import ReplayConfig
+from drivax.learning.sac import SacConfig
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.encoders import MlpConfig
 from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
@@ -61,6 +67,40 @@ def test_it_is_an_environment(bank, driving):
     for step in (9, 89):
         with pytest.raises(UsageError, match=r"use 10 \(earliest_start\) to 88"):
             Driving(driving.simulator, step)
+
+
+NETWORK = NetworkConfig(encoder=MlpConfig(rows=(8,), hidden=(8,)), distribution="grid")
+ON_LEVELS = [
+    PpoConfig(environments=4, unroll=4, epochs=1, minibatches=1, network=NETWORK),
+    BcConfig(batch=8, updates=2, loss="likelihood", network=NETWORK),
+    SacConfig(
+        environments=4, unroll=4, batch=8, replay=ReplayConfig(64), warm_up=16,
+        network=replace(NETWORK, distribution="gaussian"),
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("config", ON_LEVELS, ids=lambda config: config.kind)
+def test_discrete_actions_are_learned_by(config, bank):
+    """Levels are asked for while the network is traced."""
+    task = Task(actions=Discrete(accelerations=3, curvatures=5), observation=OBSERVATION, metrics="none")
+    environment = Driving(Simulator(task), LATEST)
+    learner = config.build(environment, bank, 2)
+    iterate = jax.eval_shape(learner.iterate, bank, jax.eval_shape(learner.init, bank, jax.random.key(0)))
+    assert iterate[0].iteration.shape == ()
+
+
+@pytest.mark.slow
+def test_a_policy_on_levels_takes_levels(bank):
+    task = Task(actions=Discrete(accelerations=3, curvatures=5), observation=OBSERVATION, metrics="none")
+    environment = Driving(Simulator(task), LATEST)
+    learner = ON_LEVELS[0].build(environment, bank, 2)
+    state, logs = jax.jit(learner.iterate)(bank, learner.init(bank, jax.random.key(0)))
+    assert all(np.isfinite(value).all() for value in jax.tree.leaves(logs))
+    policy, _ = learner.network(state.parameters).both(environment.start(bank, jax.random.key(1), 6).observation)
+    taken = policy.action(policy.sample(jax.random.key(2)))
+    accelerations, curvatures = environment.levels
+    assert np.isin(taken[:, 0], accelerations).all() and np.isin(taken[:, 1], np.float32(curvatures)).all()
 
 
 def test_the_row_behind_an_end_holds_the_final_state(experience):

@@ -195,7 +195,7 @@ def test_the_forecast_keeps_those_who_come_near():
     valid = np.arange(count) != 3
     frame = Frame(
         jnp.asarray(box, jnp.float32), jnp.asarray(velocity, jnp.float32), jnp.zeros(count), jnp.asarray(valid),
-        jnp.ones(count, jnp.int32),
+        jnp.ones(count, jnp.int32), jnp.zeros(0, jnp.int32),
     )  # fmt: skip
     way = jnp.stack([jnp.arange(0, 100, 5.0), jnp.zeros(20)], 1)
 

@@ -34,6 +34,7 @@ def frame(rows, velocities, kinds=None):
         z=jnp.zeros(n),
         valid=jnp.ones(n, bool),
         kind=jnp.array(kinds or [1] * n, jnp.int32),
+        lights=jnp.zeros(0, jnp.int32),
     )
 
 

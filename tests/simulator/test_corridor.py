@@ -54,7 +54,8 @@ def paths():
 @jax.jit
 def _gap(arc, speed, box, valid):
     """The gap that a car at an arc length finds; its own box is the first of the frame."""
-    frame = Frame(box, jnp.zeros((SLOTS, 2)), jnp.zeros(SLOTS), valid, jnp.ones(SLOTS, jnp.int32))
+    kind, lights = jnp.ones(SLOTS, jnp.int32), jnp.zeros(0, jnp.int32)
+    frame = Frame(box, jnp.zeros((SLOTS, 2)), jnp.zeros(SLOTS), valid, kind, lights)
     me = Movers(box[:1], jnp.zeros(1), arc[None], speed[None], jnp.zeros(1, jnp.int32), jnp.full((1, 2), -1))
     return leaders(paths(), jnp.int32(0), me, frame).gap[0]
 

@@ -46,6 +46,7 @@ def frame_of_boxes(rows, z=0.0):
         z=jnp.zeros(count).at[1:].set(z),
         valid=jnp.ones(count, bool),
         kind=jnp.ones(count, jnp.int32),
+        lights=jnp.zeros(0, jnp.int32),
     )
 
 

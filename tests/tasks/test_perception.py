@@ -9,8 +9,9 @@ import pytest
 
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
+from drivax.tasks.example_features import car_following, stop_line
 from drivax.tasks.features import Features
-from drivax.tasks.observations import ObservationConfig, observe
+from drivax.tasks.observations import ObservationConfig, OwnGroup, observe
 from drivax.tasks.perception import Perception, in_view, lights_seen
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road
@@ -202,6 +203,25 @@ def test_range_and_dropout_by_distance(bank, seen):
     found = seen["all"]["agents_mask"][..., -1].sum(axis=1)
     assert abs(found.sum() - expected.sum()) < 4 * np.sqrt((expected * (1 - expected)).sum())
     assert len(np.unique(found)) > 2
+
+
+def test_lights_that_are_not_seen_are_hidden_from_groups_of_ones_own():
+    """A red light 40 m ahead, and nobody else; out of range neither example that reads lights knows of it."""
+    bank = bank_of(straight_road([car(0, 0, 0, 4)], light=RED))
+    own = (OwnGroup(stop_line), OwnGroup(car_following))
+    near, far = (
+        Simulator(Task(observation=replace(SMALL, own=own, perception=Perception(range_m=range_m))))
+        for range_m in (5.0, 90.0)
+    )
+
+    def look(bank):
+        return [one.observe(bank, one.scene(bank, 0, FIRST)) for one in (near, far)]
+
+    blind, sighted = jax.device_get(jax.jit(look)(bank))
+    assert sighted["lights_mask"].any() and sighted["stop_line"][1:].tolist() == [1.0, 1.0]
+    assert sighted["car_following"][3] == 1.0 and sighted["car_following"][0] < 1.0
+    assert not blind["lights_mask"].any() and blind["stop_line"].tolist() == [1.0, 0.0, 0.0]
+    assert blind["car_following"][3] == 0.0 and blind["car_following"][5] > sighted["car_following"][5]
 
 
 @pytest.mark.slow

@@ -54,8 +54,9 @@ def around(near=True):
         jnp.asarray(near), jnp.zeros(4, bool), no, no, no, no, zero, jnp.zeros((), jnp.int32), zero, zero
     )
     frame = Frame(
-        jnp.zeros((2, 6)), jnp.zeros((2, 2)), jnp.zeros(2), jnp.zeros(2, bool), jnp.zeros(2, jnp.int32)
-    )
+        jnp.zeros((2, 6)), jnp.zeros((2, 2)), jnp.zeros(2), jnp.zeros(2, bool), jnp.zeros(2, jnp.int32),
+        jnp.zeros(0, jnp.int32),
+    )  # fmt: skip
     return Surroundings(frame, hits, RouteHit(zero, zero, zero, jnp.zeros(2)))
 
 

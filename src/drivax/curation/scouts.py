@@ -2,7 +2,8 @@
 
 Each scout leaves one fold of the recordings out; all are trained side by side in one program, and differ in their first
 parameters, too. They look at the same steps, drawn and observed once for all; each leaves those of its own fold out of
-its loss, so that what it learns from is drawn as it would be for it alone. Deep ensembles: Lakshminarayanan et al. 2017, arXiv 1612.01474.
+its loss, so that what it learns from is drawn as it would be for it alone. Deep ensembles: Lakshminarayanan et al.
+2017, arXiv 1612.01474.
 """
 
 from __future__ import annotations
@@ -53,9 +54,9 @@ class ScoutsConfig:
 
     Attributes:
         folds: How many scouts; each leaves out every so manieth recording, chosen by lot.
-        cloning: How each is trained; of every ``batch`` each scout leaves out the steps of its own fold. With ``loss: mse`` scouts disagree by the variance of what they would do; with
-            ``likelihood`` by how much their distributions differ, so that ``network.distribution: mixture`` can
-            disagree about modes.
+        cloning: How each is trained; of every ``batch`` each scout leaves out the steps of its own fold. With ``loss:
+            mse`` scouts disagree by the variance of what they would do; with ``likelihood`` by how much their
+            distributions differ, so that ``network.distribution: mixture`` can disagree about modes.
         total_steps: Recorded steps that are drawn for all of them, rounded up to whole iterations of ``cloning``.
         weighted: ``plain``: all steps alike; ``rarity``: drawn by inverse density of the expert's action, clipped
             (:class:`~drivax.curation.rarity.KernelRarity` with its exponent at 1).

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float64
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import defined, design_effect
+from drivax.evaluation.crossed import Crossed, agents_interval, difference_interval
 from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, judged
 from drivax.evaluation.effects import (
     ROUNDING,
@@ -42,8 +43,7 @@ from drivax.evaluation.results import RATES, interval_of
 from drivax.evaluation.split import Split, assign, strata_of
 from drivax.evaluation.statistics import (
     Interval,
-    bootstrap_mean,
-    crossed_bootstrap,
+    interquartile_bootstrap,
     paired_bootstrap,
     split_bootstrap,
 )
@@ -117,11 +117,8 @@ class _Side:
         return np.stack([self.pairs.values(table, metric) for table in self.tables])
 
     def values(self, metric: str) -> Values:
-        """Mean over the seeds where it is defined; NaN elsewhere and outside of the arm."""
-        x = self.by_seed(metric)
-        there = ~np.isnan(x) & self.arm
-        sums = np.where(there, x, 0.0).sum(axis=0)
-        return np.divide(sums, there.sum(axis=0), out=np.full(sums.shape, np.nan), where=there.any(axis=0))
+        """Mean over the seeds; NaN where one of them leaves it undefined, and outside of the arm."""
+        return np.where(self.arm, self.by_seed(metric).mean(axis=0), np.nan)
 
     @property
     def folder(self) -> Path:
@@ -159,6 +156,8 @@ def compare(
     pairs = Pairs.of(*a, *b)
     if not pairs.keys:
         raise UsageError("A and B have no scenario in common", cure="evaluate both on the same scenarios")
+    if plan.split != "paired" and max(len(a), len(b)) > 1:
+        raise UsageError("a split takes one evaluation of A and of B", cure="compare seeds in pairs")
     split = None if plan.split == "paired" else _split(plan, pairs, entries)
     everyone = np.ones(len(pairs.keys), bool)
     arms = (everyone, everyone) if split is None else (split.first, ~split.first)
@@ -214,26 +213,23 @@ def _compared(
     x, y = (side.values(metric) for side in sides)
     undefined = [int((np.isnan(v) & side.arm).sum()) for v, side in zip((x, y), sides, strict=True)]
     draws = {"confidence": plan.confidence, "resamples": plan.resamples, "seed": plan.seed}
-    if split is None:
-        both = ~np.isnan(x) & ~np.isnan(y)
-        x, y = np.where(both, x, np.nan), np.where(both, y, np.nan)
-        if seeds == 1:
-            difference = paired_bootstrap(x, y, clusters, **draws)
-        else:
-            mine, theirs = (np.where(both, side.by_seed(metric), np.nan) for side in sides)
-            difference = crossed_bootstrap(mine, clusters, against=theirs, **draws)
-            if both.any():
-                difference = replace(difference, mean=float((x - y)[both].mean()), n=int(both.sum()))
-        effects = asdict(cohens_d_paired(x, y))
-        evidence = _paired_test(plan, metric, x, y, clusters)
-    else:
+    both = ~np.isnan(x) & ~np.isnan(y) if split is None else np.ones(x.size, bool)
+    x, y = np.where(both, x, np.nan), np.where(both, y, np.nan)
+    if split is not None:
         values = np.where(split.first, x, y)
         difference = split_bootstrap(values, split.first, clusters, strata=split.strata, **draws)
-        effects = {"d": cohens_d(x, y)}
         evidence = split_permutation(
             values, split.first, clusters, split.strata, plan.resamples, seed=plan.seed
         )
-    a, b = (_interval(plan, metric, one, clusters) for one in (x, y))
+    elif seeds == 1:
+        difference = paired_bootstrap(x, y, clusters, **draws)
+        evidence = _paired_test(plan, metric, x, y, clusters)
+    else:
+        difference, crossed = _of_seeds(plan, metric, sides)
+        p, units = (None, 0) if crossed is None else (crossed.p, crossed.clusters)
+        evidence = Evidence("t", p, units, exact=False)
+    effects = asdict(cohens_d_paired(x, y)) if split is None else {"d": cohens_d(x, y)}
+    a, b = (_interval(plan, metric, side, both) for side in sides)
     found = sides[0].tables[0].metric(metric)
     unit, better = ("", "-") if found is None else (found.unit, found.better)
     return MetricComparison(
@@ -241,10 +237,22 @@ def _compared(
     )
 
 
-def _interval(plan: ComparisonPlan, metric: str, x: Values, clusters: Sequence[str]) -> Interval:
-    if metric in RATES and not _is_binary(x):  # shares of several seeds
-        return bootstrap_mean(x, clusters, plan.confidence, plan.resamples, seed=plan.seed)
-    return interval_of(metric, x, clusters, plan.confidence, plan.seed)
+def _of_seeds(
+    plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side]
+) -> tuple[Interval, Crossed | None]:
+    """A difference that other seeds and other recordings would show again."""
+    x, y = (side.by_seed(metric) for side in sides)
+    return difference_interval(x, y, sides[0].pairs.clusters, plan.confidence)
+
+
+def _interval(plan: ComparisonPlan, metric: str, side: _Side, counts: Bool[np.ndarray, " n"]) -> Interval:
+    """Of one planner, over the scenarios that count."""
+    clusters = side.pairs.clusters
+    if len(side.tables) == 1:
+        x = np.where(counts, side.values(metric), np.nan)
+        return interval_of(metric, x, clusters, plan.confidence, plan.seed)
+    x = np.where(counts, side.by_seed(metric), np.nan)
+    return agents_interval(x, clusters, confidence=plan.confidence, rate=metric in RATES)
 
 
 def _is_binary(x: Values) -> bool:
@@ -279,6 +287,10 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
         return None
     smallest = plan.smallest_difference or SMALL_EFFECT * deviation
     effect, inflation = smallest / deviation, design_effect(apart, labels)
+    if max(len(side.tables) for side in sides) > 1:
+        return _sensitivity_of_seeds(
+            plan, _of_seeds(plan, plan.primary, sides)[1], apart.size, deviation, inflation
+        )
     n = apart.size / inflation
     seen = detectable(n, plan.power, plan.confidence, share)
     return Sensitivity(
@@ -291,17 +303,27 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
     )
 
 
+def _sensitivity_of_seeds(
+    plan: ComparisonPlan, found: Crossed | None, n: int, deviation: float, inflation: float
+) -> Sensitivity | None:
+    """The same where seeds vary too, which more scenarios do not change."""
+    if found is None:
+        return None
+    smallest = plan.smallest_difference or SMALL_EFFECT * deviation
+    chance, needed = found.power(smallest, plan.confidence), n
+    if chance < plan.power:
+        clusters = replace(found, difference=smallest).clusters_needed(plan.power, plan.confidence)
+        needed = None if clusters is None else math.ceil(clusters * n / found.clusters)
+    return Sensitivity(
+        deviation, inflation, smallest, chance, found.detectable(plan.power, plan.confidence), needed
+    )
+
+
 def _spread(plan: ComparisonPlan, side: _Side) -> SeedSpread | None:
     if len(side.tables) == 1:
         return None
     x = np.where(side.arm, side.by_seed(plan.primary), np.nan)
-    middle = crossed_bootstrap(
-        x,
-        side.pairs.clusters,
-        plan.confidence,
-        plan.resamples,
-        across="interquartile_mean",
-        seed=plan.seed,
-    )
+    clusters = side.pairs.clusters
+    middle = interquartile_bootstrap(x, clusters, plan.confidence, plan.resamples, seed=plan.seed)
     means = [row[~np.isnan(row)] for row in x]
     return SeedSpread(tuple(float(row.mean()) if row.size else None for row in means), middle)

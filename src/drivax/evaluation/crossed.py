@@ -16,6 +16,7 @@ from scipy import special
 
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import dense
+from drivax.evaluation.statistics import Interval, wilson
 
 #: Values of the agents of one kind, one column per scenario.
 Values = Float64[np.ndarray, "agent scenario"]
@@ -87,6 +88,13 @@ class Crossed:
             _quantile(self.freedom, (1.0 + confidence) / 2.0) + _quantile(self.freedom, power)
         )
 
+    def power(self, difference: float, confidence: float = _CONFIDENCE) -> float:
+        """Probability to find a difference of this size with so many seeds and scenarios."""
+        if self.error == 0.0:
+            return float(difference != 0.0)
+        reach = abs(difference) / self.error - _quantile(self.freedom, (1.0 + confidence) / 2.0)
+        return float(special.stdtr(_finite(self.freedom), reach))
+
     def seeds_needed(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> int | None:
         """Seeds of each kind, more than now, with which this difference would be found; None: no number of them."""
         return self._least(self._with_seeds, max(self.agents), power, confidence)
@@ -147,8 +155,46 @@ def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None =
     Raises:
         UsageError: There are fewer than two clusters of scenarios that all define.
     """
-    twice = values if len(values) > 1 else np.repeat(values, 2, axis=0)
-    return crossed_difference(twice, np.zeros((2, values.shape[1])), clusters, weights)
+    return crossed_difference(certain(values), np.zeros((2, values.shape[1])), clusters, weights)
+
+
+def certain(values: Values) -> Others:
+    """Agents whose number says how they vary; one alone stands for itself, as a planner does that learned nothing."""
+    return values if len(values) > 1 else np.repeat(values, 2, axis=0)
+
+
+def agents_interval(
+    values: Values,
+    clusters: Any = None,
+    weights: Weights | None = None,
+    confidence: float = _CONFIDENCE,
+    *,
+    rate: bool = False,
+) -> Interval:
+    """The mean of one kind of agents with the interval of :func:`crossed_mean`.
+
+    Args:
+        values: As there, like the next two.
+        clusters: The same.
+        weights: The same.
+        confidence: Coverage.
+        rate: The interval lies within 0 and 1; where all is 0, or all is 1, it is Wilson's of as many clusters.
+
+    Returns:
+        ``n`` counts scenarios that all agents define; no bounds with fewer than two clusters of them.
+    """
+    _, keep = _counted(values, values, weights)
+    number = int(keep.sum())
+    labels = dense(clusters, values.shape[1], "cluster")
+    if np.unique(labels[keep]).size < 2:
+        return Interval(float(values[:, keep].mean()) if number else None, None, None, number)
+    found = crossed_mean(values, labels, weights)
+    low, high = found.interval(confidence)
+    if rate and found.error == 0.0 and found.difference in (0.0, 1.0):
+        return replace(wilson(found.difference * found.clusters, found.clusters, confidence), n=number)
+    if rate:
+        low, high = max(low, 0.0), min(high, 1.0)
+    return Interval(found.difference, low, high, number)
 
 
 def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed:
@@ -188,6 +234,25 @@ def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weig
         totals = np.stack([np.bincount(labels, row, number) for row in rest])
         both.append(more * float(np.square(totals).sum()) / (count * (count - 1)))
     return Crossed(mean, (seeds[0], seeds[1]), scenarios, (len(a), len(b)), number, both=(both[0], both[1]))
+
+
+def difference_interval(
+    a: Values, b: Others, clusters: Any = None, confidence: float = _CONFIDENCE
+) -> tuple[Interval, Crossed | None]:
+    """The difference of two kinds of agents, either of which may be one agent alone (:func:`certain`).
+
+    Returns:
+        The interval, ``n`` counting scenarios that all define, and what it is from; fewer than two clusters of them
+        have no bounds and nothing behind them.
+    """
+    _, keep = _counted(a, b, None)
+    number = int(keep.sum())
+    labels = dense(clusters, a.shape[1], "cluster")
+    if np.unique(labels[keep]).size < 2:
+        mean = float(a[:, keep].mean() - b[:, keep].mean()) if number else None
+        return Interval(mean, None, None, number), None
+    found = crossed_difference(certain(a), certain(b), labels)
+    return Interval(found.difference, *found.interval(confidence), number), found
 
 
 def log_ratio(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed | None:

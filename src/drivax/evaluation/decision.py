@@ -23,7 +23,8 @@ class Sensitivity:
         smallest: The smallest difference that matters.
         power: Probability to find it with these scenarios.
         detectable: The difference that is found with the plan's power.
-        needed: Scenarios that it takes to find the smallest difference with the plan's power.
+        needed: Scenarios that it takes to find the smallest difference with the plan's power; None where seeds differ
+            so much that no number of them would do.
     """
 
     deviation: float
@@ -31,7 +32,7 @@ class Sensitivity:
     smallest: float
     power: float
     detectable: float | None
-    needed: int
+    needed: int | None
 
 
 @dataclass(frozen=True)
@@ -85,25 +86,12 @@ class Decision:
 
 
 def judged(plan: ComparisonPlan, one: MetricComparison, p: float | None) -> MetricComparison:
-    """With its adjusted p-value, and the winner where that is small enough.
-
-    With several seeds the interval resamples them and the test does not; so the interval has to leave out zero too.
-    """
+    """With its adjusted p-value, and the winner where that is small enough."""
     judged = replace(one, p_adjusted=p)
     mean = one.difference.mean
-    if one.better == "-" or not mean or not _rejects(plan, p) or _seeds_differ(one):
+    if one.better == "-" or not mean or p is None or p >= 1 - plan.confidence:
         return judged
     return replace(judged, winner="A" if (mean > 0) == (one.better == "high") else "B")
-
-
-def _rejects(plan: ComparisonPlan, p: float | None) -> bool:
-    return p is not None and p < 1 - plan.confidence
-
-
-def _seeds_differ(one: MetricComparison) -> bool:
-    """Whether there are several seeds and the interval of the difference holds zero."""
-    low, high = one.difference.low, one.difference.high
-    return one.seeds > 1 and low is not None and high is not None and low <= 0 <= high
 
 
 def decide(
@@ -116,20 +104,20 @@ def decide(
 
     With fewer scenarios than the plan's minimum nothing is decided. A test that rejects gives the better planner. One
     that does not means "no difference" only if the smallest difference that matters would have been found with the
-    plan's power; otherwise there are not enough scenarios. Where seeds differ so much that the interval holds zero,
-    a test that rejects decides nothing either.
+    plan's power; otherwise there are not enough scenarios, or seeds, where these differ so much that no number of
+    scenarios would do.
     """
     n = primary.difference.n
-    needed = max(plan.minimum_scenarios, 0 if sensitivity is None else sensitivity.needed)
+    needed = max(plan.minimum_scenarios, 0 if sensitivity is None else sensitivity.needed or 0)
     if n < plan.minimum_scenarios:
         return Decision("not enough scenarios", "minimum", needed, ())
     if primary.winner is not None:
         worse = tuple(one.metric for one in secondary if one.winner not in (None, primary.winner))
         return Decision(primary.winner, "test", None, worse)
-    if _rejects(plan, primary.p_adjusted) and _seeds_differ(primary):
-        return Decision("not enough scenarios", "seeds", None, ())
     if sensitivity is None and primary.difference.mean == 0:
         return Decision("no difference", "alike", None, ())
     if sensitivity is not None and sensitivity.power >= plan.power:
         return Decision("no difference", "power", None, ())
+    if sensitivity is not None and sensitivity.needed is None:
+        return Decision("not enough scenarios", "seeds", None, ())
     return Decision("not enough scenarios", "power", max(needed, n + 1), ())

@@ -8,9 +8,8 @@ given. Seeds are explicit; results are repeatable. Tests are in ``hypotheses``, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -227,59 +226,49 @@ def paired_bootstrap(
     return bootstrap_mean(differences(a, b), clusters, confidence, resamples, seed=seed)
 
 
-def crossed_bootstrap(
+def interquartile_bootstrap(
     values: Any,
     clusters: Any = None,
     confidence: float = 0.95,
     resamples: int = RESAMPLES,
     *,
-    against: Any = None,
-    across: Literal["mean", "interquartile_mean"] = "mean",
     seed: int,
 ) -> Interval:
-    """Percentile bootstrap interval of a mean over agents (training seeds) and episodes, both resampled.
+    """Percentile bootstrap interval of the interquartile mean over agents (training seeds) of their mean episode.
 
     Agents and clusters are crossed: every agent drove every scenario. Each resample draws as many of both as there are,
-    independently and with replacement, which for crossed factors is at worst too wide (Owen, Ann. Appl. Stat. 1, 2007,
-    "The pigeonhole bootstrap").
+    independently and with replacement (Owen, Ann. Appl. Stat. 1, 2007, "The pigeonhole bootstrap"). Of a few agents it
+    is too narrow, as bootstraps of few things are; means have :func:`~drivax.evaluation.crossed.agents_interval`.
 
     Args:
         values: ``[agents, episodes]``; numbers or undefined.
         clusters: Labels of the clusters, one per episode; None: every episode is its own.
         confidence: Coverage, between 0 and 1.
         resamples: Number of resamples.
-        against: Values of other agents in the same episodes, whose mean is subtracted; drawn by themselves.
-        across: The mean of everything, or the :func:`interquartile_mean` of the agents' means.
         seed: Seed of the random numbers.
 
     Returns:
-        ``n`` counts the values of the first agents.
+        ``n`` counts the values of the agents.
 
     Raises:
         UsageError: If lengths disagree, a value is infinite, or an option is impossible.
     """
     check_draws(confidence, resamples)
-    sides = [[numbers(row) for row in side] for side in (values, against) if side is not None]
-    labels = dense(clusters, sides[0][0].size, "cluster")
-    if any(row.size != labels.size for side in sides for row in side):
+    rows = [numbers(row) for row in values]
+    labels = dense(clusters, rows[0].size, "cluster")
+    if any(row.size != labels.size for row in rows):
         raise UsageError("agents drove different episodes", cure="give one value per agent and episode")
-    arms = [_agent_totals(np.stack(side), labels) for side in sides]
-    n, count = int(arms[0][1].sum()), arms[0][0].shape[1]
-    if not all(counts.any() for _, counts in arms):
+    sums, counts = _agent_totals(np.stack(rows), labels)
+    n, (agents, number) = int(counts.sum()), sums.shape
+    if not n:
         return NOTHING
-    statistic, rng = _pooled if across == "mean" else _interquartile, np.random.default_rng(seed)
-
-    def resampled(drawn: np.ndarray[Any, Any], agents: Sequence[np.ndarray[Any, Any]]) -> float:
-        parts = [statistic(some, s @ drawn, c @ drawn) for some, (s, c) in zip(agents, arms, strict=True)]
-        return parts[0] - sum(parts[1:])
-
-    mean = resampled(np.ones(count, int), [np.ones(len(sums), int) for sums, _ in arms])
-    if count < 2:
+    mean = _interquartile(np.ones(agents, int), sums.sum(axis=1), counts.sum(axis=1))
+    if number < 2:
         return Interval(mean, None, None, n)
-    means = np.empty(resamples)
-    for number in range(resamples):
-        agents = [_times_drawn(len(sums), rng) for sums, _ in arms]
-        means[number] = resampled(_times_drawn(count, rng), agents)
+    rng, means = np.random.default_rng(seed), np.empty(resamples)
+    for at in range(resamples):
+        drawn, of = _times_drawn(number, rng), _times_drawn(agents, rng)
+        means[at] = _interquartile(of, sums @ drawn, counts @ drawn)
     return Interval(mean, *_percentiles(means, confidence), n)
 
 
@@ -312,12 +301,6 @@ def interquartile_mean(values: Any) -> float | None:
         return None
     edges = np.clip(np.arange(x.size + 1) / x.size, 0.25, 0.75)
     return float(2.0 * np.diff(edges) @ x)
-
-
-def _pooled(agents: Labels, sums: Totals, counts: Totals) -> float:
-    """Mean of all episodes of the agents that were drawn; NaN of nothing, which a resample of sparse values may be."""
-    count = float(agents @ counts)
-    return float(agents @ sums) / count if count else float("nan")
 
 
 def _interquartile(agents: Labels, sums: Totals, counts: Totals) -> float:

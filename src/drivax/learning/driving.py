@@ -78,7 +78,9 @@ class Driving:
         actions = self.task.actions
         if not isinstance(actions, Discrete):
             return None
-        return tuple(tuple(float(level) for level in levels) for levels in actions.levels())
+        # Asked for while networks are traced, too; levels are numbers all the same.
+        with jax.ensure_compile_time_eval():
+            return tuple(tuple(float(level) for level in levels) for levels in actions.levels())
 
     def shapes(self, data: ScenarioBank) -> dict[str, tuple[int, ...]]:
         """Shapes of one observation by group."""

@@ -119,7 +119,9 @@ def fault_times(
 
     def at_fault(both: Array, kind: Array, speed: Array, other: Array, several: Array) -> Array:
         two = jnp.zeros(2)
-        frame = Frame(both, jnp.zeros((2, 2)), two, two == 0.0, jnp.stack([kind, kind]))
+        frame = Frame(
+            both, jnp.zeros((2, 2)), two, two == 0.0, jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
+        )
         fresh = jnp.arange(2) == 1
         return judge_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
 

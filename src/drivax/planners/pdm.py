@@ -182,7 +182,7 @@ class PdmPlanner:
         lines, others = jax.lax.optimization_barrier((lines, others))
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
         wanted = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
-        stop_m = stop_line_m(bank, scene, me[LENGTH])
+        stop_m = stop_line_m(bank, scene, frame)
         driver = (config.driver, config.steps, config.leader_every)
         proposals = unrolled(lines, others, size, speed, wanted, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))

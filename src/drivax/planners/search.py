@@ -95,7 +95,7 @@ class SearchPlanner:
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
         wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
-        stop = stop_line_m(bank, scene, me[4])
+        stop = stop_line_m(bank, scene, frame)
         trend = carry.updated(frame)
         others = Others.near(bank, scene, frame, trend, (path, there, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)

@@ -59,6 +59,8 @@ def how_tested(one: MetricComparison) -> str:
     """The test behind a p-value."""
     if one.evidence.name.startswith("McNemar"):
         return f"{one.evidence.name}, {one.evidence.units:,} discordant pairs"
+    if one.seeds > 1:
+        return f"{one.evidence.name} test over seeds and {one.evidence.units:,} recordings"
     extent = "every sign counted" if one.evidence.exact else "drawn by recordings"
     return f"{one.evidence.name} test, {extent}"
 
@@ -77,9 +79,7 @@ def reasons(found: Comparison) -> list[str]:
         wanted = f"{found.plan.minimum_scenarios:,}"
         told.insert(0, f"{one.difference.n:,} scenarios count, and the plan asks for at least {wanted}.")
     if decision.because == "seeds":
-        told.append(
-            "Seeds differ so much that it may be chance: it takes more seeds rather than more scenarios."
-        )
+        told.append("Seeds differ so much that no number of scenarios would tell: it takes more seeds.")
     if decision.because == "alike":
         same = "the same for A and B in each" if found.plan.split == "paired" else "the same in all"
         told = [f"{metric_note(one).label} is {same} of {one.difference.n:,} scenarios."]
@@ -100,7 +100,7 @@ def _tested(found: Comparison) -> str:
     how = f"{bounds(one.difference, entry.unit, signed=True)}, p {p if p[0] == '<' else '= ' + p}"
     size = number(abs(one.difference.mean), entry.unit) + (" points" if entry.unit == "rate" else "")
     more = "higher" if one.difference.mean > 0 else "lower"
-    if one.winner is None and found.decision.because != "seeds":
+    if one.winner is None:
         return f"{entry.label} is {size} {more} with A ({how}): it may be chance."
     alone = "" if found.decision.because != "minimum" else f" The test alone would say {one.winner}."
     return f"{entry.label} is {size} {more} with A ({how}).{alone}"
@@ -142,7 +142,7 @@ def notes(found: Comparison) -> list[str]:
             middle = f"{number(spread.interquartile.mean, unit)} ({bounds(spread.interquartile, unit)})"
             told.append(f"{arm}, {name}: {len(spread.means)} seeds: {means}; interquartile mean {middle}")
     if any(found.seeds):
-        told.append("seeds are averaged per scenario; the interval of the difference resamples seeds too")
+        told.append("seeds are averaged per scenario; intervals and the test hold for other seeds, too")
     return told
 
 

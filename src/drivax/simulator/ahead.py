@@ -74,7 +74,7 @@ def ahead(bank: ScenarioBank, scene: Scene, frame: Frame, min_gap_m: float) -> A
     gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
-    stop = stop_line_m(bank, scene, me[4]) + min_gap_m - STOP_SHORT_M
+    stop = stop_line_m(bank, scene, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
     return Ahead(
         gap=jnp.where(jnp.isfinite(gap), gap, FREE_M),
@@ -83,11 +83,10 @@ def ahead(bank: ScenarioBank, scene: Scene, frame: Frame, min_gap_m: float) -> A
     )
 
 
-def stop_line_m(bank: ScenarioBank, scene: Scene, length_m: Float[Array, ""]) -> Float[Array, ""]:
+def stop_line_m(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
     """Distance from the front bumper to the nearest stop line of the route whose light asks to stop; inf: none does."""
-    line = bank.light_line[scene.index]
-    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
-    front = line[LIGHT_ARC] - scene.route_m - length_m / 2
+    line, state = bank.light_line[scene.index], frame.lights
+    front = line[LIGHT_ARC] - scene.route_m - frame.box[scene.slot, 4] / 2
     speed = scene.history[-1, 3]
     can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)

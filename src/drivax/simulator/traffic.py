@@ -92,6 +92,7 @@ def frame_of(
         z=z,
         valid=agents[:, 7] > 0,
         kind=box[:, 3].astype(jnp.int32),
+        lights=jnp.where(step >= back, bank.light_state[index, at], -1),
     )
 
 

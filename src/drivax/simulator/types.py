@@ -44,7 +44,7 @@ class Scene:
 
 @record
 class Frame:
-    """Everyone at one step: in each of the S slots a moving or a parked agent, or nobody.
+    """Everyone at one step: in each of the S slots a moving or a parked agent, or nobody; and the L lights.
 
     Attributes:
         box: x, y, cos, sin, length, width.
@@ -52,6 +52,7 @@ class Frame:
         z: Height of the box centre, m.
         valid: Whether the agent is there.
         kind: ``scenario.schema.AgentKind``.
+        lights: ``scenario.schema.LightState``; negative where nothing was seen.
     """
 
     box: Float[Array, "*batch S 6"]
@@ -59,6 +60,7 @@ class Frame:
     z: Float[Array, "*batch S"]
     valid: Bool[Array, "*batch S"]
     kind: Int[Array, "*batch S"]
+    lights: Int[Array, "*batch L"]
 
 
 @record

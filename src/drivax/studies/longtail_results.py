@@ -15,9 +15,8 @@ from drivax.curation.agents import CURATED, control_of
 from drivax.curation.ranking import rank_correlation
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
-from drivax.evaluation.crossed import Crossed, crossed_difference, crossed_mean, log_ratio
+from drivax.evaluation.crossed import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
 from drivax.evaluation.hypotheses import holm
-from drivax.evaluation.statistics import wilson
 
 Values = Float[np.ndarray, "seed scenario"]
 #: By metric.
@@ -329,16 +328,10 @@ def rates(
     return found
 
 
-def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict[str, float]:
+def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict[str, float | int | None]:
     """Mean, interval within what all of these metrics lie in, and how many scenarios it is of."""
-    found = crossed_mean(values, labels, weights)
-    low, high = np.clip(found.interval(), 0.0, 1.0)
-    if found.error == 0.0 and found.difference in (0.0, 1.0):
-        # Never or always: chance is that of as many recordings.
-        wide = wilson(found.difference * found.clusters, found.clusters)
-        low, high = wide.low or 0.0, wide.high or 0.0
-    number = int(((weights > 0.0) & ~np.isnan(values).any(axis=0)).sum())
-    return {"mean": found.difference, "low": float(low), "high": float(high), "scenarios": number}
+    found = agents_interval(values, labels, weights, rate=True).as_dict()
+    return {"scenarios" if name == "n" else name: value for name, value in found.items()}
 
 
 def rankings(tables: Mapping[str, ScoreTable]) -> list[dict[str, Any]]:

@@ -133,7 +133,7 @@ def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, 
     """
     ahead = bank.light_line[scene.index, LIGHT_ARC] - scene.route_m
     gap = ahead - bank.agent_box[scene.index, scene.slot, 0] / 2
-    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
+    state = frames(0).lights
     real = bank.light_line[scene.index, LIGHT_ARC] < NEVER_M
     there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
     next_one = jnp.argmin(jnp.where(there, gap, jnp.inf))

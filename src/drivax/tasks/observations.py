@@ -47,7 +47,7 @@ from drivax.tasks.features import (
     shown_curvature,
 )
 from drivax.tasks.own import own_name, refuse_taken
-from drivax.tasks.perception import Perception, lights_seen, moved_lights, moved_road, perceived
+from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
 from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Frames, View
 
 #: Places of a block of the running count.
@@ -197,7 +197,7 @@ def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames:
     if config.road and features.road:
         result |= _shown_road(config, bank, scene, view)
     if features.lights:
-        result |= _lights(config, bank, scene, view)
+        result |= _lights(config, bank, scene, view, frames(0).lights)
     if features.route:
         result |= _route(config, bank, scene, view)
     for group in config.own:
@@ -343,15 +343,14 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
     return jnp.stack([row + before for row in within], axis=-1).reshape(-1)[:count].astype(jnp.int32)
 
 
-def _lights(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+def _lights(
+    config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, state: Int[Array, " L"]
+) -> Observation:
     line = bank.light_line[scene.index]
-    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)]
     dx, dy = line[LIGHT_X] - view.xy[0], line[LIGHT_Y] - view.xy[1]
     # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
     seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
     perception, on_route = config.perception, line[LIGHT_ARC] < NEVER_M
-    if perception.of_lights:
-        seen &= lights_seen(perception, bank, scene, jnp.sqrt(dx * dx + dy * dy))
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank import LIGHT_X, LIGHT_Y, ScenarioBank
 from drivax.scenario.queries import LEVEL_M
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, Frame, Scene
@@ -85,7 +85,8 @@ def perceived(
         frames: The truth: everyone so many steps ago.
 
     Returns:
-        Frames in which who was not seen is not valid, and places have their errors.
+        Frames in which who was not seen is not valid, lights that were not seen are none, and places of agents have
+        their errors.
     """
 
     @cache
@@ -111,7 +112,11 @@ def _sensed(config: Perception, bank: ScenarioBank, scene: Scene, frame: Frame, 
         place = place + rotate(error, jnp.cos(eye[2]), jnp.sin(eye[2]))
     place = jnp.where(others[:, None], place, frame.box[:, :2])
     box = jnp.concatenate([place, frame.box[:, 2:]], axis=-1)
-    return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid))
+    lights = frame.lights
+    if config.of_lights:
+        line = bank.light_line[scene.index, LIGHT_X : LIGHT_Y + 1]
+        lights = jnp.where(lights_seen(config, bank, scene, norm(line.T - eye[:2]), back), lights, -1)
+    return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid), lights=lights)
 
 
 def in_view(
@@ -138,10 +143,10 @@ def in_view(
 
 
 def lights_seen(
-    config: Perception, bank: ScenarioBank, scene: Scene, distance_m: Float[Array, " L"]
+    config: Perception, bank: ScenarioBank, scene: Scene, distance_m: Float[Array, " L"], back: int = 0
 ) -> Bool[Array, " L"]:
-    """Which stop lines at these distances are seen."""
-    key = jax.random.fold_in(_key(config, bank, scene), _DROPPED_LIGHTS)
+    """Which stop lines were seen ``back`` steps ago, at these distances then."""
+    key = jax.random.fold_in(_key(config, bank, scene, back), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)
 
 
