@@ -97,7 +97,9 @@ def test_a_policy_on_levels_takes_levels(bank):
     learner = ON_LEVELS[0].build(environment, bank, 2)
     state, logs = jax.jit(learner.iterate)(bank, learner.init(bank, jax.random.key(0)))
     assert all(np.isfinite(value).all() for value in jax.tree.leaves(logs))
-    policy, _ = learner.network(state.parameters).both(environment.start(bank, jax.random.key(1), 6).observation)
+    policy, _ = learner.network(state.parameters).both(
+        environment.start(bank, jax.random.key(1), 6).observation
+    )
     taken = policy.action(policy.sample(jax.random.key(2)))
     accelerations, curvatures = environment.levels
     assert np.isin(taken[:, 0], accelerations).all() and np.isin(taken[:, 1], np.float32(curvatures)).all()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import base64
 import csv
 import json
 import math
@@ -16,9 +17,11 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation.statistics import wilson
 from drivax.metrics.catalogue import METRICS
 from drivax.scenario.store import ScenarioWriter
+from drivax.show.episode import ABSENT
 from drivax.show.glossary import note
 from drivax.show.palette import LIGHT
 from drivax.show.report import write_report
+from drivax.show.runs import read_runs
 
 from .conftest import SMALL, drive_off, make_scenario
 
@@ -268,9 +271,37 @@ def test_the_error_of_a_crash_is_the_title_of_its_cell(runs, tmp_path):
     assert found == ["planner crashed", "step 55: ValueError: too <fast>", "✕ planner crashed at 5.5 s"]
 
 
+def react(run):
+    """Stores where reactive traffic went: slot 1 stands still left of where ego began, nobody else is there."""
+    with np.load(run / "trajectories.npz") as stored:
+        arrays = dict(stored)
+    others = np.full((*arrays["ego"].shape[:2], 2, 3), -32768, np.int16)
+    others[:, :, 1] = 0, 500, 0
+    np.savez(run / "trajectories.npz", **arrays, others=others)
+
+
+def test_others_are_shown_as_they_reacted_to_the_last_run(runs, tmp_path):
+    for run in runs[:3]:
+        about = json.loads((run / "run.json").read_text())
+        (run / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
+        react(run)
+    page = Page(write_report(runs, tmp_path / "report.html").read_text())
+    assert "Other agents are drawn as they moved around policy;" in page.text
+    episode = json.loads(next(text for kind, text in page.scripts if kind.get("class") == "episode"))
+    pose = np.frombuffer(base64.b64decode(episode["agents"]["pose"]), "<i2").reshape(-1, episode["steps"], 3)
+    place = pose[0, 11:, :2] * episode["unit"] + episode["centre"]
+    np.testing.assert_allclose(place, [[0.0, 10.0]] * len(place), atol=episode["unit"])
+    assert (pose[1:, 11:] == ABSENT).all()
+    alone = Page(write_report(runs[2:3], tmp_path / "alone.html").read_text())
+    assert "Other agents are drawn" not in alone.text
+
+
 def test_other_traffic_is_said_and_not_compared(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
+    with pytest.raises(DataError, match="lacks an array: others"):
+        read_runs(runs)
+    react(runs[0])
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
     said = "expert and policy drove in different traffic (idm and log)."
     assert said in parsed.text and "constant and policy" not in parsed.text

@@ -78,6 +78,7 @@ class Results:
         events: First step of each kind of failure, -1 for none.
         motion: x, y, heading, speed per step from ``start`` on.
         actions: What was carried out from ``start`` on, NaN from a crash on.
+        others: Where everyone was from ``start`` on (``evaluation.others``); None where the log was replayed.
         start: Step of the log at which the episodes began.
         offroad_steps: Steps off the road.
         own: Those of the metrics that are the user's own: unit, direction and text.
@@ -92,6 +93,7 @@ class Results:
     events: Mapping[str, np.ndarray[Any, Any]]
     motion: np.ndarray[Any, Any]
     actions: np.ndarray[Any, Any]
+    others: np.ndarray[Any, Any] | None
     start: int
     offroad_steps: np.ndarray[Any, Any]
     own: Mapping[str, Metric] = field(default_factory=dict)
@@ -160,6 +162,7 @@ class Results:
             writer.writerows(self.rows())
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=1) + "\n", encoding="utf-8")
         arrays = {f"{name}_step": self.events[name].astype(np.int16) for name in EVENTS}
+        arrays |= {} if self.others is None else {"others": self.others}
         np.savez_compressed(
             folder / "trajectories.npz",
             allow_pickle=False,

@@ -8,8 +8,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Int16
 
+from drivax.evaluation.others import packed
 from drivax.evaluation.results import FAILED
 from drivax.metrics.episode import episode_metrics, first_steps
 from drivax.metrics.scores import Value
@@ -19,6 +20,7 @@ from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic import LogTraffic
 from drivax.simulator.types import SimState
 from drivax.tasks.task import Task
 
@@ -35,6 +37,7 @@ class Episodes:
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
         actions: What was carried out in each step: within bounds, and as the actuators let it be.
+        others: Where everyone was at each step (``evaluation.others``), if traffic does not replay the log.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was no number, -1 for none. Nothing is measured from there on; motion stays.
     """
@@ -43,6 +46,7 @@ class Episodes:
     events: dict[str, Int[Array, "*batch"]]
     motion: Float[Array, "*batch steps 4"]
     actions: Float[Array, "*batch actions D"]
+    others: Int16[Array, "*batch steps A 3"] | None
     offroad_steps: Int[Array, "*batch"]
     crashed: Int[Array, "*batch"]
 
@@ -91,18 +95,23 @@ def _episode(
     begin_key, key = jax.random.split(key)
     carry = planner.init(bank, state, begin_key)
 
+    def others(state: SimState) -> Int16[Array, "A 3"] | None:
+        traffic = simulator.traffic
+        return None if isinstance(traffic, LogTraffic) else packed(traffic.agents(bank, state.scene, 0))
+
     def one(now: Any, key: Array) -> Any:
         state, kept, carry, sound = now
         state, carry, step_sound = advanced(simulator, planner, bank, state, carry, key)
         sound &= step_sound
         kept = state if planner.replays else jax.tree.map(partial(jnp.where, sound), state, kept)
         scene = kept.scene
-        seen = scene.history[-1], scene.action, sound & state.facts.offroad, sound
+        seen = scene.history[-1], scene.action, sound & state.facts.offroad, sound, others(state)
         return (state, kept, carry, sound), seen
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
     first = (state, state, carry, jnp.ones((), bool))
-    (last, final, _, _), (motion, actions, offroad, sound) = jax.lax.scan(one, first, keys)
+    (last, final, _, _), (motion, actions, offroad, sound, moved) = jax.lax.scan(one, first, keys)
+    began = others(state)
     metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
     # What a scenario defines does not depend on how soon its planner crashed.
     failed = {
@@ -113,6 +122,7 @@ def _episode(
         events=first_steps(final.episode),
         motion=jnp.concatenate([state.scene.history[-1][None], motion]),
         actions=actions,
+        others=None if began is None else jnp.concatenate([began[None], moved]),
         offroad_steps=offroad.sum().astype(jnp.int32),
         crashed=jnp.where(sound.all(), -1, start_step + jnp.argmin(sound)),
     )

@@ -267,6 +267,7 @@ class _Trial:
             events={name: np.asarray(steps) for name, steps in episodes.events.items()},
             motion=np.asarray(episodes.motion),
             actions=actions,
+            others=None if episodes.others is None else np.asarray(episodes.others),
             start=self.start_step,
             offroad_steps=np.asarray(episodes.offroad_steps),
             own={name: metric for name, metric in self.metrics.items() if name not in METRICS},

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
+from drivax.evaluation.others import unpacked
 from drivax.evaluation.stored import ScenarioKey, open_driven_set
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
@@ -75,7 +76,11 @@ def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
     events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
     action, asked = np.full((steps, COMMANDED), np.nan), stored.action[place, : steps - start, :COMMANDED]
     action[start : start + len(asked), : asked.shape[1]] = asked
-    return Drive(run.name, ego, start, events, outcome(run, row), action)
+    others = None
+    if stored.others is not None:
+        others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
+        others[start : start + len(driven)] = unpacked(stored.others[place, : steps - start])
+    return Drive(run.name, ego, start, events, outcome(run, row), action, others)
 
 
 def logged_drive(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:

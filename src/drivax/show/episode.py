@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,8 @@ class Drive:
         events: Step of the first event by name, -1 where there was none.
         outcome: How it ended, in words.
         action: The first two numbers of its actions, NaN where there are none; None where nobody acted (the log).
+        others: Place [m] and heading [rad] of every agent where traffic reacted, NaN where it is not there; None where
+            they are as recorded.
     """
 
     planner: str
@@ -47,6 +49,22 @@ class Drive:
     events: dict[str, int]
     outcome: str
     action: Float[Array, "step 2"] | None = None
+    others: Float[Array, "step agent 3"] | None = None
+
+
+def as_driven(scenario: Scenario, drive: Drive) -> Scenario:
+    """The scenario with all but ego where they were in this drive, from where its planner took over."""
+    if drive.others is None:
+        return scenario
+    pose = drive.others[drive.start :]
+    steps, known = slice(drive.start, drive.start + len(pose)), slice(1, pose.shape[1])
+    there = np.isfinite(pose[:, known]).all(axis=-1)
+    found = np.where(there[..., None], pose[:, known], 0.0)
+    record = scenario.record.copy()
+    record["agent_valid"][steps, 1:] = False
+    record["agent_valid"][steps, known] = there
+    record["agent_xy"][steps, known], record["agent_heading"][steps, known] = found[..., :2], found[..., 2]
+    return replace(scenario, record=record)
 
 
 @dataclass(frozen=True)
@@ -89,7 +107,9 @@ def pack_episode(scenario: Scenario, drives: Sequence[Drive], title: str) -> dic
     which a parked agent was seen; ``lights.state`` ``[step, light]`` indexes (unknown, red, amber, green) and is -1
     where nobody observed the light; ``drives[].pose`` is ``[step, 3]``, ``speed`` is in cm/s, and ``signals`` are those
     of ``motion.SIGNALS`` and ``motion.COMMANDS`` in order, in units of their steps, ABSENT where there are none.
+    Others are shown as they were in the last of the drives.
     """
+    scenario = as_driven(scenario, drives[-1])
     box = surroundings(scenario, drives)
     scale = Scale.of(box)
     steps = int(scenario.steps)

@@ -199,10 +199,11 @@ def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
         f"<small>{escape(choice.scenario_id)}</small></button>"
         for choice, _ in packed
     )
-    reactive = any(run.traffic != "log" for run in runs if comparable(run, runs[-1]))
+    shown = [run for run in runs if comparable(run, runs[-1])]
     caution = (
-        "<p><b>Other agents are drawn as recorded;</b> in this traffic they reacted and moved otherwise.</p>"
-        if reactive
+        f"<p><b>Other agents are drawn as they moved around {escape(runs[-1].name)};</b> around the others they reacted "
+        "otherwise.</p>"
+        if len(shown) > 1 and runs[-1].traffic != "log"
         else ""
     )
     return (

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Int16, Int64
 
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.stored import AGAIN, EpisodeTable, ScenarioKey, present, read_about, read_episodes
@@ -31,6 +31,7 @@ class Trajectories:
         action: What was asked of it from ``start`` on; without numbers in a run that does not tell.
         start: Step of the log at which the planner took over.
         events: Step of the first event by name (:data:`EVENTS`), -1 where there was none.
+        others: Where everyone was from ``start`` on (``evaluation.others``); None where the log was replayed.
     """
 
     rows: Mapping[tuple[str, int], int]
@@ -38,6 +39,7 @@ class Trajectories:
     action: Float32[Array, "episode action D"]
     start: Int64[Array, " episode"]
     events: Mapping[str, Int64[Array, " episode"]]
+    others: Int16[Array, "episode step A 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def _unique(name: str, folder: Path, names: set[str]) -> str:
 
 def _evaluation(folder: Path, name: str, about: Mapping[str, Any]) -> Evaluation:
     columns = read_episodes(folder)
-    driven = _trajectories(present(folder / "trajectories.npz"))
+    driven = _trajectories(present(folder / "trajectories.npz"), replayed=about.get("traffic") == "log")
     return Evaluation(folder, name, about, *columns, driven, _crashes(folder / "crashes.json"))
 
 
@@ -139,7 +141,7 @@ def _crashes(path: Path) -> dict[ScenarioKey, tuple[int, str]]:
         raise DataError(f"cannot be read ({error})", file=path, cure=AGAIN) from error
 
 
-def _trajectories(path: Path) -> Trajectories:
+def _trajectories(path: Path, replayed: bool) -> Trajectories:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             ids = [_text(value) for value in stored["scenario_id"]]
@@ -147,6 +149,7 @@ def _trajectories(path: Path) -> Trajectories:
             action = (stored["action"] if "action" in stored else ego[:, 1:, :0]).astype(np.float32)
             start = stored["start"].astype(np.int64)
             events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
+            others = None if replayed else stored["others"]
     except KeyError as error:
         raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=AGAIN) from error
     except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
@@ -154,14 +157,14 @@ def _trajectories(path: Path) -> Trajectories:
     n = len(ids)
     if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
         array.shape != (n,) for array in (start, *events.values())
-    ):  # fmt: skip
+    ) or (others is not None and (others.shape[:2] != ego.shape[:2] or others.dtype != np.int16)):  # fmt: skip
         raise DataError("its arrays disagree in shape", file=path, cure=AGAIN)
     seen: dict[str, int] = {}
     rows = {}
     for row, scenario_id in enumerate(ids):
         rows[scenario_id, seen.get(scenario_id, 0)] = row
         seen[scenario_id] = seen.get(scenario_id, 0) + 1
-    return Trajectories(rows, ego, action, start, events)
+    return Trajectories(rows, ego, action, start, events, others)
 
 
 def _text(value: Any) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from drivax.errors import UsageError
 from drivax.scenario.schema import Scenario
 from drivax.show.drives import DrivenSet, drives_of
-from drivax.show.episode import Drive
+from drivax.show.episode import Drive, as_driven
 from drivax.show.frames import Canvas, Picture, Scenery, draw_frame, legend_strip
 from drivax.show.palette import THEMES
 from drivax.show.runs import Evaluation, read_runs
@@ -120,11 +120,15 @@ def frames(scenario: Scenario, drives: Sequence[Drive], theme: str = "light") ->
         theme: ``light`` or ``dark``.
     """
     side = ALONE if len(drives) == 1 else BESIDE
-    scenery = Scenery(Canvas(side, side, theme), scenario, drives)
+    canvas = Canvas(side, side, theme)
+    sceneries = [Scenery(canvas, as_driven(scenario, drive), drives) for drive in drives]
     across = len(drives) if len(drives) <= _ACROSS else -(-len(drives) // (-(-len(drives) // _ACROSS)))
     legend = legend_strip(across * side, theme)
     for step in range(min(drive.start for drive in drives), int(scenario.steps)):
-        panes = [draw_frame(scenery, drive, step, float(scenario.dt_s)) for drive in drives]
+        panes = [
+            draw_frame(scenery, drive, step, float(scenario.dt_s))
+            for scenery, drive in zip(sceneries, drives, strict=True)
+        ]
         for pane in panes if across > 1 else ():
             pane[:, -1, :3] = np.array([int(THEMES[theme]["lane"][at : at + 2], 16) for at in (1, 3, 5)])
         yield np.concatenate((_tiled(panes, across), legend))
