@@ -11,6 +11,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate_scenarios
+from drivax.evaluation.runs import with_metrics
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
 from drivax.named import is_dotted
@@ -98,7 +99,8 @@ def _traffic(given: str | Traffic) -> Traffic:
 
 def evaluate(
     planner: str | Path | Planner | Callable[..., Any], data: str | Path | Loaded, *, task: Task | None = None,
-    traffic: str | Traffic = "log", start: Start | None = None, **options: Any,
+    traffic: str | Traffic = "log", start: Start | None = None, sample: bool = False,
+    metrics: Sequence[str] = (), **options: Any,
 ) -> Results:  # fmt: skip
     """Drives every scenario to the end of its log and measures it; writes nothing.
 
@@ -108,15 +110,20 @@ def evaluate(
         task: Action space and observation of a planner of your own.
         traffic: As of :func:`make_simulator`; it is prepared here.
         start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
+        sample: Whether a policy, named by its folder, samples its actions rather than acting by the mode.
+        metrics: Metrics of your own as ``module:name``, beside all of ours.
         options: ``start_step``, ``seed``, ``batch`` and ``progress`` of ``evaluation.runner.evaluate_scenarios``.
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
         if task is not None:
             raise UsageError("a planner by name brings its own task", cure="leave out task=")
-        planner, task = find_planner(str(planner), loaded.bank)
+        planner, task = find_planner(str(planner), loaded.bank, sample)
+    elif sample:
+        raise UsageError("only a policy by name can sample", cure="leave out sample=")
     driver = as_planner(planner, getattr(planner, "__name__", "planner"))
-    simulator = Simulator(task or Task(), _traffic(traffic), start or LogStart())
+    task = with_metrics(task or Task(), tuple(metrics))
+    simulator = Simulator(task, _traffic(traffic), start or LogStart())
     scenarios = data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data)
     return evaluate_scenarios(simulator, driver, scenarios, sizes=loaded.sizes, **options)
 

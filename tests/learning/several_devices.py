@@ -1,6 +1,10 @@
 """Learns on one device and on several, in a process that simulates four: run by ``test_devices.py``."""
 
+import shutil
 import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -8,14 +12,20 @@ from test_resume import ALGORITHMS, SHOWN
 
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
+from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
+from drivax.learning.loop import train
 from drivax.learning.program import Program
 from drivax.scenario.assemble import assemble
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
+from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
+from drivax.tracking.checkpoints import Checkpoints
+from drivax.tracking.sinks import read_rows
 from pendulum import Pendulum
 
 SEEN = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2)
@@ -85,7 +95,46 @@ def refuses(learner, data, devices, words):
         raise AssertionError(f"{devices} devices")
 
 
+def whole_runs(folder):
+    """Run folders on two devices: validated, stopped and resumed in the middle, like one of one device."""
+    generate(folder / "set", 2, 7, Generation(workers=1))
+    data = ScenarioSet.open(folder / "set")
+    task = Task(observation=SEEN, metrics=("steps",))
+    algorithm, count = ALGORITHMS["ppo"], 4
+    config = TrainConfig(
+        task=task, algorithm=algorithm, total_steps=count * algorithm.steps_per_iteration, latest_start=60,
+        evaluate_every=2, checkpoint_every=2, keep=5, devices=2,
+    )  # fmt: skip
+
+    def driven(name, **changes):
+        run = train(replace(config, **changes), data, folder / name, validation=data)
+        rows = [row for row in read_rows(run.path / "metrics.jsonl") if "validation/vmax_score" in row]
+        assert len(rows) == 2, rows
+        return run, rows
+
+    def parameters(run):
+        shapes = jax.eval_shape(algorithm.build(environment, bank, count).init, bank, jax.random.key(0))
+        return jax.device_get(Checkpoints(run.checkpoints).restore(shapes).parameters)
+
+    environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
+    (one, shown), (two, others) = driven("one", devices=1), driven("two")
+    same(parameters(one), parameters(two))
+    for row, other in zip(shown, others, strict=True):
+        assert abs(row["validation/vmax_score"] - other["validation/vmax_score"]) < 1e-3, (row, other)
+    before = parameters(two)
+    last = sorted(two.checkpoints.glob("step-*"))[-1]
+    shutil.rmtree(last)
+    again = train(config, data, two.path, validation=data, resume=True)
+    same(before, parameters(again))
+    assert sorted(again.checkpoints.glob("step-*"))[-1] == last
+
+
 def main(name, extent):
+    if extent == "runs":
+        with tempfile.TemporaryDirectory() as folder:
+            whole_runs(Path(folder))
+        print("same")
+        return
     learner, data = problem(name)
     if name == "bc":
         refuses(learner, data, 2, "an algorithm without environments cannot be divided among 2 devices")

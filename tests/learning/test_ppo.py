@@ -43,6 +43,44 @@ def test_a_truncated_step_bootstraps_its_own_final_state():
         np.testing.assert_array_equal(batch["alive"], [1, 1, 0, 1])
 
 
+def test_the_loss_against_numpy():
+    """Of what the networks say; rows between episodes (``alive`` 0) count for nothing, and advantages are normalised."""
+    config = PpoConfig(network=NETWORK, clip=0.1, value_coefficient=0.7, entropy_coefficient=0.03)
+    learner = config.build(Pendulum(), (), 1)
+    parameters, keys = learner.init((), jax.random.key(0)).parameters, jax.random.split(jax.random.key(1), 7)
+    alive = jnp.array([1.0, 1.0, 0.0, 1.0] * 8)
+    part = {
+        "observation": {"pendulum": jax.random.normal(keys[0], (32, 3))},
+        "choice": jax.random.normal(keys[1], (32, 1)),
+        "advantage": 3.0 + 2.0 * jax.random.normal(keys[2], (32,)),
+        "target": jax.random.normal(keys[3], (32,)),
+        "alive": alive,
+    }
+    policy, value = learner.network(parameters).both(part["observation"])
+    now = policy.log_prob(part["choice"])
+    part["log_prob"] = now + 0.3 * jax.random.normal(keys[4], (32,))
+    total, logs = learner._loss(
+        parameters, part, keys[5], lambda *_: (jnp.float32(0.5), {"also": jnp.ones(())})
+    )
+
+    there = np.asarray(alive, bool)
+    rows = {name: np.asarray(part[name], np.float64)[there] for name in ("advantage", "target", "log_prob")}
+    ratio = np.exp(np.asarray(now, np.float64)[there] - rows["log_prob"])
+    advantage = (rows["advantage"] - rows["advantage"].mean()) / rows["advantage"].std()
+    clipped = np.clip(ratio, 0.9, 1.1)
+    surrogate = -np.minimum(ratio * advantage, clipped * advantage).mean()
+    errors = np.square(np.asarray(value, np.float64)[there] - rows["target"]).mean()
+    spread = np.asarray(policy.entropy_estimate(jax.random.split(keys[5])[0]), np.float64)[there].mean()
+    assert float(total) == pytest.approx(surrogate + 0.7 * errors - 0.03 * spread + 0.5, rel=1e-4)
+    told = {
+        "policy": surrogate, "value": errors, "entropy": spread, "also": 1.0,
+        "clipped_share": (abs(ratio - 1) > 0.1).mean(), "kl": -np.log(ratio).mean(),
+        "explained_variance": 1 - errors / rows["target"].var(),
+    }  # fmt: skip
+    assert {name: float(logs[name]) for name in told} == pytest.approx(told, rel=1e-4, abs=1e-6)
+    assert 0.2 < told["clipped_share"] < 0.9
+
+
 @pytest.mark.parametrize(
     "network",
     [

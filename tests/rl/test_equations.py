@@ -63,3 +63,5 @@ def test_clipped_surrogate(ratio, advantage, loss, slope):
     value, gradient = jax.value_and_grad(of)(jnp.log(jnp.asarray(ratio)))
     assert float(value) == pytest.approx(loss, rel=1e-5)
     assert (abs(float(gradient)) > 1e-6) == slope
+    around = [float(of(jnp.log(jnp.asarray(ratio)) + shift)) for shift in (-1e-3, 1e-3)]
+    assert float(gradient) == pytest.approx((around[1] - around[0]) / 2e-3, rel=2e-3, abs=1e-3)

@@ -86,7 +86,7 @@ def run_evaluation(
     scenarios = [data[row] for row in chosen(data, config.filter, config.scenarios, config.limit)]
     refuse_existing(Path(out), overwrite, "evaluation")
     start = NoisyStart() if config.noisy_start else LogStart()
-    judged = _with_metrics(task or Task(), config.metrics)
+    judged = with_metrics(task or Task(), config.metrics)
     with Progress(f"driving {planner.name}", "scenarios", len(scenarios)) as bar:
         results = evaluate_scenarios(
             Simulator(judged, traffic or make_traffic(config.traffic), start),
@@ -109,7 +109,7 @@ def run_evaluation(
     return results
 
 
-def _with_metrics(task: Task, more: tuple[str, ...]) -> Task:
+def with_metrics(task: Task, more: tuple[str, ...]) -> Task:
     """The task with further metrics."""
     given = task.metrics if isinstance(task.metrics, tuple) else (task.metrics,)
     return replace(task, metrics=tuple(dict.fromkeys((*given, *more)))) if more else task

@@ -201,8 +201,8 @@ def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
     )
     shown = [run for run in runs if comparable(run, runs[-1])]
     caution = (
-        f"<p><b>Other agents are drawn as they moved around {escape(runs[-1].name)};</b> around the others they reacted "
-        "otherwise.</p>"
+        f"<p><b>Other agents are drawn as they moved around {escape(runs[-1].name)};</b> around the others they "
+        "reacted otherwise.</p>"
         if len(shown) > 1 and runs[-1].traffic != "log"
         else ""
     )
