@@ -30,18 +30,22 @@ from drivax.learning.ppo import Ppo
 from drivax.learning.program import Program
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.studies.bench import use_all_cores
 from drivax.tracking.runs import versions
 
 RESULT = Path(__file__).resolve().parent / "results" / "training.json"
 SCENARIOS = 1024
 _TWO = ("--algorithm.network.shared_encoder", "false")
-#: What is trained: the preset; with an encoder each for policy and value; and with twice the passes over experience.
+#: What is trained: the preset; with an encoder each for policy and value; with twice the passes over experience; and
+#: with the small latent-query encoder in bfloat16.
 KINDS = {
     "ppo": (),
     "ppo, two encoders": _TWO,
     "ppo, two encoders, 4 epochs of 8 minibatches": (
         *_TWO, "--algorithm.epochs", "4", "--algorithm.minibatches", "8",
+    ),
+    "ppo, lq small in bfloat16": (
+        "--algorithm.network.encoder.kind", "lq", "--algorithm.network.encoder.size", "small",
+        "--algorithm.network.encoder.dtype", "bfloat16",
     ),
 }  # fmt: skip
 
@@ -87,14 +91,14 @@ def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], 
     return {"whole": whole, "acting": run(acting), "simulating": run(simulating)}
 
 
-def measured(data: Path, repeats: int) -> dict[str, Any]:
-    """Steps per second of training and the split, of every kind, all by turns."""
-    use_all_cores()
+def measured(data: Path, repeats: int, environments: int | None) -> dict[str, Any]:
+    """Steps per second of training and the split, of every kind, all by turns, as ``drivax train`` runs them."""
     stored = ScenarioSet.open(data)
     bank = ScenarioBank.from_scenarios([stored[row] for row in range(SCENARIOS)])
     calls, steps = {}, {}
     for name, overrides in KINDS.items():
-        config = replace(settings.load(TrainConfig, "ppo", list(overrides)), devices=jax.device_count())
+        more = [] if environments is None else ["--algorithm.environments", str(environments)]
+        config = settings.load(TrainConfig, "ppo", [*overrides, *more])
         steps[name] = config.algorithm.steps_per_iteration
         calls |= {(name, part): call for part, call in programs(config, bank).items()}
     times: dict[tuple[str, str], list[float]] = {kind: [] for kind in calls}
@@ -122,6 +126,7 @@ def measured(data: Path, repeats: int) -> dict[str, Any]:
         "when": datetime.now(UTC).isoformat(timespec="minutes"),
         "devices": [device.device_kind for device in jax.devices()],
         "scenarios": SCENARIOS,
+        "environments": environments,
         "training": result,
         "versions": versions(),
     }
@@ -134,9 +139,12 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument(
+        "--environments", type=int, help="side by side, in place of the preset's; more on a GPU"
+    )
     parser.add_argument("--write", action="store_true", help="store the result")
     args = parser.parse_args()
-    result = measured(args.data, args.repeats)
+    result = measured(args.data, args.repeats, args.environments)
     print(json.dumps(result["training"], indent=1))
     if args.write:
         RESULT.write_text(json.dumps(result, indent=1) + "\n")

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from test_resume import ALGORITHMS, SHOWN
+from test_resume import ALGORITHMS, SHOWN, TINY
 
 from drivax.errors import UsageError
 from drivax.learning.agents import Agents
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
+from drivax.learning.iql import IqlConfig
 from drivax.learning.loop import train
 from drivax.learning.program import Program
 from drivax.scenario.assemble import assemble
@@ -37,6 +38,9 @@ def problem(name):
         return ALGORITHMS[name].build(Pendulum(), SHOWN, 6), SHOWN
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
     environment = Driving(Simulator(Task(observation=SEEN, metrics=("steps",))), latest_start=60)
+    if name == "driving_iql":
+        config = IqlConfig(batch=8, updates=2, network=TINY)
+        return config.build(environment, bank, 6), config.experience(environment, bank, None)
     return ALGORITHMS[name.removeprefix("driving_")].build(environment, bank, 6), bank
 
 
@@ -48,12 +52,13 @@ def run(learner, data, seeds, devices):
     for _ in range(3):
         state, logs = program.step(state)
     inner = getattr(state, "learner", state)
+    environments = getattr(inner, "environments", None)
     held = {
-        "over": inner.environments.over,
+        "over": getattr(environments, "over", None),
         "reward": getattr(getattr(inner, "replay", None), "reward", None),
     }
     shards = {name: leaf.sharding.shard_shape(leaf.shape) for name, leaf in held.items() if leaf is not None}
-    spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(inner.environments)}
+    spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves((environments, state.parameters))}
     assert spread == {len(program.devices)}, spread
     return jax.device_get((state.parameters, logs)), shards, program.account().parts
 
@@ -93,6 +98,20 @@ def refuses(learner, data, devices, words):
         assert words in str(error), error
     else:
         raise AssertionError(f"{devices} devices")
+
+
+def divides_batches(learner, data):
+    """No environments: every device has the whole state, and its share of the work."""
+    one, _, _ = run(learner, data, (3,), 1)
+    work = []
+    for devices in (2, None):
+        several, _, _ = run(learner, data, (3,), devices)
+        same(one, several)
+    for devices in (1, 4):
+        program = Program(Agents(learner, (3,)), data, devices)
+        work.append(program.compiled.cost_analysis()["flops"])
+    assert work[1] < 0.6 * work[0], work
+    refuses(learner, data, 3, "8 moments cannot be divided among 3 devices")
 
 
 def whole_runs(folder):
@@ -136,9 +155,8 @@ def main(name, extent):
         print("same")
         return
     learner, data = problem(name)
-    if name == "bc":
-        refuses(learner, data, 2, "an algorithm without environments cannot be divided among 2 devices")
-        assert len(Program(Agents(learner, (3,)), data, None).devices) == 1
+    if extent == "batches":
+        divides_batches(learner, data)
     elif extent == "two":
         divides(learner, data, (2,))
     else:

@@ -7,9 +7,9 @@ import sys
 import pytest
 
 CASES = [
-    ("bc", "none"), ("ppo", "two"), ("sac", "two"), ("ppo", "four_and_seeds"), ("sac", "four_and_seeds"),
-    ("sac_observations", "two"), ("bc_sac", "two"), ("driving_ppo", "two"), ("driving_sac", "two"),
-    ("bc_ppo", "two"), ("ppo", "runs"),
+    ("bc", "batches"), ("driving_bc", "batches"), ("driving_iql", "batches"), ("ppo", "two"), ("sac", "two"),
+    ("ppo", "four_and_seeds"), ("sac", "four_and_seeds"), ("sac_observations", "two"), ("bc_sac", "two"),
+    ("driving_ppo", "two"), ("driving_sac", "two"), ("bc_ppo", "two"), ("ppo", "runs"),
 ]  # fmt: skip
 
 

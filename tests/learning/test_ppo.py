@@ -44,7 +44,7 @@ def test_a_truncated_step_bootstraps_its_own_final_state():
 
 
 def test_the_loss_against_numpy():
-    """Of what the networks say; rows between episodes (``alive`` 0) count for nothing, and advantages are normalised."""
+    """Of what the networks say; rows between episodes (``alive`` 0) do not count, advantages are normalised."""
     config = PpoConfig(network=NETWORK, clip=0.1, value_coefficient=0.7, entropy_coefficient=0.03)
     learner = config.build(Pendulum(), (), 1)
     parameters, keys = learner.init((), jax.random.key(0)).parameters, jax.random.split(jax.random.key(1), 7)

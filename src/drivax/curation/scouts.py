@@ -54,9 +54,10 @@ class ScoutsConfig:
 
     Attributes:
         folds: How many scouts; each leaves out every so manieth recording, chosen by lot.
-        cloning: How each is trained; of every ``batch`` each scout leaves out the steps of its own fold. With ``loss:
-            mse`` scouts disagree by the variance of what they would do; with ``likelihood`` by how much their
-            distributions differ, so that ``network.distribution: mixture`` can disagree about modes.
+        cloning: How each is trained; of every ``batch`` each scout takes the share of the other folds, steps of its own
+            being left out. With ``loss: mse`` scouts disagree by the variance of what they would do; with
+            ``likelihood`` by how much their distributions differ, so that ``network.distribution: mixture`` can
+            disagree about modes.
         total_steps: Recorded steps that are drawn for all of them, rounded up to whole iterations of ``cloning``.
         weighted: ``plain``: all steps alike; ``rarity``: drawn by inverse density of the expert's action, clipped
             (:class:`~drivax.curation.rarity.KernelRarity` with its exponent at 1).
@@ -267,26 +268,30 @@ def fit(
         fold: Of every scenario.
         say: Called with (iterations done, iterations).
     """
-    environment, cloning, own = recorded(learner.environment), config.cloning, jnp.arange(config.folds)
+    environment, cloning = recorded(learner.environment), config.cloning
+    used = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
-    def update(
-        experience: Experience, fold: Array, trained: tuple[Any, Any], key: Array
-    ) -> tuple[tuple[Any, Any], dict[str, Array]]:
+    def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
         places = draw(experience.critic, key, (cloning.batch,))
         observation, action, _ = moments(environment, experience, places)
 
-        def one(own: Array, trained: tuple[Any, Any]) -> tuple[tuple[Any, Any], dict[str, Array]]:
+        def one(each: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
+            others = fold[places[0]] != each[0]
+            # Those of its fold last; steps are drawn independently, so that which others are too many is chance.
+            rows = jnp.argsort(~others, stable=True)[:used]
+            seen = jax.tree.map(lambda leaf: leaf[rows], observation)
+
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
-                policy = learner.distribution(parameters, observation)
-                return cloning.of_moments(policy, action, fold[places[0]] != own)
+                return cloning.of_moments(learner.distribution(parameters, seen), action[rows], others[rows])
 
-            return updated(trained, learner.optimiser, loss)
+            return updated(each[1], learner.optimiser, loss)[0]
 
-        # One after the other: on CPUs products of stacked small matrices take thrice as long.
-        return jax.lax.map(lambda each: one(*each), (own, trained))
+        # On CPUs products of stacked small matrices take thrice as long as one after the other.
+        together = None if jax.default_backend() == "cpu" else config.folds
+        return jax.lax.map(one, (jnp.arange(config.folds), trained), batch_size=together), None
 
     @partial(jax.jit, donate_argnums=2)
-    def iterate(experience: Experience, fold: Array, trained: tuple[Any, Any], key: Array) -> tuple[Any, Any]:
+    def iterate(experience: Experience, fold: Array, trained: Any, key: Array) -> Any:
         keys = jax.random.split(key, cloning.updates)
         return jax.lax.scan(partial(update, experience, fold), trained, keys)[0]
 

@@ -37,7 +37,11 @@ class LearnerState(Protocol):
 
 @runtime_checkable
 class Learner(Protocol):
-    """An algorithm in one environment. Holds configuration; everything computed is in the state."""
+    """An algorithm in one environment. Holds configuration; everything computed is in the state.
+
+    One that learns from data alone and divides its batches among devices (``devices.divided``) has their size as
+    ``batch``.
+    """
 
     def init(self, data: Any, key: Array) -> Any:
         """The state (:class:`LearnerState`) before the first iteration. Pure."""

@@ -1,4 +1,4 @@
-"""Several devices: agents divide among them where they can, otherwise each agent's environments do.
+"""Several devices: agents divide among them where they can, otherwise each agent's environments do, or its batches.
 
 Everything is one program on one mesh of devices, and the compiler divides the work by where the arrays lie. So the
 result does not depend on the number of devices, but for the order of sums.
@@ -18,13 +18,14 @@ from drivax.errors import UsageError
 _AXIS = "devices"
 
 
-def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[Any]:
+def chosen_devices(wanted: int | None, agents: int, state: Any, batch: int | None = None) -> list[Any]:
     """The devices that a run uses.
 
     Args:
         wanted: How many; None: all of this machine's, as far as there is something to divide among them.
         agents: Number of agents.
         state: Their state, or its shapes.
+        batch: Of an algorithm that learns from data alone: how many moments an update takes.
 
     Raises:
         UsageError: So many devices are not there, or what is to be learned cannot be divided among them.
@@ -36,13 +37,15 @@ def chosen_devices(wanted: int | None, agents: int, state: Any) -> list[Any]:
     if count == 1 or agents % count == 0:
         return have[:count]
     sizes = {leaf.shape[axis] for leaf, axis in _divisible(state, agents) if axis is not None}
+    kind = "environments" if sizes else "moments"
+    sizes |= set() if batch is None else {batch}
     odd = [size for size in sizes if size % count]
     if sizes and not odd:
         return have[:count]
     if wanted is None:
         return have[:1]
-    what = f"{odd[0]} environments" if odd else "an algorithm without environments"
-    cure = f"use a multiple of {count} environments or seeds, or fewer devices"
+    what = f"{odd[0]} {kind}" if odd else "an algorithm without environments or batches"
+    cure = f"use a multiple of {count} {kind} or seeds, or fewer devices"
     raise UsageError(f"{what} cannot be divided among {count} devices", cure=cure)
 
 
@@ -70,7 +73,7 @@ def everywhere(mesh: Mesh) -> NamedSharding:
 
 
 def divided(tree: Any, axis: int) -> Any:
-    """The same arrays; where environments are divided among devices, the compiler is asked to divide this axis too.
+    """The same arrays; where one agent's work is divided among devices, the compiler is asked to divide this axis.
 
     Without that it may well compute a whole update on every device.
     """

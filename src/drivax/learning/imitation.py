@@ -14,6 +14,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
+from drivax.learning.devices import divided
 from drivax.learning.environment import Environment
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
 from drivax.learning.optimisers import clipped_adam
@@ -75,7 +76,7 @@ class Cloning:
         self, act: Act, parameters: Any, environment: Demonstrated, data: Any, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """The loss on random moments, and what to log: it, the mean error of the mode, the share left out."""
-        observation, action, clipped = _moments(environment, data, key, self.batch)
+        observation, action, clipped = divided(_moments(environment, data, key, self.batch), axis=0)
         return self.of_moments(act(parameters, observation), action, ~(clipped & self.mask_clipped))
 
     def of_moments(
@@ -152,7 +153,7 @@ class Bc:
     """Behaviour cloning in one environment. Holds configuration and the network's graph."""
 
     def __init__(self, config: BcConfig, environment: Environment, data: Any, iterations: int) -> None:
-        self.config, self.environment = config, demonstrated(environment)
+        self.config, self.environment, self.batch = config, demonstrated(environment), config.batch
         refuse_flat(config, config.network)
         self.spec = environment.shapes(data)
         self.optimiser = config.optimiser(iterations * config.updates)

@@ -15,6 +15,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
+from drivax.learning.devices import divided
 from drivax.learning.environment import Environment
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded, transitions
 from drivax.learning.fitted_q import FittedQ, FittedQConfig
@@ -142,7 +143,7 @@ class Offline:
     follows: ClassVar[tuple[str, ...]] = ("critic",)
 
     def __init__(self, config: OfflineConfig, environment: Environment, data: Any, iterations: int) -> None:
-        self.settings, self.environment = config, environment
+        self.settings, self.environment, self.batch = config, environment, config.batch
         self.updates = iterations * config.updates
         self.spec = environment.shapes(data)
         self.optimiser = optax.partition(self.optimisers(), {name: name for name in self.optimisers()})
@@ -241,10 +242,11 @@ class Offline:
         """Steps to learn values from, and where to improve the policy."""
         environment, count = recorded(self.environment), (self.settings.batch,)
         critic_key, policy_key = jax.random.split(key)
-        part = transitions(environment, data, draw(data.critic, critic_key, count))
+        part = divided(transitions(environment, data, draw(data.critic, critic_key, count)), axis=0)
         if data.policy is None:
             return part, (part.observation, part.action)
-        observation, action, _ = moments(environment, data, draw(data.policy, policy_key, count))
+        found = moments(environment, data, draw(data.policy, policy_key, count))
+        observation, action, _ = divided(found, axis=0)
         return part, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:

@@ -28,7 +28,8 @@ class Program:
     def __init__(self, agents: Agents, data: Any, devices: int | None = 1) -> None:
         self.agents = agents
         shapes = jax.eval_shape(agents.init, data)
-        self.devices = chosen_devices(devices, len(agents.seeds), shapes)
+        batch = getattr(agents.learner, "batch", None)
+        self.devices = chosen_devices(devices, len(agents.seeds), shapes, batch)
         self._mesh = mesh_of(self.devices)
         self._layout: Any = None
         if len(self.devices) > 1:
