@@ -22,6 +22,7 @@ from drivax.evaluation.rollout import judging
 from drivax.planners.planner import Memoryless
 from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
+from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Physical, Published
 from drivax.tasks.features import Features
@@ -120,6 +121,19 @@ def test_only_what_the_planner_looks_at_matters(shy):
     assert found.pop(("agents", "position x")) > 0.5 and shy.groups["agents"] > 0.5
     assert set(found.values()) == {0.0}
     assert {value for name, value in shy.groups.items() if name != "agents"} == {0.0}
+
+
+@pytest.mark.slow
+def test_others_move_as_the_traffic_says():
+    """A car comes up behind ego at 12 m/s: the log drives through it, by IDM it brakes."""
+    bank = bank_of(straight_road([car(0, 0, 0, 2), car(-40, 0, 0, 12)]))
+    log, idm = (
+        column(
+            observation_statistics(Shy(), bank, TASK, permute=False, traffic=one), "agents", "velocity ahead"
+        )
+        for one in (None, IdmTraffic())
+    )
+    assert log.low == pytest.approx(12 / 15, abs=1e-3) and idm.low < 4 / 15
 
 
 def test_a_planner_of_another_action_space_is_refused(bank):

@@ -46,6 +46,8 @@ class Inspect:
     """Describe what a policy observes: every feature's spread, what it has to do with collisions and actions."""
     planner: str | None = None
     """Who drives for --observations: a planner, the run folder of a training run or zoo:NAME; the log by default."""
+    traffic: str | None = None
+    """How the others move for --observations: log (the default), idm, zoo:NAME, ... as of drivax evaluate."""
     task: str | None = None
     """Whose observations: a training configuration (file or preset); a run brings its own."""
     draw: Path | None = None
@@ -118,7 +120,7 @@ def _refuse_misfits(args: Inspect) -> None:
         raise UsageError(
             "--observations describes one set, and makes no page", cure="name one set, and no --html"
         )
-    for name in ("planner", "task", "draw"):
+    for name in ("planner", "traffic", "task", "draw"):
         if getattr(args, name) is not None and not args.observations:
             raise UsageError(f"--{name} needs --observations", cure="add --observations")
     if args.planner is not None and args.task is not None and is_policy(args.planner.partition("@")[0]):
@@ -133,6 +135,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics
     from drivax.learning.config import TrainConfig
+    from drivax.learning.policy_traffic import find_traffic
     from drivax.planners.simple import Expert
     from drivax.scenario.bank import ScenarioBank
     from drivax.show.observation_view import draw_moment
@@ -144,7 +147,8 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     task = given or task
     if args.planner is None:
         planner = Expert(actions=task.actions)
-    found = observation_statistics(planner, bank, task, permute=not planner.replays)
+    traffic = find_traffic(args.traffic or "log")
+    found = observation_statistics(planner, bank, task, permute=not planner.replays, traffic=traffic)
     if args.json:
         json.dump(found.as_dict(), sys.stdout, indent=1)
         print()

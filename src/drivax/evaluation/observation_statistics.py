@@ -23,8 +23,10 @@ from drivax.planners.planner import Planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.catalogue import prepared
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import SimState
+from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task
 
@@ -118,14 +120,16 @@ def _plain(value: Any) -> Any:
 
 
 def observation_statistics(
-    planner: Planner, bank: ScenarioBank, task: Task, *, permute: bool, every: int = EVERY, seed: int = 0
-) -> ObservationStatistics:
+    planner: Planner, bank: ScenarioBank, task: Task, *, permute: bool, traffic: Traffic | None = None,
+    every: int = EVERY, seed: int = 0,
+) -> ObservationStatistics:  # fmt: skip
     """Drives every scenario of a bank from its current step to the end, and describes what was observed on the way.
 
     Args:
         planner: The driver; ``expert`` for the log itself.
         bank: The scenarios.
         task: Whose observations, and whose actions.
+        traffic: How the others move; as recorded by default.
         permute: Whether to measure the importance of features to the planner.
         every: Steps between two looks.
         seed: Of the planner, as in an evaluation, and of the permutations.
@@ -137,7 +141,8 @@ def observation_statistics(
         raise UsageError(
             f"planner {planner.name} acts in another action space than the task", cure="use the task's"
         )
-    simulator = Simulator(judging(task))
+    traffic = traffic or LogTraffic()
+    simulator, bank = Simulator(judging(task), traffic), prepared(traffic, bank)
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
