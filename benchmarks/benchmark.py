@@ -54,6 +54,8 @@ COLUMNS = {
 }  # fmt: skip
 #: Whom every learned planner is compared with, and in what.
 AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
+#: Tags by which accuracy is told apart, and where those of the scenarios are kept.
+TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: What the table of random actions shows: until the first failure, as published episodes end there.
 UNTIL = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
 
@@ -108,6 +110,8 @@ def drive(args: argparse.Namespace) -> None:
     scenarios = list(stored)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     EPISODES.mkdir(parents=True, exist_ok=True)
+    tags = {tag: np.array([entry["tags"][tag] for entry in stored.entries]) for tag in TAGS}
+    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, **tags)
     for name in args.planner or (*PLANNERS, *learned()):
         for kind in args.traffic:
             found = [
@@ -185,7 +189,7 @@ def judged() -> dict[str, Any]:
         raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
     planners: dict[str, Any] = {}
     for (name, kind), found in driven.items():
-        metrics = (*COLUMNS, *UNTIL) if name == BOX else COLUMNS
+        metrics = (*COLUMNS, *UNTIL) if name in (BOX, "expert") else COLUMNS
         planners.setdefault(name, {"seeds": found.about["seeds"]})[kind] = {
             metric: mean(found, metric).as_dict() for metric in metrics
         }
@@ -208,13 +212,37 @@ def judged() -> dict[str, Any]:
                     for metric in COMPARED
                 }
                 for other in AGAINST
-                for name in (*(name for name in ("pdm",) if name != other), *learned())
+                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned())
                 if {(name, kind), (other, kind)} <= driven.keys()
             }
             for kind in TRAFFIC
         },
+        "strata": strata(driven),
         "driven": {f"{name}, {kind}": dict(found.about) for (name, kind), found in driven.items()},
     }
+
+
+def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
+    """Accuracy in recorded traffic by tag of the scenarios and its value, of every planner."""
+    with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
+        tags = {tag: stored[tag] for tag in TAGS}
+    planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
+    found = []
+    for tag, values in tags.items():
+        for value in np.unique(values):
+            rows = values == value
+            some = {
+                name: mean(
+                    replace(
+                        one, values={"accuracy": one.values["accuracy"][:, rows]}, segments=one.segments[rows]
+                    ),
+                    "accuracy",
+                )
+                for name, one in planners.items()
+            }
+            told = {name: one.as_dict() for name, one in some.items()}
+            found.append({"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": told})
+    return found
 
 
 def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -251,8 +279,26 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
         ],
     )
     shown = {**UNTIL, "collision": "collision", "offroad": "off-road"}
-    rows = [(f"`{kind}`", *cells(planners[BOX][kind], shown)) for kind in TRAFFIC if kind in planners[BOX]]
-    found["random"] = table(("traffic", *shown.values()), rows)
+    rows = [
+        (name, f"`{kind}`", *cells(planners[name][kind], shown))
+        for name in (BOX, "expert")
+        for kind in TRAFFIC
+        if kind in planners[name]
+    ]
+    found["random"] = table(("planner", "traffic", *shown.values()), rows)
+    names = [name for name in order if name in result["strata"][0]["planners"]]
+    found["strata"] = table(
+        ("tag", "value", "scenarios", *(f"`{name}`" for name in names)),
+        [
+            (
+                one["tag"],
+                one["value"],
+                f"{one['scenarios']:,}",
+                *(interval(one["planners"][n]) for n in names),
+            )
+            for one in result["strata"]
+        ],
+    )
     return found
 
 

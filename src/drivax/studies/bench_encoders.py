@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from dataclasses import dataclass, field, replace
@@ -48,8 +49,8 @@ VARIANTS: dict[str, _Ours] = {
     "wayformer small, hierarchical": WayformerConfig(fusion="hierarchical"),
     "wayformer small, factorised": WayformerConfig(factorised=True),
 }
-#: Calls of a timing; one alone is too short for the clock.
-_CALLS = 10
+#: A timing takes so long at least, s: one call of a small encoder is too short for the clock.
+_LEAST_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class EncoderBench:
     """
 
     only: tuple[str, ...] = ()
-    batches: tuple[int, ...] = (1, 256)
-    repeats: int = 7
+    batches: tuple[int, ...] = (1, 64)
+    repeats: int = 5
     observation: ObservationConfig = field(default_factory=lambda: PRESETS["optimal"])
 
     def __post_init__(self) -> None:
@@ -157,13 +158,15 @@ def _times(config: EncoderConfig, spec: GroupSpec, bench: EncoderBench) -> dict[
 
 
 def _microseconds(function: Any, parameters: Any, groups: dict[str, Array], repeats: int) -> float:
-    """Time per observation; the median of the repeats, after one that compiles."""
+    """Time per observation; the median of the repeats, after one that compiles and one that says how often to call."""
     batch = next(iter(groups.values())).shape[0]
-    jax.block_until_ready(function(parameters, groups))
-    seen = []
-    for _ in range(repeats):
+
+    def seconds(calls: int) -> float:
         began = time.perf_counter()
-        for _ in range(_CALLS):
+        for _ in range(calls):
             jax.block_until_ready(function(parameters, groups))
-        seen.append((time.perf_counter() - began) / _CALLS / batch)
-    return round(1e6 * statistics.median(seen), 2)
+        return (time.perf_counter() - began) / calls
+
+    seconds(1)
+    calls = math.ceil(_LEAST_S / seconds(1))
+    return round(1e6 * statistics.median(seconds(calls) for _ in range(repeats)) / batch, 2)
