@@ -27,7 +27,7 @@ def place(tmp_path_factory):
     """Two sets, a tiny configuration, and scores of the first set."""
     place = tmp_path_factory.mktemp("train")
     for seed in (3, 4):
-        generate(place / f"set-{seed}", 2, seed, Generation(workers=1))
+        generate(place / f"set-{seed}", 2, seed, Generation(workers=0))
     (place / "tiny.yaml").write_text(json.dumps(TINY))
     call = ["curate", "uniform", "--data", str(place / "set-3"), "--out", str(place / "scores.npz")]
     assert main(call) == 0

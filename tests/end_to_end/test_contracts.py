@@ -67,7 +67,7 @@ BENCH = {
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("contracts") / "set"
-    generate(path, 6, 21, Generation(workers=1))
+    generate(path, 6, 21, Generation(workers=0))
     return path
 
 

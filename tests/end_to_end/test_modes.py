@@ -24,7 +24,7 @@ START = 60
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("modes") / "set"
-    generate(path, 2, 21, Generation(workers=1))
+    generate(path, 2, 21, Generation(workers=0))
     return path
 
 

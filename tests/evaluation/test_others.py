@@ -61,7 +61,7 @@ def nearest_m(scenario, drive, step):
 
 @pytest.mark.slow
 def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
-    generate(tmp_path / "set", 24, 3, Generation(workers=1))
+    generate(tmp_path / "set", 24, 3, Generation(workers=0))
     call = ["evaluate", "--planner", "constant_velocity", "--data", str(tmp_path / "set"), "--traffic", "idm"]
     assert main([*call, "--out", str(tmp_path / "run")]) == 0
     evaluations, _ = read_runs([tmp_path / "run"])
@@ -81,7 +81,7 @@ def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
 
 @pytest.mark.slow
 def test_where_the_log_is_replayed_nothing_is_kept(tmp_path):
-    generate(tmp_path / "set", 2, 3, Generation(workers=1))
+    generate(tmp_path / "set", 2, 3, Generation(workers=0))
     assert drivax.evaluate("constant_velocity", tmp_path / "set").others is None
     found = drivax.evaluate("constant_velocity", tmp_path / "set", traffic="idm").others
     scenarios = ScenarioSet.open(tmp_path / "set")

@@ -9,5 +9,5 @@ from drivax.synthetic.generate import Generation, generate
 @pytest.fixture(scope="session")
 def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("learning") / "set"
-    generate(path, 3, 11, Generation(workers=1))
+    generate(path, 3, 11, Generation(workers=0))
     return ScenarioSet.open(path)

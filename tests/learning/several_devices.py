@@ -116,7 +116,7 @@ def divides_batches(learner, data):
 
 def whole_runs(folder):
     """Run folders on two devices: validated, stopped and resumed in the middle, like one of one device."""
-    generate(folder / "set", 2, 7, Generation(workers=1))
+    generate(folder / "set", 2, 7, Generation(workers=0))
     data = ScenarioSet.open(folder / "set")
     task = Task(observation=SEEN, metrics=("steps",))
     algorithm, count = ALGORITHMS["ppo"], 4

@@ -183,7 +183,7 @@ def test_a_run_is_never_overwritten_or_resumed_on_other_data(data, config, tmp_p
     train(config, data, tmp_path / "run")
     with pytest.raises(UsageError, match="--overwrite"):
         train(config, data, tmp_path / "run")
-    generate(tmp_path / "other", 1, 12, Generation(workers=1))
+    generate(tmp_path / "other", 1, 12, Generation(workers=0))
     other = ScenarioSet.open(tmp_path / "other")
     with pytest.raises(UsageError, match="other scenarios"):
         train(config, other, tmp_path / "run", resume=True)

@@ -16,6 +16,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.settings import dump
 from drivax.synthetic import generate as generation
 from drivax.synthetic.generate import RESERVED_SEED, FamilyCount, GeneratedSet, Generation, generate
+from drivax.synthetic.portable import portable_workers
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 
 SCENARIOS = 7
@@ -25,7 +26,10 @@ SCENARIOS = 7
 def one_worker(tmp_path_factory):
     path = tmp_path_factory.mktemp("sets") / "one"
     progress = []
-    result = generate(path, SCENARIOS, 5, progress=lambda done, total: progress.append((done, total)))
+    options = Generation(workers=1)
+    result = generate(
+        path, SCENARIOS, 5, options, progress=lambda done, total: progress.append((done, total))
+    )
     return path, result, progress
 
 
@@ -40,21 +44,48 @@ def test_any_number_of_workers_writes_the_same_bytes(one_worker, tmp_path):
     assert two.families == result.families
 
 
-def test_processors_without_newer_instructions_write_the_same_bytes(one_worker, tmp_path):
-    """NumPy takes other routines there, whose last bits differ."""
-    path, _, _ = one_worker
+def test_processors_without_newer_instructions_write_the_same_bytes(tmp_path):
+    """NumPy takes other routines there, whose last bits differ, and OpenBLAS other kernels."""
     newer = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
     if not newer:
         pytest.skip("this processor has none of the newer instructions that NumPy knows")
-    call = (
-        f"from drivax.synthetic.generate import generate; generate({str(tmp_path / 'old')!r}, {SCENARIOS}, 5)"
+    hashes = []
+    for number, more in enumerate(
+        ({"NPY_DISABLE_CPU_FEATURES": " ".join(newer), "OPENBLAS_CORETYPE": "Nehalem"}, {})
+    ):
+        out = tmp_path / str(number)
+        words = ["generate", str(out), "--scenarios", str(SCENARIOS), "--seed", "5", "--workers", "1"]
+        call = [sys.executable, "-m", "drivax", *words]
+        subprocess.run(call, env={**os.environ, **more}, check=True)
+        hashes.append(ScenarioSet.open(out).hash)
+    assert hashes[0] == hashes[1]
+
+
+def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
+    """Sines of a million angles, and solutions of equations, in processes with and without what this processor has."""
+    script = tmp_path / "computes.py"
+    script.write_text(
+        "import hashlib, numpy as np\n"
+        "from numpy._core import _multiarray_umath as u\n"
+        "rng = np.random.default_rng(0)\n"
+        "angles, square = rng.normal(size=1_000_000), rng.normal(size=(60, 60))\n"
+        "found = np.concatenate([np.sin(angles), np.exp(angles), np.linalg.solve(square, angles[:60])])\n"
+        "print(any(u.__cpu_features__[name] for name in u.__cpu_dispatch__), hashlib.sha256(found).hexdigest())\n"
     )
-    subprocess.run(
-        [sys.executable, "-c", call],
-        env={**os.environ, "NPY_DISABLE_CPU_FEATURES": " ".join(newer)},
-        check=True,
-    )
-    assert ScenarioSet.open(tmp_path / "old").hash == ScenarioSet.open(path).hash
+
+    def numbers():
+        call = [sys.executable, str(script)]
+        return subprocess.run(call, env=os.environ, capture_output=True, text=True, check=True).stdout
+
+    found = []
+    for kernel in (None, "SkylakeX"):
+        if kernel is not None:
+            monkeypatch.setenv("OPENBLAS_CORETYPE", kernel)
+        before = dict(os.environ)
+        with portable_workers():
+            found.append(numbers())
+        assert dict(os.environ) == before
+    assert found[0] == found[1] and found[0].startswith("False")
 
 
 def test_counts_and_progress(one_worker):
@@ -142,7 +173,7 @@ def test_what_cannot_be_meant_is_refused(tmp_path):
         ((1, RESERVED_SEED), "seed is 1000000000; use 0 to 999999999"),
         ((1, 0, Generation(world=WorldConfig(rare_rate=1.5))), "rare_rate is 1.5; use a share from 0 to 1"),
         ((1, 0, Generation(world=WorldConfig(scenarios_per_map=0))), "scenarios_per_map is 0; use 1"),
-        ((1, 0, Generation(workers=0)), "workers is 0; use 1 or more"),
+        ((1, 0, Generation(workers=-1)), "workers is -1; use 0 or more"),
         ((1, 0, Generation(capacity="tiny")), "no capacity 'tiny'; use one of default, large"),
     ):
         with pytest.raises(UsageError, match=text):

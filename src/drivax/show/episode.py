@@ -58,7 +58,7 @@ def as_driven(scenario: Scenario, drive: Drive) -> Scenario:
         return scenario
     pose = drive.others[drive.start :]
     steps, known = slice(drive.start, drive.start + len(pose)), slice(1, pose.shape[1])
-    there = np.isfinite(pose[:, known]).all(axis=-1)
+    there = np.asarray(np.isfinite(pose[:, known]).all(axis=-1))
     found = np.where(there[..., None], pose[:, known], 0.0)
     record = scenario.record.copy()
     record["agent_valid"][steps, 1:] = False

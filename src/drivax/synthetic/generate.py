@@ -1,7 +1,8 @@
 """Scenario sets of the built-in world: drawn and assembled in worker processes, written in order by one.
 
-The bytes of a set depend on the seed and the number of scenarios only, not on the number of workers. Nothing here
-imports JAX, so that workers start in a fraction of a second; an audit that needs it is handed in.
+The bytes of a set depend on the seed and the number of scenarios only, neither on the number of workers nor on the
+processor (``portable``). Nothing here imports JAX, so that workers start in a fraction of a second; an audit that needs
+it is handed in.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import dataclasses
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from drivax.errors import DrivaxError, UsageError
 from drivax.scenario.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
+from drivax.synthetic.portable import portable_workers
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
 
@@ -44,13 +46,14 @@ class Generation:
     """How to generate.
 
     Attributes:
-        workers: Processes; with 1 everything happens in this one.
+        workers: Processes that draw. With 0 this one does, without waiting for others to start, and whose NumPy follows
+            the processor in its last bits: only workers write the same bytes everywhere.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         overwrite: Replace an existing scenario set.
         world: What the world is like.
     """
 
-    workers: int = 1
+    workers: int = 0
     capacity: str = "default"
     overwrite: bool = False
     world: WorldConfig = field(default_factory=WorldConfig)
@@ -61,8 +64,8 @@ class Generation:
         Raises:
             UsageError: The first of them.
         """
-        if self.workers < 1:
-            raise UsageError(f"workers is {self.workers}", cure="use 1 or more")
+        if self.workers < 0:
+            raise UsageError(f"workers is {self.workers}", cure="use 0 or more")
         if self.capacity not in CAPACITIES:
             raise UsageError(
                 f"there is no capacity {self.capacity!r}", cure=f"use one of {', '.join(CAPACITIES)}"
@@ -218,11 +221,17 @@ def _draw(first: int, last: int, seed: int, options: Generation) -> list[_Drawn]
 def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, None, None]:
     """All scenarios in order."""
     spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
-    if options.workers == 1:
+    if options.workers == 0:
         for first, last in spans:
             yield from _draw(first, last, seed, options)
         return
-    pool = worker_pool(min(options.workers, len(spans)))
+    with portable_workers():
+        yield from _drawn_by(worker_pool(min(options.workers, len(spans))), spans, seed, options)
+
+
+def _drawn_by(
+    pool: ProcessPoolExecutor, spans: list[tuple[int, int]], seed: int, options: Generation
+) -> Generator[_Drawn, None, None]:
     waiting: deque[Future[list[_Drawn]]] = deque()
     try:
         for first, last in spans:
