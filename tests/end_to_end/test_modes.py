@@ -10,11 +10,14 @@ import sys
 import numpy as np
 import pytest
 
+import drivax
 from drivax import settings
-from drivax.api import load
+from drivax.api import find_planner, load
 from drivax.cli import main
+from drivax.errors import UsageError
 from drivax.evaluation.runs import EvaluationConfig
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.generate import Generation, generate
 from tiny_run import write_run
 
@@ -55,6 +58,12 @@ def test_a_sampling_checkpoint_from_noisy_starts_over_an_old_run(data, tmp_path,
     logged = np.stack([one.agent_xy[START, 0] for one in scenarios])
     away = np.linalg.norm(sampled["ego"][:, 0, :2] - logged, axis=1)
     assert (away > 0.01).all(), "a second of wrong driving leads elsewhere than the log"
+    options = {"start": NoisyStart(), "start_step": START, "seed": 7, "metrics": ("own_terms:nearest_other",)}
+    found = drivax.evaluate(planner, data, sample=True, **options)
+    np.testing.assert_array_equal(found.motion.astype(np.float32), sampled["ego"])
+    assert list(found.own) == ["nearest_other"]
+    with pytest.raises(UsageError, match="only a policy by name can sample"):
+        drivax.evaluate(find_planner(planner, load(data).bank)[0], data, sample=True)
     (out / "crashes.json").write_text("[]")
     capsys.readouterr()
     assert evaluate(data, planner, out) == 2 and "exists already" in capsys.readouterr().err

@@ -85,7 +85,9 @@ def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("planner", ["idm", "random", "pdm", "search", "zoo:aggressive"])
+@pytest.mark.parametrize(
+    "planner", ["expert", "constant_velocity", "idm", "random", "pdm", "search", "zoo:aggressive"]
+)
 def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
     with ScenarioWriter(tmp_path / "set", scenarios[0].capacity) as writer:
         for scenario in scenarios:
