@@ -52,8 +52,8 @@ def seconds(call: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def updates(config: TrainConfig, data: ScenarioSet, repeats: int) -> dict[str, Any]:
-    """Of one training: updates per second, parameters that gradients change, and what preparing the steps took."""
+def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
+    """What runs an iteration of a training, and its size: gradients change so many parameters."""
     environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     began = time.perf_counter()
@@ -63,38 +63,52 @@ def updates(config: TrainConfig, data: ScenarioSet, repeats: int) -> dict[str, A
     program = Program(Agents(learner, (0,)), made, 1)
     state = [program.first_state()]
     trained = state[0].parameters, getattr(state[0], "rest", ())
+    size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
 
     def iterate() -> Any:
         state[0], logs = program.step(state[0])
         return logs
 
-    size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
     algorithm: Any = config.algorithm
-    return {
-        "updates_per_second": round(algorithm.updates / seconds(iterate, repeats), 1),
+    return iterate, {
         "batch": algorithm.batch,
         "parameters": size,
         "seconds_to_prepare": round(prepared, 1),
     }
 
 
+def updates(config: TrainConfig, data: ScenarioSet, repeats: int) -> dict[str, Any]:
+    """Of one training: updates per second, its size, and what preparing the steps took."""
+    iterate, size = training(config, data)
+    algorithm: Any = config.algorithm
+    return {"updates_per_second": round(algorithm.updates / seconds(iterate, repeats), 1), **size}
+
+
 def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
-    """Seconds per iteration of the default ensemble, and of one of its scouts alone."""
+    """Seconds per iteration of the default ensemble and of one of its scouts alone, by turns."""
     config = ScoutsConfig()
-    one = updates(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data, repeats)
+    iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
-    ends: list[float] = []
-    train_scouts(config, data, lambda done, total: ends.append(time.perf_counter()))
-    all_of_them = statistics.median(np.diff(ends))
-    alone = config.cloning.updates / one["updates_per_second"]
+    began, all_of_them, alone = [0.0], list[float](), list[float]()
+
+    def turn(done: int, total: int) -> None:
+        ended = time.perf_counter()
+        jax.block_until_ready(iterate())
+        if done > 1:
+            all_of_them.append(ended - began[0])
+            alone.append(time.perf_counter() - ended)
+        began[0] = time.perf_counter()
+
+    train_scouts(config, data, turn)
+    one, together = statistics.median(alone), statistics.median(all_of_them)
     return {
         "scouts": config.folds,
-        "parameters_of_one": one["parameters"],
+        "parameters_of_one": size["parameters"],
         "batch": config.cloning.batch,
         "updates": config.cloning.updates,
-        "seconds_of_one": round(alone, 3),
-        "seconds_of_all": round(all_of_them, 3),
-        "ratio": round(all_of_them / alone, 2),
+        "seconds_of_one": round(one, 3),
+        "seconds_of_all": round(together, 3),
+        "ratio": round(together / one, 2),
     }
 
 
