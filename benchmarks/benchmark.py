@@ -111,7 +111,7 @@ def drive(args: argparse.Namespace) -> None:
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     EPISODES.mkdir(parents=True, exist_ok=True)
     tags = {tag: np.array([entry["tags"][tag] for entry in stored.entries]) for tag in TAGS}
-    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, **tags)
+    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(stored.hash), **tags)
     for name in args.planner or (*PLANNERS, *learned()):
         for kind in args.traffic:
             found = [
@@ -225,7 +225,9 @@ def judged() -> dict[str, Any]:
 def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
     """Accuracy in recorded traffic by tag of the scenarios and its value, of every planner."""
     with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
-        tags = {tag: stored[tag] for tag in TAGS}
+        tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
+    if any(one.about["test"] != of for one in driven.values()):
+        raise SystemExit("the tags are those of another test set: drive a planner anew")
     planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
     found = []
     for tag, values in tags.items():
@@ -283,7 +285,7 @@ def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
         (name, f"`{kind}`", *cells(planners[name][kind], shown))
         for name in (BOX, "expert")
         for kind in TRAFFIC
-        if kind in planners[name]
+        if kind in planners.get(name, {})
     ]
     found["random"] = table(("planner", "traffic", *shown.values()), rows)
     names = [name for name in order if name in result["strata"][0]["planners"]]

@@ -98,6 +98,8 @@ def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
         values = columns | {"accuracy": np.array(accuracy)}
         np.savez(benchmark.file_of(name, kind), about=json.dumps(about), segment=["s", "s", "t"], **values)
 
+    tags = {tag: ["few", "many", "many"] for tag in benchmark.TAGS}
+    np.savez(tmp_path / benchmark.STRATA, test="a", **tags)
     keep("idm", "log", [[1, 1, 0]])
     keep("idm", "idm", [[1, 0, 0]])
     keep("bc", "log", [[1, 1, 1], [1, 1, 0]])
@@ -109,9 +111,12 @@ def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
     np.testing.assert_allclose(found["reactive"]["idm"]["accuracy"]["mean"], -1 / 3)
     assert list(found["differences"]["log"]) == ["bc - idm"] and not found["differences"]["idm"]
     np.testing.assert_allclose(found["differences"]["log"]["bc - idm"]["accuracy"]["mean"], 1 / 6)
+    few, many = found["strata"][:2]
+    assert (few["value"], few["scenarios"], few["planners"]["bc"]["mean"]) == ("few", 1, 1.0)
+    assert (many["scenarios"], many["planners"]["idm"]["mean"]) == (2, 0.5)
     shown = benchmark.page(found)
     assert [line.split(" | ")[:2] for line in shown["idm"][2:]] == [["| `idm`", "1"]]
-    assert shown["random"][2].startswith("| `log` | 0.5")
+    assert shown["random"][2].startswith(f"| {benchmark.BOX} | `log` | 0.5")
     keep("pdm", "log", [[1, 1, 1]], test="b")
     with pytest.raises(SystemExit, match="2 test sets"):
         benchmark.judged()

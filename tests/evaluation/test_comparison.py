@@ -221,6 +221,17 @@ def test_seeds_that_agree_are_told_apart_or_said_to_be_alike():
     assert found.sensitivity.needed == N
 
 
+def test_seeds_that_differ_alike_everywhere_ask_for_seeds():
+    rows = [np.ones(N), np.zeros(N)]
+    seeds = [table(f"seed-{n}", vmax_score=row) for n, row in enumerate(rows)]
+    found = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
+    assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "seeds")
+    same = compare(
+        PLAN, [table(f"seed-{n}", vmax_score=rows[0]) for n in range(2)], [table("two", vmax_score=rows[0])]
+    )
+    assert (same.decision.recommendation, same.decision.because) == ("no difference", "alike")
+
+
 def test_seeds_on_one_recording_tell_nothing():
     found = compare(PLAN, seeds_of(0.0, 0.1, per_recording=N), [table("two", per_recording=N)])
     assert found.primary.evidence.p is None and found.primary.winner is None and found.sensitivity is None

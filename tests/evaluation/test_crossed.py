@@ -11,6 +11,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.crossed import (
     Crossed,
     agents_interval,
+    certain,
     crossed_difference,
     crossed_mean,
     log_ratio,
@@ -220,6 +221,8 @@ def test_intervals_of_agents():
     assert agents_interval(few).low < 0.0 == agents_interval(few, rate=True).low
     never = agents_interval(np.zeros((3, 60)), clusters, rate=True)
     assert never == replace(wilson(0, 30), n=60)
+    for count in (6, 1000):  # shares of which do not add up to 1 in floats
+        assert agents_interval(np.ones((3, count)), rate=True) == replace(wilson(count, count), n=count)
     assert agents_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)
     assert agents_interval(np.full((2, 3), np.nan)).mean is None
 
@@ -229,3 +232,23 @@ def test_power_is_that_of_what_is_detectable():
     found = crossed_difference(rng.normal(size=(3, 80)) + rng.normal(size=(3, 1)), rng.normal(size=(3, 80)))
     assert found.power(found.detectable(0.8)) == pytest.approx(0.8)
     assert found.power(0.0) < 0.05 and Crossed(0.1, (0.0, 0.0), 0.0, (2, 2), 9).power(0.1) == 1.0
+
+
+def test_more_clusters_may_help_although_many_more_would_not():
+    """With ever more clusters only the seeds' two degrees of freedom are left."""
+    one = Crossed(5.0, (1.0, 0.0), 5.0, (3, 2), 100)
+    needed = one.clusters_needed()
+    assert needed is not None and 100 < needed < 1000
+    assert replace(one, scenarios=5.0 * 100 / needed, clusters=needed).detectable() <= 5.0
+    before = needed - 1
+    assert replace(one, scenarios=5.0 * 100 / before, clusters=before).detectable() > 5.0
+    assert replace(one, difference=1.0).clusters_needed() is None
+
+
+def test_the_same_numbers_are_no_difference():
+    """Three times a number, by three, may be another float."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        row = rng.integers(0, 11, 300) / 10
+        found = crossed_difference(np.stack([row] * 3), certain(row[None]))
+        assert found.difference == 0.0 and found.p == 1.0

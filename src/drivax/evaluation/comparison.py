@@ -283,14 +283,17 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
         a, b = x[~np.isnan(x)], y[~np.isnan(y)]
         share = a.size / apart.size
         deviation = pooled_deviation(a, b) if apart.size > 2 else 0.0
-    if deviation <= ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
+    if apart.size < 2:
         return None
-    smallest = plan.smallest_difference or SMALL_EFFECT * deviation
-    effect, inflation = smallest / deviation, design_effect(apart, labels)
+    inflation = design_effect(apart, labels)
     if max(len(side.tables) for side in sides) > 1:
         return _sensitivity_of_seeds(
             plan, _of_seeds(plan, plan.primary, sides)[1], apart.size, deviation, inflation
         )
+    if deviation <= ROUNDING * max(np.nanmax(np.abs(x)), np.nanmax(np.abs(y))):
+        return None
+    smallest = plan.smallest_difference or SMALL_EFFECT * deviation
+    effect = smallest / deviation
     n = apart.size / inflation
     seen = detectable(n, plan.power, plan.confidence, share)
     return Sensitivity(
@@ -307,7 +310,7 @@ def _sensitivity_of_seeds(
     plan: ComparisonPlan, found: Crossed | None, n: int, deviation: float, inflation: float
 ) -> Sensitivity | None:
     """The same where seeds vary too, which more scenarios do not change."""
-    if found is None:
+    if found is None or found.error == 0.0:
         return None
     smallest = plan.smallest_difference or SMALL_EFFECT * deviation
     chance, needed = found.power(smallest, plan.confidence), n

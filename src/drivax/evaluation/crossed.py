@@ -16,6 +16,7 @@ from scipy import special
 
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import dense
+from drivax.evaluation.effects import ROUNDING
 from drivax.evaluation.statistics import Interval, wilson
 
 #: Values of the agents of one kind, one column per scenario.
@@ -25,7 +26,8 @@ Others = Float64[np.ndarray, "other_agent other_scenario"]
 Weights = Float64[np.ndarray, " scenario"]
 #: What is wanted of a comparison that has not been made yet.
 _CONFIDENCE, _POWER = 0.95, 0.80
-_MOST = 10**6
+#: The largest number that is considered, and how many up to there.
+_MOST, _TRIED = 10**6, 400
 
 
 @dataclass(frozen=True)
@@ -131,11 +133,16 @@ class Crossed:
         def found(number: int) -> bool:
             return abs(self.difference) >= at(number).detectable(power, confidence)
 
-        if self.difference == 0.0 or not found(_MOST):
+        # More is not always better: the fewer degrees of freedom are left, the more the part that stays alone weighs.
+        numbers = (
+            np.unique(np.round(np.geomspace(present + 1, max(_MOST, present + 1), _TRIED)))
+            .astype(int)
+            .tolist()
+        )
+        at_least = next((place for place, number in enumerate(numbers) if found(number)), None)
+        if self.difference == 0.0 or at_least is None:
             return None
-        low, high = present, present + 1
-        while not found(high):
-            low, high = high, 2 * high
+        low, high = (numbers[at_least - 1] if at_least else present), numbers[at_least]
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (low, middle) if found(middle) else (middle, high)
@@ -190,8 +197,9 @@ def agents_interval(
         return Interval(float(values[:, keep].mean()) if number else None, None, None, number)
     found = crossed_mean(values, labels, weights)
     low, high = found.interval(confidence)
-    if rate and found.error == 0.0 and found.difference in (0.0, 1.0):
-        return replace(wilson(found.difference * found.clusters, found.clusters, confidence), n=number)
+    only = np.unique(values[:, keep])
+    if rate and only.size == 1 and only[0] in (0.0, 1.0):
+        return replace(wilson(float(only[0]) * found.clusters, found.clusters, confidence), n=number)
     if rate:
         low, high = max(low, 0.0), min(high, 1.0)
     return Interval(found.difference, low, high, number)
@@ -224,6 +232,8 @@ def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weig
     more = number / (number - 1)
     kinds = [one[:, keep] for one in (a, b)]
     apart = kinds[0].mean(axis=0) - kinds[1].mean(axis=0)
+    # What sums of equal numbers differ by is no difference.
+    apart = np.where(np.abs(apart) <= ROUNDING * max(float(np.abs(one).max()) for one in kinds), 0.0, apart)
     mean = float(apart @ share)
     scenarios = more * float(np.square(np.bincount(labels, share * (apart - mean), number)).sum())
     seeds, both = [], []

@@ -97,7 +97,7 @@ def _episode(
 
     def others(state: SimState) -> Int16[Array, "A 3"] | None:
         traffic = simulator.traffic
-        return None if isinstance(traffic, LogTraffic) else packed(traffic.agents(bank, state.scene, 0))
+        return None if traffic.name == LogTraffic.name else packed(traffic.agents(bank, state.scene, 0))
 
     def one(now: Any, key: Array) -> Any:
         state, kept, carry, sound = now

@@ -126,7 +126,9 @@ def _unique(name: str, folder: Path, names: set[str]) -> str:
 
 def _evaluation(folder: Path, name: str, about: Mapping[str, Any]) -> Evaluation:
     columns = read_episodes(folder)
-    driven = _trajectories(present(folder / "trajectories.npz"), replayed=about.get("traffic") == "log")
+    driven = _trajectories(
+        present(folder / "trajectories.npz"), replayed=about.get("traffic", "log") == "log"
+    )
     return Evaluation(folder, name, about, *columns, driven, _crashes(folder / "crashes.json"))
 
 
@@ -157,7 +159,9 @@ def _trajectories(path: Path, replayed: bool) -> Trajectories:
     n = len(ids)
     if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
         array.shape != (n,) for array in (start, *events.values())
-    ) or (others is not None and (others.shape[:2] != ego.shape[:2] or others.dtype != np.int16)):  # fmt: skip
+    ) or (others is not None and (
+        others.ndim != 4 or others.shape[:2] != ego.shape[:2] or others.shape[3] != 3 or others.dtype != np.int16
+    )):  # fmt: skip
         raise DataError("its arrays disagree in shape", file=path, cure=AGAIN)
     seen: dict[str, int] = {}
     rows = {}

@@ -1,8 +1,8 @@
 """Scenario sets of the built-in world: drawn and assembled in worker processes, written in order by one.
 
-The bytes of a set depend on the seed and the number of scenarios only, neither on the number of workers nor on the
-processor (``portable``). Nothing here imports JAX, so that workers start in a fraction of a second; an audit that needs
-it is handed in.
+The bytes of a set depend on the seed and the number of scenarios only, neither on the number of workers nor, if they
+draw, on the processor (``portable``). Nothing here imports JAX, so that workers start in a fraction of a second; an
+audit that needs it is handed in.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import dataclasses
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -225,17 +225,12 @@ def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, 
         for first, last in spans:
             yield from _draw(first, last, seed, options)
         return
-    with portable_workers():
-        yield from _drawn_by(worker_pool(min(options.workers, len(spans))), spans, seed, options)
-
-
-def _drawn_by(
-    pool: ProcessPoolExecutor, spans: list[tuple[int, int]], seed: int, options: Generation
-) -> Generator[_Drawn, None, None]:
+    pool = worker_pool(min(options.workers, len(spans)))
     waiting: deque[Future[list[_Drawn]]] = deque()
     try:
         for first, last in spans:
-            waiting.append(pool.submit(_draw, first, last, seed, options))
+            with portable_workers():  # processes are started as they are needed
+                waiting.append(pool.submit(_draw, first, last, seed, options))
             if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
         while waiting:

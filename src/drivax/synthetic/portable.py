@@ -16,15 +16,16 @@ from contextlib import contextmanager
 _umath = importlib.import_module("numpy._core._multiarray_umath")
 
 
+_FEATURES = "NPY_DISABLE_CPU_FEATURES"
+
+
 @contextmanager
 def portable_workers() -> Iterator[None]:
     """Processes that are started within compute alike on any x86-64 processor; this one is as it was."""
-    found = {
-        "NPY_DISABLE_CPU_FEATURES": " ".join(
-            name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name]
-        ),
-        "OPENBLAS_CORETYPE": "Prescott",
-    }
+    # What this process was told to leave alone it does not have any more, but they would.
+    told = os.environ.get(_FEATURES, "").split()
+    newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in told]
+    found = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
     before = {name: os.environ.get(name) for name in found}
     os.environ.update(found)
     try:
