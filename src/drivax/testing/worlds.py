@@ -6,7 +6,8 @@ is, what padding holds, and what happens later.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from functools import cache, partial
 from typing import Any
 
@@ -120,7 +121,7 @@ def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Si
 def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:
     """The same agents in other slots; the driven one (slot 0) stays."""
     order = order_of(frame.valid.shape[-1], seed)
-    return jax.tree.map(lambda leaf: leaf[:, order], frame)
+    return _of_agents(lambda leaf: leaf[:, order], frame)
 
 
 def padded_frame(frame: Frame, slots: int = 8) -> Frame:
@@ -131,7 +132,7 @@ def padded_frame(frame: Frame, slots: int = 8) -> Frame:
         more = jnp.full((leaf.shape[0], slots, *leaf.shape[2:]), fill).astype(leaf.dtype)
         return jnp.concatenate([leaf, more], axis=1)
 
-    return jax.tree.map(pad, frame)
+    return _of_agents(pad, frame)
 
 
 def littered_frame(frame: Frame) -> Frame:
@@ -141,12 +142,18 @@ def littered_frame(frame: Frame) -> Frame:
         there = frame.valid.reshape(*frame.valid.shape, *(1,) * (leaf.ndim - 2))
         return leaf if leaf.dtype == bool else jnp.where(there, leaf, GARBAGE).astype(leaf.dtype)
 
-    return jax.tree.map(fill, frame)
+    return _of_agents(fill, frame)
 
 
 def deserted_frame(frame: Frame) -> Frame:
     """Nobody but the driven agent."""
     return replace(frame, valid=frame.valid & (jnp.arange(frame.valid.shape[-1]) == 0))
+
+
+def _of_agents(change: Callable[[Array], Array], frame: Frame) -> Frame:
+    """The frame with what it says of agents changed; lights are no agents."""
+    names = [field.name for field in fields(frame) if field.name != "lights"]
+    return replace(frame, **{name: change(getattr(frame, name)) for name in names})
 
 
 def with_frame(moments: Moments, frame: Frame) -> Moments:
