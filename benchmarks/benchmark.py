@@ -23,7 +23,7 @@ import numpy as np
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.crossed import agents_interval, difference_interval
-from drivax.evaluation.results import RATES, Results, interval_of
+from drivax.evaluation.results import SHARES, Results, interval_of
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap
 from drivax.learning.policies import load_policy
@@ -161,7 +161,7 @@ def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval
     if against is None:
         if len(own) == 1:
             return interval_of(metric, own[0], segments)
-        return agents_interval(own, segments, rate=metric in RATES)
+        return agents_interval(own, segments, share=metric in SHARES)
     other = against.values[metric].astype(np.float64)
     if len(own) == len(other) == 1:
         return paired_bootstrap(own[0], other[0], segments, seed=0)

@@ -226,6 +226,7 @@ def test_seeds_that_differ_alike_everywhere_ask_for_seeds():
     seeds = [table(f"seed-{n}", vmax_score=row) for n, row in enumerate(rows)]
     found = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
     assert (found.decision.recommendation, found.decision.because) == ("not enough scenarios", "seeds")
+    assert (found.primary.a.low, found.primary.a.high) == (0.0, 1.0), "a score is no less, and no more"
     same = compare(
         PLAN, [table(f"seed-{n}", vmax_score=rows[0]) for n in range(2)], [table("two", vmax_score=rows[0])]
     )

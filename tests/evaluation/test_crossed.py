@@ -218,11 +218,11 @@ def test_intervals_of_agents():
     # A rate lies within 0 and 1, and is never certain.
     few = np.zeros((2, 20))
     few[0, 0] = 1.0
-    assert agents_interval(few).low < 0.0 == agents_interval(few, rate=True).low
-    never = agents_interval(np.zeros((3, 60)), clusters, rate=True)
+    assert agents_interval(few).low < 0.0 == agents_interval(few, share=True).low
+    never = agents_interval(np.zeros((3, 60)), clusters, share=True)
     assert never == replace(wilson(0, 30), n=60)
     for count in (6, 1000):  # shares of which do not add up to 1 in floats
-        assert agents_interval(np.ones((3, count)), rate=True) == replace(wilson(count, count), n=count)
+        assert agents_interval(np.ones((3, count)), share=True) == replace(wilson(count, count), n=count)
     assert agents_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)
     assert agents_interval(np.full((2, 3), np.nan)).mean is None
 

@@ -39,7 +39,7 @@ from drivax.evaluation.hypotheses import (
 )
 from drivax.evaluation.misfits import refuse_metric, refuse_misfits, refuse_undefined
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.results import RATES, interval_of
+from drivax.evaluation.results import RATES, SHARES, interval_of
 from drivax.evaluation.split import Split, assign, strata_of
 from drivax.evaluation.statistics import (
     Interval,
@@ -252,7 +252,7 @@ def _interval(plan: ComparisonPlan, metric: str, side: _Side, counts: Bool[np.nd
         x = np.where(counts, side.values(metric), np.nan)
         return interval_of(metric, x, clusters, plan.confidence, plan.seed)
     x = np.where(counts, side.by_seed(metric), np.nan)
-    return agents_interval(x, clusters, confidence=plan.confidence, rate=metric in RATES)
+    return agents_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
 
 
 def _is_binary(x: Values) -> bool:

@@ -176,7 +176,7 @@ def agents_interval(
     weights: Weights | None = None,
     confidence: float = _CONFIDENCE,
     *,
-    rate: bool = False,
+    share: bool = False,
 ) -> Interval:
     """The mean of one kind of agents with the interval of :func:`crossed_mean`.
 
@@ -185,7 +185,7 @@ def agents_interval(
         clusters: The same.
         weights: The same.
         confidence: Coverage.
-        rate: The interval lies within 0 and 1; where all is 0, or all is 1, it is Wilson's of as many clusters.
+        share: The interval lies within 0 and 1; where all is 0, or all is 1, it is Wilson's of as many clusters.
 
     Returns:
         ``n`` counts scenarios that all agents define; no bounds with fewer than two clusters of them.
@@ -198,9 +198,9 @@ def agents_interval(
     found = crossed_mean(values, labels, weights)
     low, high = found.interval(confidence)
     only = np.unique(values[:, keep])
-    if rate and only.size == 1 and only[0] in (0.0, 1.0):
+    if share and only.size == 1 and only[0] in (0.0, 1.0):
         return replace(wilson(float(only[0]) * found.clusters, found.clusters, confidence), n=number)
-    if rate:
+    if share:
         low, high = max(low, 0.0), min(high, 1.0)
     return Interval(found.difference, low, high, number)
 

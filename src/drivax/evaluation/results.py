@@ -23,6 +23,8 @@ RATES = (
     "accuracy", "accuracy_at_fault", "success", "success_moving", "collision", "at_fault_collision", "offroad",
     "left_map", "off_route", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal", "crashed",
 )  # fmt: skip
+#: What lies between 0 and 1: these, and the scores.
+SHARES = (*RATES, "vmax_score", "nuplan_score", "vmax_score_partial", "nuplan_score_partial")
 #: Codes and counts that no mean makes sense of.
 NOT_SUMMARISED = ("collision_type", "steps")
 #: What an episode is, by these metrics, whose planner crashed: failed.
