@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import dump
 from drivax.synthetic import generate as generation
+from drivax.synthetic import portable
 from drivax.synthetic.generate import RESERVED_SEED, FamilyCount, GeneratedSet, Generation, generate
 from drivax.synthetic.portable import portable_workers
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
@@ -86,6 +88,16 @@ def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
             found.append(numbers())
         assert dict(os.environ) == before
     assert found[0] == found[1] and found[0].startswith("False")
+
+
+def test_workers_are_told_again_what_this_process_was_told(monkeypatch):
+    """What it was told to leave alone it lacks; a worker that was not told would have it."""
+    has = {"A": True, "B": False, "C": False}
+    monkeypatch.setattr(portable, "_umath", SimpleNamespace(__cpu_dispatch__=[*has], __cpu_features__=has))
+    monkeypatch.setenv("NPY_DISABLE_CPU_FEATURES", "B")
+    with portable_workers():
+        assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "A B"
+    assert os.environ["NPY_DISABLE_CPU_FEATURES"] == "B"
 
 
 def test_counts_and_progress(one_worker):

@@ -121,7 +121,11 @@ def frames(scenario: Scenario, drives: Sequence[Drive], theme: str = "light") ->
     """
     side = ALONE if len(drives) == 1 else BESIDE
     canvas = Canvas(side, side, theme)
-    sceneries = [Scenery(canvas, as_driven(scenario, drive), drives) for drive in drives]
+    recorded = Scenery(canvas, scenario, drives)
+    sceneries = [
+        recorded if drive.others is None else Scenery(canvas, as_driven(scenario, drive), drives)
+        for drive in drives
+    ]
     across = len(drives) if len(drives) <= _ACROSS else -(-len(drives) // (-(-len(drives) // _ACROSS)))
     legend = legend_strip(across * side, theme)
     for step in range(min(drive.start for drive in drives), int(scenario.steps)):

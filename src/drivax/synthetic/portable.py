@@ -14,8 +14,7 @@ from contextlib import contextmanager
 
 #: What NumPy was built for beyond the oldest processor, and what of it this one has.
 _umath = importlib.import_module("numpy._core._multiarray_umath")
-
-
+#: Tells NumPy which of them to leave alone.
 _FEATURES = "NPY_DISABLE_CPU_FEATURES"
 
 
