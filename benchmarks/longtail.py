@@ -5,7 +5,8 @@ python benchmarks/longtail.py keep --out STUDY      (what is done, into benchmar
 python benchmarks/longtail.py restore --out STUDY   (what was kept, into a new folder, where the study goes on)
 python benchmarks/longtail.py table                 (the results that were kept, into the page)
 
-Of every agent the run without its checkpoints and the episodes are kept, and so are the scores of the scouts.
+Of every agent the run without its checkpoints and the episodes are kept, and so are the scores: another processor
+rounds otherwise, and what was trained with other weights belongs to another study.
 BENCHMARK is what `drivax generate BENCHMARK --benchmark` made.
 """
 
@@ -31,14 +32,12 @@ ROOT = Path(__file__).resolve().parents[1]
 KEPT = ROOT / "benchmarks" / "results" / "longtail"
 PAGE = ROOT / "docs" / "results" / "longtail.md"
 BEGIN, END = "<!-- longtail.py: {} -->", "<!-- longtail.py: end -->"
-#: Scores whose making takes a training.
-ENSEMBLE = "ensemble.npz"
 #: What of a folder is kept.
 FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
 
 
 def keep(study: Path) -> None:
-    """Keeps every agent that has driven and is not kept yet, the study's own files, its scouts and its results."""
+    """Keeps every agent that has driven and is not kept yet, the study's own files, its scores and its results."""
     KEPT.mkdir(parents=True, exist_ok=True)
     _pack([study], study, KEPT / "study.tar.xz")
     _pack([study / DRIVES / "expert"], study, KEPT / "expert.tar.xz")
@@ -47,9 +46,9 @@ def keep(study: Path) -> None:
         if not file.exists() and has_driven(study, agent, seed):
             folders = [run_of(study, agent, seed), *(drive_of(study, name, seed) for name in names(agent))]
             _pack(folders, study, file)
-    for file in (study / SCORES / ENSEMBLE, study / RESULTS):
-        if file.is_file():
-            shutil.copyfile(file, KEPT / file.name)
+    shutil.copytree(study / SCORES, KEPT / SCORES, dirs_exist_ok=True)
+    if (study / RESULTS).is_file():
+        shutil.copyfile(study / RESULTS, KEPT / RESULTS)
 
 
 def restore(study: Path) -> None:
@@ -58,9 +57,7 @@ def restore(study: Path) -> None:
     for file in sorted(KEPT.glob("*.tar.xz")):
         with tarfile.open(file) as packed:
             packed.extractall(study, filter="data")
-    (study / SCORES).mkdir()
-    if (KEPT / ENSEMBLE).is_file():
-        shutil.copyfile(KEPT / ENSEMBLE, study / SCORES / ENSEMBLE)
+    shutil.copytree(KEPT / SCORES, study / SCORES)
 
 
 def filled(page: str, results: dict[str, Any]) -> str:

@@ -301,7 +301,10 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     script.keep(out)
     script.restore(tmp_path / "restored")
     assert not list((tmp_path / "restored").rglob("checkpoints"))
-    kept = [file for file in (tmp_path / "restored").rglob("*") if file.is_file()]
+    restored = [file for file in (tmp_path / "restored").rglob("*") if file.is_file()]
+    scores = {file.name for file in restored if file.suffix == ".npz"}
+    assert scores == {file.name for file in (out / "scores").iterdir()} >= {"kinematic.npz"}
+    kept = [file for file in restored if file.suffix != ".npz"]
     assert {file.name for file in kept} == {"config.yaml", "run.json", "metrics.jsonl", "episodes.csv"}
     for file in kept:
         assert str(tmp_path.parent) not in file.read_text(), file
