@@ -157,7 +157,7 @@ def scored(
         for data, found in zip(sets, actions, strict=True):
             known, steps = found["known"], np.zeros(found["known"].shape)
             steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
-            tables.append(table_of(name, vars(config), data, {"rarity": steps}))
+            tables.append(table_of(name, config, data, {"rarity": steps}))
         yield name, tables[0], joined(tables)
 
 

@@ -55,8 +55,20 @@ def test_what_does_not_go_together(place, capsys):
     assert trained(place, "set-3", "none", "--weighting.temperature", "2") == 2
     assert "--weighting without scores to weight; pass --scores or --agent" in capsys.readouterr().err
     assert trained(place, "set-3", "none", "--agent", "heuristic") == 2
-    assert "the agent heuristic is trained by cql; use offline/cql" in capsys.readouterr().err
-    call = ["train", "offline/cql", "--data", str(place / "set-3"), "--out", str(place / "none")]
+    assert "the agent heuristic is trained by cql, not " in capsys.readouterr().err
+    rest = ["--data", str(place / "set-3"), "--out", str(place / "none")]
+    call = ["train", "offline/cql", *rest]
+    assert main([*call, "--agent", "cql_bc"]) == 2
+    told = "the agent cql_bc is trained by cql with imitation, not cql; use offline/cql_bc"
+    assert told in capsys.readouterr().err
+    assert main(["train", "offline/cql_bc", *rest, "--agent", "baseline"]) == 2
+    assert "trained by cql, not cql with imitation; use offline/cql" in capsys.readouterr().err
+    assert main([*call, "--scale", "scenario"]) == 2
+    assert "--scale without scores to weight; pass --scores" in capsys.readouterr().err
+    assert main([*call, "--agent", "heuristic", "--scale", "scenario"]) == 2
+    assert "the agent heuristic has its own scale; leave out --scale" in capsys.readouterr().err
+    assert main([*call, "--agent", "oracle", "--weighting.uniform", "0"]) == 2
+    assert "the agent oracle has its own weights; leave out --weighting" in capsys.readouterr().err
     assert main([*call, "--agent", "random_matched", "--seeds", "2"]) == 2
     assert "2 agents random_matched in one program would share one lot" in capsys.readouterr().err
     other = place / "braking.npz"

@@ -59,6 +59,13 @@ def test_every_method_scores_every_step_and_comes_back(data, tables, tmp_path):
         np.testing.assert_allclose(read_scores(tmp_path / f"{name}.npz", data).steps, table.steps, atol=1e-6)
 
 
+def test_what_a_method_says_that_it_weighs_is_there(tables):
+    for table in tables.values():
+        method = METHODS[table.method]
+        if table.components:
+            assert set(table.components) == {*method.combination(method.config).weights, *method.beside}
+
+
 def test_the_command_offers_every_method():
     hints = get_type_hints(Curate, include_extras=True)
     assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)

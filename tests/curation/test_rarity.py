@@ -65,10 +65,10 @@ def test_published_histogram():
         counts[i, j] += 1
         cells.append((i, j))
     weight = 1 / (counts + 1)
-    wanted = [weight[cell] / weight.mean() / 3 for cell in cells]
+    wanted = [weight[cell] / weight.mean() / 3 + 0.01 for cell in cells]
     scores = config.scores(actions, actions)
     np.testing.assert_allclose(scores, wanted)
-    assert scores.max() < 1.764 / 3  # the cap of 3 never binds
+    assert scores.max() < 1.764 / 3 + 0.01  # the cap of 3 never binds
 
 
 def test_actions_of_the_expert_and_where_they_are_known():

@@ -194,6 +194,18 @@ def test_the_command(data, tmp_path, capsys):
     ):
         assert main([*anew, "--overwrite", *wrong]) == 2
         assert words in capsys.readouterr().err
+    # Or before anything is trained or scored.
+    begin = ["--data", str(data.path), "--out", str(tmp_path / "x")]
+    mixture = ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
+    for wrong, words in (
+        (["kinematic", "--weights", "urgency", "-1"], "the weight of 'urgency' is -1.0; use 0 or more"),
+        (["kinematic", "--scenario", "p101"], "'p101' aggregates no steps"),
+        (["ensemble", "--weights", "actoin_0", "1"], "no component 'actoin_0'; did you mean 'action_0'"),
+        (["ensemble", *mixture, "--weights", "action_0", "1"], "there is no component 'action_0'"),
+    ):
+        assert main(["curate", *wrong[:1], *begin, *wrong[1:]]) == 2
+        told = capsys.readouterr().err
+        assert words in told and "scor" not in told.split(words)[0]
     assert main(["curate", "published", *anew[2:], "--overwrite"]) == 2
     assert "is a table of kinematic; say curate kinematic" in capsys.readouterr().err
     for ignored in (["--seed", "1"], ["--like", str(out)]):

@@ -79,12 +79,16 @@ def test_a_clip_that_too_few_steps_can_keep():
     np.testing.assert_allclose(weights_of(table, plain(most=2.0), "step")[0, :4], [0, 0, 0, 8])
 
 
-def test_published_weights_tilt_as_the_study_says():
-    """A score of 0.2835 +- 0.1712 drawn with 0.01 on top: an effective share of 0.75 (the study's own statistics)."""
-    a = 0.2835 - 0.1712, 0.2835 + 0.1712
-    table = table_of(np.resize(a, (40, 51)))
+@pytest.mark.parametrize(
+    ("mean", "deviation", "share"),
+    [(0.2835, 0.1712, 0.746), (0.0104, 0.0062, 0.915)],
+    ids=["heuristic", "rarity"],
+)
+def test_published_weights_tilt_as_the_study_says(mean, deviation, share):
+    """Scores of a mean and deviation, drawn with 0.01 on top (the study's own statistics of its scores)."""
+    table = table_of(np.resize((mean - deviation, mean + deviation), (40, 51)))
     weights = weights_of(table, PUBLISHED, "step")
-    assert effective_share(weights[table.drawn]) == pytest.approx(0.746, abs=1e-3)
+    assert effective_share(weights[table.drawn]) == pytest.approx(share, abs=1e-3)
 
 
 def test_equal_scores_are_uniform_at_either_scale():

@@ -87,7 +87,7 @@ def test_a_real_effect_is_supported_and_one_that_lots_have_too_is_not_credited()
     assert found["ensemble collides less than the baseline"].verdict == "supported"
     assert found["ensemble fails less than the baseline"].verdict == "supported"
     assert found["heuristic collides less than the baseline"].verdict == "supported"
-    assert found["heuristic collides less than its weights dealt out by lot"].verdict == "undecided"
+    assert found["heuristic collides less than weights as strong, dealt out by lot"].verdict == "undecided"
     assert found[SIZE].verdict == "supported"
     low_high = found[SIZE].change
     assert low_high[1] < 0.02 / 0.16 - 1 < low_high[2] < -0.5
@@ -164,11 +164,14 @@ def test_mean_q_is_judged_in_pairs():
 
 
 def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_sizes(data):
-    """Of steps, and of scenarios: from scores that lie together as criticality does, and labels that mostly are 0."""
+    """Of steps always; of scenarios where the scores that are dealt out lie together within scenarios as much.
+
+    From scores that do so more or less, as those of the methods, and labels that mostly are 0.
+    """
     rng, shape = np.random.default_rng(0), (600, 91)
     found = {}
-    for method in ("kinematic", "action_rarity", "ensemble", "oracle", "uniform"):
-        slow = np.cumsum(rng.normal(size=shape), axis=1) + 8 * rng.normal(size=(shape[0], 1))
+    for place, method in enumerate(("kinematic", "action_rarity", "ensemble", "oracle", "uniform")):
+        slow = np.cumsum(rng.normal(size=shape), axis=1) + 6 * (place + 1) * rng.normal(size=(shape[0], 1))
         steps = 1 / (1 + np.exp(-slow / 10))
         if method == "oracle":
             steps = ((rng.random((shape[0], 1)) < 0.1) & (np.arange(shape[1]) // 20 == 2)).astype(float)
@@ -189,7 +192,11 @@ def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_s
             for name in pair
         )
         assert lot.effective == pytest.approx(own.effective, rel=0.02), pair
-        assert lot.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
+        one, other = (AGENTS[name] for name in pair)
+        if one.scale == "scenario" or one.method == other.method:
+            assert lot.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
+        else:
+            assert lot.effective_scenarios > own.effective_scenarios, pair
     oracle = weighted(AGENTS["oracle"], data, found.__getitem__, WeightConfig(), usable).weights
     during = oracle[found["oracle"].steps > 0].sum() / oracle.sum()
     # And those that uniform draws find.
@@ -319,7 +326,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
     page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
     assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
-    assert "heuristic collides less than its weights dealt out by lot" in page
+    assert "heuristic collides less than weights as strong, dealt out by lot" in page
     # What was trained with other weights, or drove before it was trained, belongs to no study.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
     told, drive = json.loads(run.read_text()), out / "drives" / "heuristic" / "seed-0" / "run.json"

@@ -78,7 +78,7 @@ class Curate:
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and say how scores and weights lie."""
     from drivax import settings
-    from drivax.curation.methods import METHODS, Wanted, curate
+    from drivax.curation.methods import METHODS, Wanted, check_combination, curate
     from drivax.curation.scores import read_scores, refuse_existing, write_scores
     from drivax.curation.subset import check_top, write_top
     from drivax.scenario.store import ScenarioSet
@@ -89,6 +89,11 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     if config is not None:
         seed = [] if args.method != "ensemble" or args.seed is None else ["--seed", str(args.seed)]
         config = settings.load(type(config), args.config or {}, [*overrides, *seed])
+    changes = {"weights": args.weights, "scenario": args.scenario}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if args.again is None:
+        # Before anything is scored: scouts take a while to train.
+        check_combination(args.method, config, changes)
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
@@ -108,9 +113,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
         table = read_scores(args.again, data)
         if table.method != args.method:
             raise UsageError(f"{args.again} is a table of {table.method}", cure=f"say curate {table.method}")
-    other = {"weights": args.weights, "scenario": args.scenario}
-    if other := {name: value for name, value in other.items() if value is not None}:
-        table = table.combined(replace(table.combination, **other))
+    if changes:
+        table = table.combined(replace(table.combination, **changes))
     write_scores(table, args.out, args.overwrite)
     _tell(table, args.out)
     if args.export is not None:

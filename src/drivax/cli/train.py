@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from drivax import settings
-from drivax.curation.agents import AGENTS, weighted
+from drivax.curation.agents import AGENTS, Agent, weighted
 from drivax.curation.methods import Wanted, curate, refuse_stale
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, weights_of
@@ -49,8 +49,8 @@ class Train:
     """Scenario set that chooses the best checkpoint."""
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc and offline algorithms draw each recorded step by its weight."""
-    scale: Literal["step", "scenario"] = "step"
-    """Whether steps are weighted one by one, or as their scenarios are; with --scores."""
+    scale: Literal["step", "scenario"] | None = None
+    """Whether steps are weighted one by one (the default), or as their scenarios are; with --scores."""
     agent: (
         Literal[
             "bc", "baseline", "cql_bc", "heuristic", "heuristic_scenario", "ensemble", "ensemble_scenario",
@@ -104,23 +104,44 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
         if args.scores is None:
             if weighting != WeightConfig():
                 raise UsageError("--weighting without scores to weight", cure="pass --scores or --agent")
+            if args.scale is not None:
+                raise UsageError("--scale without scores to weight", cure="pass --scores")
             return data
         table = read_scores(args.scores, data)
-        return WeightedSet(data, weights_of(table, weighting, args.scale, usable_steps(config, data)))
+        return WeightedSet(
+            data, weights_of(table, weighting, args.scale or "step", usable_steps(config, data))
+        )
     agent = AGENTS[args.agent]
-    own, wanted = (
-        settings.kind_of(type(one.algorithm)) for one in (config, settings.load(TrainConfig, agent.preset))
+    _refuse_other(args, agent, config)
+    return weighted(
+        agent, data, partial(_table, args, data), weighting, usable_steps(config, data), config.seed
     )
+
+
+def _refuse_other(args: Train, agent: Agent, config: TrainConfig) -> None:
+    """Refuses a training that is not that of the agent, and flags that the agent would ignore."""
+    own, wanted = (_trained_by(one) for one in (config, settings.load(TrainConfig, agent.preset)))
     if own != wanted:
-        raise UsageError(f"the agent {args.agent} is trained by {wanted}", cure=f"use {agent.preset}")
+        raise UsageError(
+            f"the agent {args.agent} is trained by {wanted}, not {own}", cure=f"use {agent.preset}"
+        )
+    if args.scale is not None:
+        raise UsageError(
+            f"the agent {args.agent} has its own scale", cure="leave out --scale, or choose another --agent"
+        )
+    if agent.weights is not None and args.weighting != WeightConfig():
+        raise UsageError(f"the agent {args.agent} has its own weights", cure="leave out --weighting")
     if agent.by_lot and args.seeds > 1:
         raise UsageError(
             f"{args.seeds} agents {args.agent} in one program would share one lot",
             cure="train each by itself: --seeds 1 --seed NUMBER",
         )
-    return weighted(
-        agent, data, partial(_table, args, data), weighting, usable_steps(config, data), config.seed
-    )
+
+
+def _trained_by(config: TrainConfig) -> str:
+    """The algorithm, and whether it imitates beside."""
+    imitates = getattr(config.algorithm, "imitation", 0.0) > 0.0
+    return settings.kind_of(type(config.algorithm)) + (" with imitation" if imitates else "")
 
 
 def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:

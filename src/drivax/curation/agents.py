@@ -90,13 +90,17 @@ def weighted(
         seed: Of the lot, for agents ``by_lot``.
 
     Raises:
-        UsageError: The table is of another method, or nothing has a weight.
+        UsageError: The table is of another method, or nothing has a weight or a label.
     """
     table = tables(agent.method)
     if table.method != agent.method:
         raise UsageError(
             f"scores of {table.method!r} for an agent that is curated by {agent.method!r}",
             cure=f"drivax curate {agent.method} --data {data.path} --out SCORES",
+        )
+    if agent.method == "oracle" and not table.steps.any():
+        raise UsageError(
+            "no scenario has a labelled event", file=data.path, cure="use an agent that needs no labels"
         )
     if agent.by_lot:
         table = matched(table, seed, usable)

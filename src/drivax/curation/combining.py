@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,16 @@ class Combination:
                     f"there is no aggregator for {lacking[0]!r}", cure="name one for each component"
                 )
 
+    def check_components(self, there: Collection[str]) -> None:
+        """Refuses to weigh what is not there.
+
+        Raises:
+            UsageError: A component that has a weight is not there.
+        """
+        for name in self.weights:
+            if name not in there:
+                raise UsageError(f"there is no component {name!r}", cure=nearest(name, sorted(there)))
+
     def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
         """Scores in [0, 1]: of every step, ``sum of weight * component`` clipped at 1, and of every scenario.
 
@@ -58,9 +68,7 @@ class Combination:
         Raises:
             UsageError: A component that has a weight is not there.
         """
-        for name in self.weights:
-            if name not in components:
-                raise UsageError(f"there is no component {name!r}", cure=nearest(name, sorted(components)))
+        self.check_components(components)
         steps = np.zeros(valid.shape)
         for name, weight in self.weights.items():
             steps += weight * components[name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +23,7 @@ from drivax.curation.scoring import Progress, score_steps, valid_steps
 from drivax.curation.scouts import Scouts, ScoutsConfig, train_scouts
 from drivax.errors import DataError, UsageError
 from drivax.named import nearest
+from drivax.networks.distributions import Actions
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 
@@ -44,6 +45,8 @@ PUBLISHED = Combination(
 )
 #: Rarity: a scenario is as rare as its rarest steps, of which the few very rarest may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
+#: A single component.
+ALL = Combination({"all": 1.0})
 #: Disagreement above this percentile of a set scores 1.
 _MOST = 99.0
 
@@ -76,12 +79,14 @@ class Method:
     Attributes:
         score: From what is asked, with settings, to the table.
         config: Settings by default; None: it has none.
-        combination: How its components become scores; a text is the aggregator of components that all weigh 1.
+        combination: How its components become scores, from its settings.
+        beside: Components that weigh nothing in it.
     """
 
     score: Callable[[Wanted], ScoreTable]
     config: Any = None
-    combination: Combination | str = "max"
+    combination: Callable[[Any], Combination] = lambda _: ALL
+    beside: tuple[str, ...] = ()
 
 
 def curate(name: str, wanted: Wanted) -> ScoreTable:
@@ -124,7 +129,7 @@ def refuse_stale(table: ScoreTable, config: Any = None, file: Path | None = None
     method, told = METHODS[table.method], dict(table.config)
     now: dict[str, Any] = {} if method.config is None else plain(method.config if config is None else config)
     if table.components:
-        now["combination"] = asdict(_combination(method, table.components))
+        now["combination"] = asdict(method.combination(method.config if config is None else config))
     # A table that was read has lists where one that was made has tuples.
     told, now = (json.loads(json.dumps(values)) for values in (told, now))
     for name, value in now.items():
@@ -136,16 +141,27 @@ def refuse_stale(table: ScoreTable, config: Any = None, file: Path | None = None
             )
 
 
-def _combination(method: Method, components: Iterable[str]) -> Combination:
-    if isinstance(method.combination, Combination):
-        return method.combination
-    return Combination(dict.fromkeys(components, 1.0), method.combination)
+def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
+    """Refuses other weights or another aggregator (fields of :class:`Combination`) before anything is scored.
+
+    Raises:
+        UsageError: A method with these settings has no such component, or there is no such aggregator or weight.
+    """
+    usual = METHODS[name].combination(config)
+    replace(usual, **changes).check_components({*usual.weights, *METHODS[name].beside})
+
+
+def _disagreement(config: ScoutsConfig) -> Combination:
+    """A scenario is as uncertain as its most uncertain second."""
+    likely = config.cloning.loss == "likelihood"
+    names = ["information"] if likely else [f"action_{number}" for number in range(Actions().size)]
+    return Combination(dict.fromkeys(names, 1.0), "top10")
 
 
 def _heuristic(name: str) -> Callable[[Wanted], ScoreTable]:
     def score(wanted: Wanted) -> ScoreTable:
         components = score_steps(wanted.data, wanted.config, wanted.progress)
-        return table_of(name, plain(wanted.config), wanted.data, components)
+        return table_of(name, wanted.config, wanted.data, components)
 
     return score
 
@@ -155,7 +171,7 @@ def _rarity(name: str) -> Callable[[Wanted], ScoreTable]:
         expert = ExpertActions()
         found = score_steps(wanted.data, expert, wanted.progress)
         components = {"rarity": rarity_steps(wanted.config, found["action"], found["known"])}
-        return table_of(name, plain(wanted.config) | asdict(expert), wanted.data, components)
+        return table_of(name, wanted.config, wanted.data, components, asdict(expert))
 
     return score
 
@@ -194,24 +210,20 @@ def ensemble_table(
         components = {"information": opinions.information / math.log(scouts.config.folds)}
     own = data.hash == scouts.set_hash
     error = opinions.error(scouts.deviation, scouts.fold if own else None)
-    about = {
-        **plain(scouts.config),
-        "trained_on": scouts.set_hash,
-        "scale": scale,
-    }
-    table = table_of("ensemble", about, data, components)
+    about = {"trained_on": scouts.set_hash, "scale": scale}
+    table = table_of("ensemble", scouts.config, data, components, about)
     known = opinions.known
     told = {"error_rank_correlation": rank_correlation(table.steps[known], error[known])}
     return replace(table, config={**table.config, **told})
 
 
 def _uniform(wanted: Wanted) -> ScoreTable:
-    return table_of("uniform", {}, wanted.data, {"all": np.ones(_shape(wanted.data))})
+    return table_of("uniform", None, wanted.data, {"all": np.ones(_shape(wanted.data))})
 
 
 def _oracle(wanted: Wanted) -> ScoreTable:
     components = {"all": event_steps(wanted.data).astype(np.float64)}
-    return table_of("oracle", {}, wanted.data, components)
+    return table_of("oracle", None, wanted.data, components)
 
 
 def _random_matched(wanted: Wanted) -> ScoreTable:
@@ -225,33 +237,37 @@ def _shape(data: ScenarioSet) -> tuple[int, int]:
 
 def table_of(
     name: str,
-    config: Mapping[str, Any],
+    config: Any,
     data: ScenarioSet,
     components: Mapping[str, np.ndarray[Any, Any]],
+    about: Mapping[str, Any] = MappingProxyType({}),
 ) -> ScoreTable:
     """The table of a set, from what a method says of every step.
 
     Args:
         name: Of the method.
-        config: Its configuration, as plain values.
+        config: Its settings; None: it has none.
         data: The set.
         components: By name, of every step and in [0, 1].
+        about: What else the table says of how it was made, as plain values.
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
     blank = np.zeros(valid.shape)
-    table = ScoreTable(name, config, data.hash, ids, valid, blank, blank[:, 0], components)
-    return table.combined(_combination(METHODS[name], components))
+    told = {**({} if config is None else plain(config)), **about}
+    table = ScoreTable(name, told, data.hash, ids, valid, blank, blank[:, 0], components)
+    return table.combined(METHODS[name].combination(config))
 
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
-        "kinematic": Method(_heuristic("kinematic"), KinematicConfig(), KINEMATIC),
-        "published": Method(_heuristic("published"), PublishedConfig(), PUBLISHED),
-        "action_rarity": Method(_rarity("action_rarity"), KernelRarity(), RARITY),
-        # A scenario is as uncertain as its most uncertain second.
-        "ensemble": Method(_ensemble, ScoutsConfig(), "top10"),
-        "action_rarity_published": Method(_rarity("action_rarity_published"), PublishedRarity(), RARITY),
+        "kinematic": Method(_heuristic("kinematic"), KinematicConfig(), lambda _: KINEMATIC, ("density",)),
+        "published": Method(_heuristic("published"), PublishedConfig(), lambda _: PUBLISHED),
+        "action_rarity": Method(_rarity("action_rarity"), KernelRarity(), lambda _: RARITY),
+        "ensemble": Method(_ensemble, ScoutsConfig(), _disagreement),
+        "action_rarity_published": Method(
+            _rarity("action_rarity_published"), PublishedRarity(), lambda _: RARITY
+        ),
         "uniform": Method(_uniform),
         "random_matched": Method(_random_matched),
         "oracle": Method(_oracle),

@@ -103,7 +103,9 @@ class PublishedRarity:
     """Inverse frequency in the study's histogram of acceleration (m/s2) and curvature (1/m).
 
     A cell with h of the actions weighs ``1 / (h + 1)``, over the mean of all cells, empty ones and those without width
-    included; the score is ``min(weight, most) / most``. Actions beyond the bins do not occur: the space is narrower.
+    included; the score is ``min(weight, most) / most + 0.01``, cut at 1; the constant is most of it. Actions beyond
+    the bins do not occur: the space is narrower. The study looks up an action on the edge of two bins in the lower one
+    though it counts it in the upper one, so that standing still is looked up beside itself; here both are the upper.
 
     Attributes:
         space: What actions mean.
@@ -124,12 +126,12 @@ class PublishedRarity:
         """Scores of actions ``at``, in [0, 1], by how often ``actions`` are in their cells."""
         cells = 89 * 89
         weight = 1.0 / (np.bincount(self._cell(actions), minlength=cells) + 1.0)
-        return np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
+        rarity = np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
+        return np.minimum(rarity + 0.01, 1.0)
 
     def _cell(self, actions: Others) -> Int[np.ndarray[Any, Any], " m"]:
         scale = np.where(actions[:, 0] < 0, self.space.braking_mps2, self.space.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * self.space.steering)
-        # An action on the edge of two bins belongs to the upper one, when it is counted and when it is looked up.
         row, column = (
             np.searchsorted(edges, value, side="right") - 1
             for edges, value in zip(self.edges, values, strict=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from drivax.curation.agents import AGENTS, weighted
+from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate, refuse_stale
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
@@ -83,10 +84,17 @@ def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
     """Makes the folder of a study, or finds that it is of this very study.
 
     Raises:
-        UsageError: It is of another one.
+        UsageError: It is of another one, or an agent needs labels that the training set does not have.
         DataError: A set is no scenario set.
     """
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
+    rest = [name for name in config.agents if AGENTS[name].method != "oracle"]
+    if len(rest) < len(config.agents) and not event_kinds(data[0]).any():
+        raise UsageError(
+            "has no labelled events, which the oracle and its lot learn from",
+            file=sets.train,
+            cure=f"pass --agents [{','.join(rest)}]",
+        )
     if not out.exists():
         RunFolder.create(out, config, data, kind="longtail")
         return

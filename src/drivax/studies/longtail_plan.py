@@ -104,6 +104,8 @@ class Sets:
         if (data / "train").is_dir():
             rest = tuple(path for path in (data / "test", data / "test-rare") if path.is_dir())
             return cls(data / "train", validation or data / "validation", tuple(test) or rest)
+        if not data.is_dir():
+            raise UsageError("does not exist", file=data, cure="name a scenario set, or a benchmark's folder")
         if validation is None or not test:
             raise UsageError(
                 "a study needs scenarios to train, to validate and to test on",

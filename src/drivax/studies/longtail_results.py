@@ -130,12 +130,14 @@ def claims(agents: Sequence[str]) -> list[Claim]:
     )
     for name in (*curated, "oracle"):
         lot = control_of(name)
-        found.append(Claim(f"{name} collides less than its weights dealt out by lot", name, lot, "lot"))
+        found.append(
+            Claim(f"{name} collides less than weights as strong, dealt out by lot", name, lot, "lot")
+        )
     for name in curated:
         for rows in ("common", "rare"):
             words = f"{name} collides less than the baseline in {rows} scenarios"
             found.append(Claim(words, name, "baseline", "where", rows=rows))
-        words = f"{name} collides less than its weights dealt out by lot in rare scenarios"
+        words = f"{name} collides less than weights as strong, dealt out by lot, in rare scenarios"
         found.append(Claim(words, name, control_of(name), "where", rows="rare"))
         words = f"{name} fails less than the baseline"
         found.append(Claim(words, name, "baseline", "failures", "accuracy"))
