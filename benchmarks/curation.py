@@ -18,7 +18,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,17 @@ from drivax.curation.controls import event_kinds, event_steps, matched
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.methods import Wanted, curate, ensemble_table, table_of
 from drivax.curation.published import PublishedConfig
-from drivax.curation.ranking import auc_interval, bootstrap_intervals, precision_at_base_rate, roc_auc
+from drivax.curation.ranking import (
+    auc_interval,
+    bootstrap_intervals,
+    precision_at_base_rate,
+    rank_correlation,
+    roc_auc,
+)
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.scoring import BATCH, score_steps
-from drivax.curation.scouts import ScoutsConfig, train_scouts
+from drivax.curation.scouts import Scouts, ScoutsConfig, train_scouts
 from drivax.curation.weights import WeightConfig, draws_of, weights_of
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.sizes import Sizes
@@ -125,8 +131,7 @@ def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, An
     methods = dict(stored["methods"]) if only else {}
     for name, own, both in scored(sets, bench / "train", only or list(SCORED)):
         methods[name] = found_by(truth, both) | {"draws": draws(own)}
-        if "error_rank_correlation" in own.config:
-            methods[name]["error_rank_correlation"] = own.config["error_rank_correlation"]
+        methods[name] |= {key: value for key, value in own.config.items() if key.startswith("error_rank_")}
         if name == "kinematic":
             methods["random_matched"] = found_by(truth, matched(both, 0)) | {"draws": draws(matched(own, 0))}
         print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
@@ -146,7 +151,8 @@ def scored(
             scouts = train_scouts(SCOUTS[name], ScenarioSet.open(train))
             first = ensemble_table(scouts, sets[0])
             rest = [ensemble_table(scouts, data, scale=first.config["scale"]) for data in sets[1:]]
-            yield name, first, joined([first, *rest])
+            interval = {"error_rank_interval": error_interval(scouts, first, sets[0])}
+            yield name, replace(first, config={**first.config, **interval}), joined([first, *rest])
     rarities = {"action_rarity": KernelRarity(), "action_rarity_published": PublishedRarity()}
     if not rarities.keys() & set(names):
         return
@@ -159,6 +165,18 @@ def scored(
             steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
             tables.append(table_of(name, config, data, {"rarity": steps}))
         yield name, tables[0], joined(tables)
+
+
+def error_interval(scouts: Scouts, table: ScoreTable, data: ScenarioSet) -> list[float]:
+    """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
+    opinions = scouts.opinions(data)
+    error, rng = opinions.error(scouts.deviation), np.random.default_rng(0)
+    found = []
+    for _ in range(200):
+        rows = rng.integers(len(data), size=len(data))
+        known = opinions.known[rows]
+        found.append(rank_correlation(table.steps[rows][known], error[rows][known]))
+    return np.quantile(found, (0.025, 0.975)).tolist()
 
 
 def joined(tables: list[ScoreTable]) -> ScoreTable:
@@ -235,6 +253,16 @@ def told(one: dict[str, Any], measure: str, digits: int) -> str:
     return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
+def scouts_table(stored: dict[str, Any]) -> str:
+    """How far scouts disagree where they err."""
+    lines = ["| scouts | rank correlation of scores and errors, by step |", "|---|---|"]
+    for name in SCOUTS:
+        one = stored["methods"][name]
+        low, high = one["error_rank_interval"]
+        lines.append(f"| `{name}` | {one['error_rank_correlation']:.2f} [{low:.2f}, {high:.2f}] |")
+    return "\n".join(lines)
+
+
 def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
     """One measure by kind of event and method."""
     methods = stored["methods"]
@@ -285,6 +313,7 @@ def filled(text: str, stored: dict[str, Any]) -> str:
         "scenario precision": kinds_table(stored, "precision", 2),
         "step auc": kinds_table(stored, "step_auc", 3),
         "step precision": kinds_table(stored, "step_precision", 2),
+        "scouts": scouts_table(stored),
         "draws": draws_table(stored),
         "speed": speed_table(stored),
     }

@@ -128,6 +128,23 @@ def test_the_page_of_curation_shows_what_was_found(script, stored):
     assert shown, "run python benchmarks/curation.py table, and read what the page says about it"
 
 
+def test_curation_was_scored_on_the_test_set_that_planners_drive(stored):
+    assert stored("curation")["sets"]["test"] == stored("benchmark")["test"]["hash"]
+
+
+def test_scouts_disagree_where_they_err(stored):
+    low, high = stored("curation")["methods"]["ensemble"]["error_rank_interval"]
+    assert 0.0 < low < high
+
+
+def test_the_page_of_offline_learning_shows_how_fast_it_is(script, stored):
+    offline = script("offline")
+    shown = (
+        f"{offline.BEGIN}\n\n{offline.table(stored('offline'))}\n\n{offline.END}" in offline.PAGE.read_text()
+    )
+    assert shown, "run python benchmarks/offline.py --table, and read what the page says about it"
+
+
 def of(mean, half=0.01):
     return {"mean": mean, "low": mean - half, "high": mean + half, "n": 9, "by_seed": [mean, mean]}
 

@@ -439,3 +439,11 @@ def test_rates_fall_linearly_over_the_run(kind, every):
 
     moves = -np.asarray(jax.lax.scan(move, adam.init(weights), None, 40 // every + 1)[1])
     np.testing.assert_allclose(moves, np.linspace(1e-3, 0.25e-3, 40 // every + 1), rtol=1e-4)
+    # Or over a part of it.
+    learner = replace(config, falling=0.5).build(Told(), arms([0.0], [0.0]), 4)
+    adam = learner.adam(config.policy_rate, every)
+    moves = -np.asarray(jax.lax.scan(move, adam.init(weights), None, 40 // every + 1)[1])
+    wanted = np.maximum(1e-3 - 0.75e-3 * np.arange(len(moves)) / (20 // every), 0.25e-3)
+    np.testing.assert_allclose(moves, wanted, rtol=1e-4)
+    with pytest.raises(UsageError, match=r"falling is 0\.0; use more than 0"):
+        replace(config, falling=0.0)

@@ -17,7 +17,7 @@ from drivax.errors import UsageError
 from drivax.learning.devices import divided
 from drivax.learning.environment import Environment
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
-from drivax.learning.optimisers import clipped_adam
+from drivax.learning.optimisers import check_falling, clipped_adam
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy
 from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
@@ -48,8 +48,9 @@ class Cloning:
             of the expert's action, which also fits the spread.
         batch: Moments per update, drawn anew from the logs each time.
         updates: Updates per iteration.
-        learning_rate: Of Adam, falling linearly over the run to ``last_rate`` times itself.
+        learning_rate: Of Adam, falling linearly to ``last_rate`` times itself.
         last_rate: See ``learning_rate``; 1: it stays.
+        falling: Share of the run over which it falls; then it stays.
         gradient_norm: Gradients are clipped to this global norm; None: not at all.
         mask_clipped: Whether moments at which the expert did what no action does are left out.
     """
@@ -59,18 +60,19 @@ class Cloning:
     updates: int = 50
     learning_rate: float = 1e-3
     last_rate: float = 0.1
+    falling: float = 1.0
     gradient_norm: float | None = 1.0
     mask_clipped: bool = True
 
     def __post_init__(self) -> None:
         if self.batch < 1 or self.updates < 1:
             raise ValueError("batch and updates are at least 1")
+        check_falling(self.falling)
 
     def optimiser(self, updates: int) -> optax.GradientTransformation:
         """The optimiser of a run of so many updates."""
-        return clipped_adam(
-            self.learning_rate, self.gradient_norm, updates=max(updates, 1), last=self.last_rate
-        )
+        falls = max(round(self.falling * updates), 1)
+        return clipped_adam(self.learning_rate, self.gradient_norm, updates=falls, last=self.last_rate)
 
     def of_batch(
         self, act: Act, parameters: Any, environment: Demonstrated, data: Any, key: Array

@@ -19,7 +19,7 @@ from drivax.learning.devices import divided
 from drivax.learning.environment import Environment
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded, transitions
 from drivax.learning.fitted_q import FittedQ, FittedQConfig
-from drivax.learning.optimisers import clipped_adam
+from drivax.learning.optimisers import check_falling, clipped_adam
 from drivax.learning.replay import Transitions
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
@@ -50,7 +50,8 @@ class OfflineConfig:
         gamma: Discount.
         tau: How far targets move toward what they follow per update.
         policy_rate, critic_rate: Learning rates of Adam; a value learns as fast as the critics.
-        last_rate: Both fall linearly over the run to so many times themselves; 1: they stay.
+        last_rate: Both fall linearly to so many times themselves; 1: they stay.
+        falling: Share of the run over which they fall; then they stay, so that validations tell what was reached.
         gradient_norm: Gradients of each network are clipped to this global norm.
         normalise: Whether every feature of an observation is shifted and scaled by its mean and deviation over recorded
             steps, in front of every encoder.
@@ -66,6 +67,7 @@ class OfflineConfig:
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     last_rate: float = 1.0
+    falling: float = 1.0
     gradient_norm: float = 10.0
     normalise: bool = False
     fitted_q: FittedQConfig = field(default_factory=FittedQConfig)
@@ -73,6 +75,7 @@ class OfflineConfig:
     def __post_init__(self) -> None:
         if self.batch < 1 or self.updates < 1:
             raise ValueError("batch and updates are at least 1")
+        check_falling(self.falling)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -175,7 +178,7 @@ class Offline:
     def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
         """Adam of something that moves in every, or every so manieth, update."""
         config = self.settings
-        falls = self.updates // every if config.last_rate != 1.0 else 0
+        falls = round(config.falling * self.updates) // every if config.last_rate != 1.0 else 0
         return clipped_adam(rate, config.gradient_norm, updates=falls, last=config.last_rate)
 
     def loss(

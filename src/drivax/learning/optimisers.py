@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from drivax.errors import UsageError
+
 
 def clipped_adam(
     rate: float,
@@ -23,7 +25,7 @@ def clipped_adam(
     Args:
         rate: The learning rate, of the first update.
         norm: Gradients are scaled down to this global norm; None: they are taken as they are.
-        updates: Updates of the whole run, over which the rate falls linearly to ``last`` times the first; 0: it stays.
+        updates: Updates over which the rate falls linearly to ``last`` times the first, and then stays; 0: it stays.
         last: See ``updates``.
         eps: Of Adam.
         apart: Whether each part of the parameters (the first level of their tree) is clipped by its own norm. Networks
@@ -35,6 +37,16 @@ def clipped_adam(
     if norm is None:
         return optax.chain(optax.identity(), adam)
     return optax.chain(clip_apart(norm) if apart else optax.clip_by_global_norm(norm), adam)
+
+
+def check_falling(share: float) -> None:
+    """Refuses what is no share of a run.
+
+    Raises:
+        UsageError: It is none.
+    """
+    if not 0.0 < share <= 1.0:
+        raise UsageError(f"falling is {share}", cure="use more than 0, and 1 at most")
 
 
 def clip_apart(norm: float) -> optax.GradientTransformation:
