@@ -11,6 +11,7 @@ import scipy.stats
 
 from drivax.cli import main
 from drivax.curation.methods import ensemble_table
+from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
 from drivax.curation.scouts import (
     Opinions,
@@ -141,6 +142,20 @@ def test_all_recordings_are_drawn_for_the_scouts(scouts, data):
     shares = np.bincount(scouts.fold[np.asarray(rows)]) / 30_000
     wanted = [usable[scouts.fold == own].sum() / usable.sum() for own in range(TINY.folds)]
     np.testing.assert_allclose(shares, wanted, atol=0.01)
+
+
+@pytest.mark.slow
+def test_rare_actions_are_drawn_by_the_inverse_of_their_density(data):
+    environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
+    experience, _ = experience_of(replace(TINY, weighted="rarity"), environment, bank)
+    usable = np.asarray(experience.usable)
+    action = np.asarray(experience.expert.action, np.float64)[usable]
+    chance = np.diff(np.asarray(experience.critic.cumulative, np.float64), prepend=0.0).reshape(usable.shape)
+    assert chance[usable].all() and not chance[~usable].any()
+    kernel = KernelRarity()
+    density = kernel.density(action, action)
+    inverse = np.minimum(np.median(density) / density, kernel.most)
+    np.testing.assert_allclose(chance[usable] / chance.sum(), inverse / inverse.sum(), rtol=1e-5)
 
 
 @pytest.mark.slow

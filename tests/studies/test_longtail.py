@@ -348,4 +348,14 @@ def test_what_cannot_be_studied_is_refused(data, tmp_path):
         settings.load(LongtailConfig, {"agents": ["baseline", "bc", "heuristics"]})
     with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
         Sets.of(data.path, None, ())
+    with pytest.raises(UsageError, match="none: does not exist"):
+        Sets.of(tmp_path / "none", None, ())
     assert asdict(LongtailConfig())["seeds"] == 5
+    # Before anything is scored or trained, and with the agents that need no labels.
+    with ScenarioWriter(tmp_path / "recorded", SMALL) as writer:
+        writer.add(assemble(straight_road([car(speed=8.0)]), SMALL))
+    recorded = tmp_path / "recorded"
+    sets = Sets.of(recorded, recorded, (recorded,))
+    with pytest.raises(UsageError, match=r"recorded: has no labelled events.*--agents \[bc,baseline,.*o\]"):
+        longtail.study(LongtailConfig(), sets, tmp_path / "study")
+    assert not (tmp_path / "study").exists()

@@ -64,7 +64,11 @@ def read_manifest(path: Path) -> dict[str, Any]:
         problem = "is not a scenario set (a folder)" if path.exists() else "does not exist"
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
     if not file.is_file():
-        raise DataError("no manifest.json, so this is no complete scenario set", file=path, cure=AGAIN)
+        raise DataError(
+            "no manifest.json, so this is no complete scenario set",
+            file=path,
+            cure=f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}",
+        )
     try:
         manifest = json.loads(file.read_bytes())
         version = manifest["schema_version"]
