@@ -170,7 +170,7 @@ def scored(
 def error_interval(scouts: Scouts, table: ScoreTable, data: ScenarioSet) -> list[float]:
     """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
     opinions = scouts.opinions(data)
-    error, rng = opinions.error(scouts.deviation), np.random.default_rng(0)
+    error, rng = opinions.error(scouts.deviation, None), np.random.default_rng(0)
     found = []
     for _ in range(200):
         rows = rng.integers(len(data), size=len(data))
