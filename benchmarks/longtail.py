@@ -5,8 +5,8 @@ python benchmarks/longtail.py keep --out STUDY      (what is done, into benchmar
 python benchmarks/longtail.py restore --out STUDY   (what was kept, into a new folder, where the study goes on)
 python benchmarks/longtail.py table                 (the results that were kept, into the page)
 
-Of every agent the run without its checkpoints and the episodes are kept, and so are the scores: another processor
-rounds otherwise, and what was trained with other weights belongs to another study.
+Of every agent the run without its checkpoints and the episodes are kept, and so are the scores, without what they are
+made of: another processor rounds otherwise, and what was trained with other weights belongs to another study.
 BENCHMARK is what `drivax generate BENCHMARK --benchmark` made.
 """
 
@@ -21,6 +21,8 @@ import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
+
+import numpy as np
 
 from drivax.studies import longtail_page
 from drivax.studies.longtail_drives import has_driven, names
@@ -46,7 +48,11 @@ def keep(study: Path) -> None:
         if not file.exists() and has_driven(study, agent, seed):
             folders = [run_of(study, agent, seed), *(drive_of(study, name, seed) for name in names(agent))]
             _pack(folders, study, file)
-    shutil.copytree(study / SCORES, KEPT / SCORES, dirs_exist_ok=True)
+    (KEPT / SCORES).mkdir(exist_ok=True)
+    for file in (study / SCORES).glob("*.npz"):
+        with np.load(file) as table:
+            wanted = {name: table[name] for name in table if not name.startswith("component_")}
+        np.savez_compressed(KEPT / SCORES / file.name, allow_pickle=False, **wanted)
     if (study / RESULTS).is_file():
         shutil.copyfile(study / RESULTS, KEPT / RESULTS)
 
