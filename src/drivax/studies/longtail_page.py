@@ -185,8 +185,9 @@ def _verdicts(results: Mapping[str, Any]) -> str:
         "drawn by chance (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). "
         "A claim is supported or contradicted below 0.05, otherwise undecided; how many seeds or recordings would "
         "decide is reckoned as if the difference were the one found, at the strictest level of its group. A claim "
-        "about a size is tested against that size. Scores are made once: claims are about these scores, at this "
-        "strength of weighting.</small></p>"
+        "about a size is tested against that size. A lot has the same distribution of weights; how many scenarios it "
+        "spreads them over may differ (see how the weights lie). Scores are made once: claims are about these scores, "
+        "at this strength of weighting.</small></p>"
     )
 
 
