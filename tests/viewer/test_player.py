@@ -114,7 +114,6 @@ def test_the_command(data, tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 1
 
 
-@needs_browser
 def test_the_most_critical_come_first_with_what_their_scores_are_made_of(data, tmp_path, capsys):
     valid = np.array([scenario.agent_valid[:, 0] for scenario in data])
     urgency = np.zeros(valid.shape)
@@ -141,6 +140,7 @@ def test_the_most_critical_come_first_with_what_their_scores_are_made_of(data, t
     assert "there are no scores" in capsys.readouterr().err
 
 
+@needs_browser
 def test_browsing_in_a_browser(page, tmp_path):
     """Opened at the second scenario, then the next one by key, then a filter that only the first one passes."""
     act = """
