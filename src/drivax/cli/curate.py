@@ -160,8 +160,6 @@ def _tell(table: ScoreTable, out: Path) -> None:
         print(
             f"  scores of steps and errors of the scouts: rank correlation {table.config['error_rank_correlation']:.2f}"
         )
-    if not most:
-        print("  every score is 0: nothing is preferred")
     print(f"  scores: 5 % {low:.3f}, median {middle:.3f}, 95 % {high:.3f}, largest {most:.3f} ({first})")
     for scale in ("step", "scenario"):
         drawn = draws_of(weights_of(table, WeightConfig(), scale), table.drawn)

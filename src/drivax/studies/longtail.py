@@ -88,14 +88,14 @@ def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
         DataError: A set is no scenario set.
     """
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
-    rest = [name for name in config.agents if AGENTS[name].method != "oracle"]
-    if len(rest) < len(config.agents) and not event_kinds(data[0]).any():
-        raise UsageError(
-            "has no labelled events, which the oracle and its lot learn from",
-            file=sets.train,
-            cure=f"pass --agents [{','.join(rest)}]",
-        )
     if not out.exists():
+        rest = [name for name in config.agents if AGENTS[name].method != "oracle"]
+        if len(rest) < len(config.agents) and not event_kinds(data[0]).any():
+            raise UsageError(
+                "has no labelled events, which the oracle and its lot learn from",
+                file=sets.train,
+                cure=f"pass --agents [{','.join(rest)}]",
+            )
         RunFolder.create(out, config, data, kind="longtail")
         return
     folder = RunFolder.open(out)
