@@ -53,7 +53,7 @@ def write_page(
         actions: What experts do there, in units of the action space.
         out: The HTML file.
     """
-    scored = {name: table for name, table in tables.items() if len(table.components) or name == "oracle"}
+    scored = {name: table for name, table in tables.items() if name != "uniform"}
     sections = [
         _section("Before the comparison", _conditions(results)),
         _section("Verdicts", _verdicts(results)),
@@ -172,8 +172,7 @@ def _conditions(results: Mapping[str, Any]) -> str:
     return _table(*conditions(results)) + (
         "<p>The smallest difference in ordinary traffic that so many seeds and scenarios find with a probability of "
         "80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
-        f"{escape(found)}. Learning rates fall to the end, so that a score that stands still is that of this "
-        "budget.</p>"
+        f"{escape(found)}. A score that stands still is that of this budget and these learning rates.</p>"
     )
 
 
