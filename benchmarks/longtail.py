@@ -106,7 +106,7 @@ def _without_paths(file: Path) -> bytes:
     """What a file says, with data and runs by name: where they lie is the machine's own affair."""
     if file.name == "run.json":
         told = json.loads(file.read_bytes())
-        told.pop("command")
+        told.pop("command", None)  # a restored study tells none
         for entry in (*told["data"], *told.get("trained_on", ())):
             entry["path"] = Path(entry["path"]).name
         return json.dumps(told).encode()
