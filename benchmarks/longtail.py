@@ -26,7 +26,7 @@ import numpy as np
 
 from drivax.studies import longtail_page
 from drivax.studies.longtail_drives import has_driven, names
-from drivax.studies.longtail_plan import DRIVES, RESULTS, RUNS, SCORES, drive_of, run_of
+from drivax.studies.longtail_plan import DRIVES, REFERENCES, RESULTS, RUNS, SCORES, drive_of, run_of
 from drivax.studies.longtail_results import Group
 from learning_tables import table
 
@@ -42,7 +42,9 @@ def keep(study: Path) -> None:
     """Keeps every agent that has driven and is not kept yet, the study's own files, its scores and its results."""
     KEPT.mkdir(parents=True, exist_ok=True)
     _pack([study], study, KEPT / "study.tar.xz")
-    _pack([study / DRIVES / "expert"], study, KEPT / "expert.tar.xz")
+    for name in REFERENCES:
+        if (study / DRIVES / name).is_dir():
+            _pack([study / DRIVES / name], study, KEPT / f"{name}.tar.xz")
     for agent, seed in _agents(study):
         file = KEPT / f"{agent}-{seed}.tar.xz"
         if not file.exists() and has_driven(study, agent, seed):

@@ -293,14 +293,16 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     assert (
         results["about"]["test"] == 4 and results["about"]["rare"] == 2
     )  # as many without an event as with one
-    assert sorted(results["rates"]) == ["baseline", "bc", "expert", "heuristic", "random_matched"]
+    assert list(results["rates"]) == ["expert", "idm", "pdm", *results["draws"]]
+    assert list(results["draws"]) == ["baseline", "bc", "heuristic", "random_matched"]
     assert results["draws"]["bc"]["effective"] == 1.0
     page = (out / "report.html").read_text()
     assert "The conditions of the comparison are not met" in page and "http://" not in page
     assert (out / "critical.html").is_file()
     # Everything is there: nothing is trained or driven again.
     assert main([*arguments, "--anyway"]) == 0
-    assert "trained" not in capsys.readouterr().err
+    again = capsys.readouterr().err
+    assert "trained" not in again and "driving" not in again
     # And so where only what was kept of it is.
     monkeypatch.syspath_prepend(repository / "benchmarks")
     script = importlib.import_module("longtail")
@@ -317,7 +319,9 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
         assert str(tmp_path.parent) not in file.read_text(), file
     arguments[arguments.index(str(out))] = str(tmp_path / "restored")
     assert main([*arguments, "--anyway"]) == 0
-    assert "trained" not in capsys.readouterr().err
+    again = capsys.readouterr().err
+    assert "trained" not in again and "driving" not in again
+    script.keep(tmp_path / "restored")  # a study that was restored tells no command
     again = json.loads((tmp_path / "restored" / "results.json").read_text())
     assert again == results
     arguments[arguments.index(str(tmp_path / "restored"))] = str(out)

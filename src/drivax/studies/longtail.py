@@ -35,7 +35,7 @@ from drivax.studies.longtail_drives import (
     chosen_steps,
     clusters,
     drive,
-    drive_expert,
+    drive_references,
     driven,
     has_driven,
     ordinary_share,
@@ -48,6 +48,7 @@ from drivax.studies.longtail_plan import (
     CRITICAL,
     DRIVES,
     FIRST,
+    REFERENCES,
     REPORT,
     RESULTS,
     SCORES,
@@ -194,7 +195,7 @@ def study(
     data, test = ScenarioSet.open(sets.train), test_set(sets, out)
     # Of one observation and one action space: whichever agent is asked.
     usable = usable_steps(config.train_config(FIRST[0], 0), data)
-    drive_expert(out, test)
+    drive_references(out, test, say)
     jobs = [
         Job(config, sets, out, agent, seed, usable) for seed in range(config.seeds) for agent in config.agents
     ]
@@ -273,8 +274,9 @@ def findings(
     data, test = ScenarioSet.open(sets.train), test_set(sets, out)
     rare, labels, share = rare_rows(config, test), clusters(test), ordinary_share(sets)
     drives = {name: driven(config, out, name) for name in (*config.agents, BY_MEAN_Q)}
-    expert = read_evaluation(out / DRIVES / "expert").metrics
-    drives["expert"] = {name: expert[name][None] for name in METRICS}
+    for name in REFERENCES:
+        drove = read_evaluation(out / DRIVES / name).metrics
+        drives[name] = {metric: drove[metric][None] for metric in METRICS}
     by_mean_q = drives[BY_MEAN_Q]
     steps = [chosen_steps(run_of(out, "baseline", seed)) for seed in range(config.seeds)]
     return {
@@ -287,7 +289,7 @@ def findings(
             "share": share,
         },
         "claims": [summary(one) for one in judge(drives, labels, rare, config.agents, share)],
-        "rates": {name: rates(drives[name], labels, rare, share) for name in ("expert", *config.agents)},
+        "rates": {name: rates(drives[name], labels, rare, share) for name in (*REFERENCES, *config.agents)},
         "draws": {
             name: asdict(
                 draws_of(

@@ -21,7 +21,16 @@ from drivax.learning.validation import rank
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.studies.longtail_plan import BY_MEAN_Q, DRIVES, TEST, LongtailConfig, Sets, drive_of, run_of
+from drivax.studies.longtail_plan import (
+    BY_MEAN_Q,
+    DRIVES,
+    REFERENCES,
+    TEST,
+    LongtailConfig,
+    Sets,
+    drive_of,
+    run_of,
+)
 from drivax.tracking.runs import RunFolder
 from drivax.tracking.sinks import read_rows
 
@@ -63,11 +72,13 @@ def ordinary_share(sets: Sets) -> float | None:
     return float(labelled.mean()) if labelled.any() else None
 
 
-def drive_expert(out: Path, test: ScenarioSet) -> None:
-    """Drives the test set with the expert, unless it has."""
-    folder = out / DRIVES / "expert"
-    if not folder.is_dir():
-        run_evaluation(EvaluationConfig("expert"), make_planner("expert"), test, folder)
+def drive_references(out: Path, test: ScenarioSet, say: Say) -> None:
+    """Drives the test set with those who need no training, unless they have."""
+    for name in REFERENCES:
+        folder = out / DRIVES / name
+        if not folder.is_dir():
+            say(f"driving the test set: {name}")
+            run_evaluation(EvaluationConfig(name), make_planner(name), test, folder)
 
 
 def drive(out: Path, agent: str, seed: int) -> None:

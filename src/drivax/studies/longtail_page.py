@@ -76,7 +76,7 @@ def _lead(results: Mapping[str, Any]) -> str:
         "drive well.</p>"
     )  # fmt: skip
     return (
-        f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['rates']) - 1} agents, {about['seeds']} seeds, "
+        f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['draws'])} agents, {about['seeds']} seeds, "
         f"{about['train']:,} training and {about['test']:,} test scenarios ({about['rare']:,} of them rare, "
         f"{'labelled' if about['labelled'] else 'by the kinematic heuristic'}).</p>{caution}"
     )

@@ -22,6 +22,8 @@ Usable = Bool[np.ndarray, "N T"]
 
 #: What has to drive well before anything is compared.
 FIRST = ("baseline", "bc")
+#: Who drives the test beside the agents: the recording itself, and two who know rules, but nothing of the future.
+REFERENCES = ("expert", "idm", "pdm")
 SCORES, RUNS, DRIVES, TEST = "scores", "runs", "drives", "test"
 RESULTS, REPORT, CRITICAL = "results.json", "report.html", "critical.html"
 #: Name of the evaluations of the baseline's checkpoints that the published rule would have chosen.
