@@ -1,11 +1,16 @@
 """Pages of results show what is stored, and nothing else."""
 
+import csv
 import importlib
+import io
 import json
+import tarfile
 import types
 
 import numpy as np
 import pytest
+
+from drivax.studies.longtail_plan import REFERENCES
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +140,35 @@ def test_curation_was_scored_on_the_test_set_that_planners_drive(stored):
 def test_scouts_disagree_where_they_err(stored):
     low, high = stored("curation")["methods"]["ensemble"]["error_rank_interval"]
     assert 0.0 < low < high
+
+
+def test_the_page_of_the_long_tail_study_shows_what_was_found(script, repository):
+    longtail = script("longtail")
+    results = json.loads((longtail.KEPT / longtail.RESULTS).read_text())
+    text = longtail.PAGE.read_text()
+    assert longtail.filled(text, results) == text, (
+        "run python benchmarks/longtail.py table, and read what the page says about it"
+    )
+
+
+def test_the_long_tail_study_found_what_its_agents_drove(script):
+    """Every agent's mean over the whole test, from what is kept of its episodes."""
+    longtail = script("longtail")
+    results = json.loads((longtail.KEPT / longtail.RESULTS).read_text())
+    about = results["about"]
+    for name, rates in results["rates"].items():
+        files = sorted(longtail.KEPT.glob(f"{name}-?.tar.xz")) or [longtail.KEPT / f"{name}.tar.xz"]
+        assert len(files) == (1 if name in REFERENCES else about["seeds"])
+        means = []
+        for file in files:
+            with tarfile.open(file) as packed:
+                wanted = f"drives/{name}/seed-{file.stem[-5]}/" if len(files) > 1 else f"drives/{name}/"
+                rows = list(csv.DictReader(io.TextIOWrapper(packed.extractfile(wanted + "episodes.csv"))))
+            assert len(rows) == about["test"]
+            means.append(np.mean([float(row["collision"]) for row in rows]))
+        rare = about["rare"] / about["test"]
+        whole = rare * rates["rare"]["collision"]["mean"] + (1 - rare) * rates["common"]["collision"]["mean"]
+        np.testing.assert_allclose(np.mean(means), whole, atol=1e-9)
 
 
 def test_the_page_of_offline_learning_shows_how_fast_it_is(script, stored):
