@@ -52,7 +52,8 @@ def page(tmp_path):
         {"urgency": steps},
     )
     kept = replace(table, method="ensemble", components={})  # of a study that went on elsewhere
-    tables = {"kinematic": table, "ensemble": kept, "uniform": replace(kept, method="uniform")}
+    tables = {"kinematic": table, "ensemble": kept}
+    tables |= {name: replace(kept, method=name) for name in ("uniform", "oracle")}
     write_page(RESULTS, tables, rng.normal(0, 0.3, (500, 2)), tmp_path / "report.html")
     return tmp_path / "report.html", table
 
@@ -67,6 +68,7 @@ def test_it_says_what_was_found(page):
     assert "The conditions of the comparison are not met" not in text
     assert "kinematic and ensemble" in text and "+0.41" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
+    assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text
     assert "Better than the same weights dealt out by lot?" in text and "than the baseline?" not in text
     assert "of which they are 5.0%" in text and "the same checkpoint of 2 of the 5 seeds" in text

@@ -33,6 +33,8 @@ _CELLS, _SIZE = 48, 336
 _STYLE = """
 table.wide td, table.wide th { text-align: left; }
 table.wide th[scope=row] { min-width: 19em; }
+table.wide td:last-child { min-width: 14em; }
+table.dense td, table.dense th[scope=row] { white-space: nowrap; max-width: none; font-size: 0.85rem; }
 table.wide td:nth-child(n+3):nth-child(-n+6) { white-space: nowrap; }
 h3 { margin-top: 1.5em; }
 .map rect { stroke: none; }
@@ -208,7 +210,7 @@ def _rates(results: Mapping[str, Any], kind: str) -> str:
     note = "" if kind != "ordinary" or share is None else (
         f"<p><small>Scenarios with an event count as in ordinary traffic, of which they are {share:.1%}.</small></p>"
     )  # fmt: skip
-    return f"<h3>{_KINDS[kind]}</h3>" + _table(*cells) + note
+    return f"<h3>{_KINDS[kind]}</h3>" + _table(*cells, "dense") + note
 
 
 def _mean(rate: Mapping[str, float] | None) -> str:
@@ -239,10 +241,11 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
     tops = [
         (name, *(table.scenario_ids[row] for row in np.argsort(-table.scenarios, kind="stable")[:3]))
         for name, table in tables.items()
+        if name != "oracle"  # labels do not rank what they mark
     ]
     return (
         f"<div class=charts>{charts}</div>"
-        + _table(("method", "most critical", "second", "third"), tops, "wide")
+        + _table(("method", "most critical", "second", "third"), tops, "dense")
         + "<p>These drives can be watched in <a href=critical.html>critical.html</a>.</p>"
     )
 
