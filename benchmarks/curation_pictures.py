@@ -20,7 +20,7 @@ from drivax.curation.rarity import ExpertActions, KernelRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.scoring import score_steps
 from drivax.curation.scouts import ScoutsConfig, train_scouts
-from drivax.scenario.schema import DT_S
+from drivax.scenario.schema import DT_S, STEPS
 from drivax.scenario.store import ScenarioSet
 from drivax.show.palette import LIGHT, SERIES
 from drivax.show.scene import draw_on
@@ -52,7 +52,7 @@ def picture(data: ScenarioSet, table: ScoreTable, plots: int, beside: Beside, ou
 def over_time(axes: Axes, step: int, what: str) -> None:
     """Seconds along the axis, and the moment of the scene."""
     axes.axvline(step * DT_S, color=LIGHT["log"], linewidth=1.0, linestyle=":")
-    axes.set(xlabel="s", title=what)
+    axes.set(xlabel="s", xlim=(0.0, (STEPS - 1) * DT_S), title=what)
     axes.title.set_fontsize(10)
     axes.spines[["top", "right"]].set_visible(False)
 
