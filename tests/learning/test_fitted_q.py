@@ -9,9 +9,11 @@ import pytest
 
 from drivax import settings
 from drivax.errors import UsageError
+from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
 from drivax.learning.fitted_q import FittedQ, FittedQConfig
+from drivax.learning.iql import IqlConfig
 from drivax.learning.validation import rank
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
@@ -56,6 +58,33 @@ def test_policies_are_worth_what_they_earn(table):
         right, left = both(ExperienceConfig().of(Told(), data))
         assert float(right) == pytest.approx(worth, rel=0.05)
         assert float(left) == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_learner_is_judged_by_it(table):
+    """A clone of pushes to the right, all features of which lie close together: told apart by normalising alone.
+
+    Pushing right pays as much as the number of the step then, so that a critic that sees no steps cannot know it.
+    """
+    right = np.asarray(table.action[..., 0]) > 0
+    number = np.broadcast_to(np.arange(LENGTH + 1), right.shape)
+    pays = jnp.asarray(right * number, jnp.float32)
+    near = replace(table, seen=100.0 + 1e-2 * table.seen, reward=pays, terminated=table.truncated)
+    worth = sum(GAMMA**step * step for step in range(LENGTH))
+    fits = FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05)
+    config = IqlConfig(
+        network=NETWORK, batch=64, updates=100, gamma=GAMMA, loss="mse", inverse_temperature=0.0, fitted_q=fits,
+        policy_rate=1e-2,
+    )  # fmt: skip
+    found = {}
+    for normalise in (True, False):
+        learner = replace(config, normalise=normalise).build(Told(), near, 4)
+        made = training_data(learner.settings, Told(), near, np.asarray(right, np.float64))
+        state = jax.jit(learner.init)(made, jax.random.key(0))
+        for _ in range(4):
+            state, _ = jax.jit(learner.iterate)(made, state)
+        found[normalise] = learner.judge(ExperienceConfig().of(Told(), near), state)
+    assert found[True]["fitted_q"] == pytest.approx(worth, rel=0.05)
+    assert abs(found[False]["fitted_q"] - worth) > 0.2 * worth
 
 
 def test_checkpoints_are_compared_by_it():

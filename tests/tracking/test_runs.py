@@ -101,24 +101,30 @@ def test_what_is_no_run(tmp_path: Path):
 
 
 def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Against a repository made here: a clean commit, a change, and a file that the repository does not track."""
+    """Against a repository made here: a clean commit, a run beside it, a new file, a change."""
 
     def git(*arguments: str) -> str:
         options = ["-c", "user.name=t", "-c", "user.email=t@t", "-c", "init.defaultBranch=main"]
         command = ["git", "-C", str(tmp_path), *options, *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
-    file = tmp_path / "runs.py"
+    file = tmp_path / "package" / "tracking" / "runs.py"
+    file.parent.mkdir(parents=True)
     file.write_text("one")
     monkeypatch.setattr(runs, "__file__", str(file))
     assert runs.git_state(tmp_path) is None
     git("init")
     assert runs.git_state(tmp_path) is None
-    git("add", "runs.py")
+    git("add", str(file))
     git("commit", "-m", "one")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").write_text("beside the package")
     assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": False}
-    file.write_text("two")
-    assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": True}
+    new = file.with_name("new.py")
+    for changed in (new, file):
+        changed.write_text("two")
+        assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": True}
+        new.unlink(missing_ok=True)
 
 
 def test_where_a_planner_was_trained(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import Actions
 from drivax.networks.encoders import GroupSpec
+from drivax.networks.normalised import Statistics, tell_statistics
 from drivax.rl.temporal_difference import polyak, td_target
 
 
@@ -62,7 +64,10 @@ class FittedQ:
     gamma: float
 
     def value(
-        self, data: Experience, act: Callable[[dict[str, Array]], Float[Array, "B D"]]
+        self,
+        data: Experience,
+        act: Callable[[dict[str, Array]], Float[Array, "B D"]],
+        statistics: Statistics = MappingProxyType({}),
     ) -> Float[Array, ""]:
         """The discounted return that a policy earns from where episodes begin, as a critic estimates it.
 
@@ -73,9 +78,11 @@ class FittedQ:
         Args:
             data: The recorded steps.
             act: From a batch of observations to the policy's actions.
+            statistics: Of features, where the network is to normalise them.
         """
         network_key, key = jax.random.split(jax.random.key(0))
         critic = self._critic(self.environment.shapes(data.data), network_key)
+        tell_statistics(critic, statistics)
         graph, first = nnx.split(critic, nnx.Param)
         config = self.config
         optimiser = clipped_adam(config.rate, config.gradient_norm, updates=config.updates)

@@ -289,8 +289,11 @@ class Offline:
     @partial(jax.jit, static_argnums=0)
     def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:
         config = self.settings
-        judge = FittedQ(config.fitted_q, config.network, recorded(self.environment), config.gamma)
-        return judge.value(data, lambda observation: self.distribution(policy, observation).mode())
+        judge = FittedQ(config.fitted_q, config.networks, recorded(self.environment), config.gamma)
+        statistics = self._statistics(data) if config.normalise else {}
+        return judge.value(
+            data, lambda observation: self.distribution(policy, observation).mode(), statistics
+        )
 
     def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
         """The policy as a planner."""

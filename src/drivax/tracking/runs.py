@@ -208,7 +208,10 @@ def machine() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Commit and cleanliness of the checkout that ``folder`` belongs to; None outside of one or without git."""
+    """Commit of the checkout that ``folder`` belongs to, and whether the package there is another; None without one.
+
+    What lies beside the package, as a run folder may, changes nothing of what runs.
+    """
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
@@ -216,8 +219,10 @@ def git_state(folder: Path) -> dict[str, Any] | None:
 
     try:
         # An installed package may lie inside a foreign repository: only a checkout that tracks this file counts.
-        git("ls-files", "--error-unmatch", str(Path(__file__).resolve()))
-        return {"commit": git("rev-parse", "HEAD"), "changed": bool(git("status", "--porcelain"))}
+        own = Path(__file__).resolve()
+        git("ls-files", "--error-unmatch", str(own))
+        changed = git("status", "--porcelain", "--", str(own.parents[1]))
+        return {"commit": git("rev-parse", "HEAD"), "changed": bool(changed)}
     except (OSError, subprocess.SubprocessError):
         return None
 
