@@ -52,6 +52,9 @@ SCENES = {
     ],
     "far": [car(speed=15.0), car(x=60.0)],
     "standing": [car(), car(x=10.0)],
+    "waiting": [car(), car(x=25.0, heading=np.pi, speed=10.0, steps=range(28))],
+    "letting pass": [car(), car(x=8.0, y=-6.0, heading=np.pi / 2 + 0.5, speed=5.0, steps=range(28))],
+    "head on": [car(speed=5.0), car(x=40.0, heading=np.pi, speed=10.0, steps=range(28))],
     "brief": [car(speed=15.0, steps=range(12)), car(x=60.0)],
     "noise": [with_speeds(10.0 + 0.01 * NOISE)],
     "jerk": [with_speeds(10.0 + 4.13 / 2 * TIME**2)],
@@ -122,6 +125,14 @@ def test_who_is_not_in_the_way_does_not_count(steps):
     assert steps["standing"].max() == 0.0
 
 
+def test_who_comes_nearer_counts_as_standing(components):
+    """No braking takes away what others bring to the closing speed, and who stands has nothing to brake."""
+    for scene in ("waiting", "letting pass"):
+        assert components[scene]["braking"].max() == components[scene]["urgency"].max() == 0.0
+    wanted = 5.0**2 / (2 * (40.0 - 4.8)) / CONFIG.full_braking_mps2
+    assert components["head on"]["braking"][NOW] == pytest.approx(wanted, abs=1e-3)
+
+
 def test_nearer_and_faster_is_more_critical(steps):
     near, fast = ([steps[name][NOW] for name in SCENES if name.startswith(kind)] for kind in ("gap", "speed"))
     assert len(near) == len(fast) == 4
@@ -153,6 +164,23 @@ def test_jerk_and_yaw_acceleration(components):
     """Constant ones, which the fitted polynomials give exactly: half of twice nuPlan's limit, and 0.6 rad/s2."""
     np.testing.assert_allclose(components["jerk"]["volatility"], 0.5, atol=2e-3)
     np.testing.assert_allclose(components["bend"]["volatility"], 0.6 / (2 * 1.93), atol=2e-3)
+
+
+BRAKING = 30.0 - 2.0 * (TIME + 1.0)
+
+
+@pytest.mark.parametrize("there", [range(5, 91), range(51), {*range(91)} - {*range(40, 50)}, range(2, 16)])
+@pytest.mark.parametrize(("speeds", "jerk"), [(BRAKING, 0.0), (20.0 + 4.13 / 2 * TIME**2, 0.5)])
+def test_where_ego_is_not_there_nothing_is_made_up(there, speeds, jerk):
+    """Constant deceleration, or jerk, up to the last step that is known; 0 where there are no 1.5 s on end."""
+    valid = np.isin(np.arange(91), list(there))
+    track = with_speeds(speeds)
+    bank = bank_of(straight_road([track | {"valid": valid}]))
+    found = np.asarray(of_logs(CONFIG, bank)["volatility"][0])
+    acts = valid & np.roll(valid, -1)
+    acts[-1] = acts[-2]
+    wanted = jerk if valid.sum() > 15 else 0.0
+    np.testing.assert_allclose(found, np.where(acts, wanted, 0.0), atol=3e-3)
 
 
 def test_volatility_is_that_of_the_action_that_begins_now():

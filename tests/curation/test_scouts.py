@@ -10,6 +10,7 @@ import pytest
 import scipy.stats
 
 from drivax.cli import main
+from drivax.curation import scouts as scouts_module
 from drivax.curation.methods import ensemble_table
 from drivax.curation.rarity import KernelRarity
 from drivax.curation.scores import read_scores
@@ -20,6 +21,7 @@ from drivax.curation.scouts import (
     fit,
     folds_of,
     mutual_information,
+    some_of,
     train_scouts,
 )
 from drivax.errors import UsageError
@@ -133,6 +135,43 @@ def test_a_scout_learns_from_all_recordings_but_those_of_its_fold(scouts, data, 
 
 
 @pytest.mark.slow
+def test_stacked_or_one_after_the_other_they_learn_the_same(scouts, data):
+    environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
+    experience, _ = experience_of(TINY, environment, bank)
+    learner = TINY.cloning.build(environment, bank, TINY.iterations)
+    one, other = (
+        fit(TINY, learner, experience, scouts.fold, together=together) for together in (True, False)
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), one, other)
+
+
+def test_a_part_of_the_recordings_is_whole_recordings():
+    clusters = [f"recording-{number}" for number in np.random.default_rng(0).integers(0, 40, 300)]
+    rows = some_of(clusters, 100, seed=1)
+    taken = {clusters[row] for row in rows}
+    assert rows.tolist() == [row for row, name in enumerate(clusters) if name in taken]
+    largest = max(clusters.count(name) for name in taken)
+    assert 100 <= len(rows) < 100 + largest
+    assert some_of(clusters, 100, seed=2).tolist() != rows.tolist()
+    assert len(some_of(clusters, None, seed=1)) == len(some_of(clusters, 1_000, seed=1)) == 300
+
+
+@pytest.mark.slow
+def test_scouts_that_learn_from_a_part_score_all(data):
+    trained = train_scouts(replace(TINY, learn_from=6), data)
+    assert sorted(np.bincount(trained.fold + 1)) == [2, 2, 2, 4]
+    assert len({*np.flatnonzero(trained.fold < 0) // 2}) == 2  # two recordings of two windows
+    table = ensemble_table(trained, data)
+    assert table.steps.min(axis=1).shape == (10,) and (table.steps.max(axis=1) > 0).all()
+
+
+def test_more_scenarios_than_fit_are_refused(data, monkeypatch):
+    monkeypatch.setattr(scouts_module, "free_memory", lambda device: 1_000_000)
+    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* pass --learn_from \d"):
+        train_scouts(TINY, data)
+
+
+@pytest.mark.slow
 def test_all_recordings_are_drawn_for_the_scouts(scouts, data):
     environment, bank = Driving(Simulator(TINY.task)), ScenarioBank.from_scenarios(data)
     experience, _ = experience_of(TINY, environment, bank)
@@ -188,9 +227,15 @@ def test_scouts_disagree_where_they_have_seen_little(scouts, tmp_path):
 def test_the_table_of_an_ensemble(data, scouts, weighted):
     trained = scouts if weighted == "plain" else train_scouts(replace(TINY, weighted="rarity"), data)
     table = ensemble_table(trained, data)
-    assert table.method == "ensemble" and sorted(table.components) == ["action_0", "action_1"]
-    assert 0.0 < table.scenarios.max() <= 1.0
+    assert table.method == "ensemble"
+    assert sorted(table.components) == ["action_0", "action_1", "disagreement"]
     told = trained.opinions(data)
+    whole = told.disagreement(trained.deviation).sum(axis=-1)
+    # A half at the percentile 99, more beyond it: the order stays to the top.
+    wanted = whole / (whole + np.percentile(whole, 99.0))
+    np.testing.assert_allclose(table.steps, wanted)
+    np.testing.assert_allclose(table.components["action_0"] + table.components["action_1"], wanted)
+    assert np.unique(table.steps[wanted > 0.5]).size > 5 and table.steps.max() < 1.0
     error = told.error(trained.deviation, trained.fold)[told.known]
     by_hand = scipy.stats.spearmanr(table.steps[told.known], error).statistic
     assert table.config["error_rank_correlation"] == pytest.approx(by_hand)
@@ -215,6 +260,8 @@ def test_the_command_trains_scouts_that_can_disagree_about_modes(data, tmp_path,
 def test_what_cannot_be_is_refused(data, tmp_path, capsys):
     with pytest.raises(UsageError, match="1 folds"):
         ScoutsConfig(folds=1)
+    with pytest.raises(UsageError, match="learn_from is 0"):
+        ScoutsConfig(learn_from=0)
     call = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "s.npz")]
     assert main([*call, "--folds", "3"]) == 2
     assert "folds: there is no such setting; use one of urgent_s" in capsys.readouterr().err

@@ -188,6 +188,18 @@ def test_weights_of_the_steps_that_a_training_can_use():
     assert draws_of(weights, usable).effective == pytest.approx(0.75, rel=1e-3)
 
 
+@pytest.mark.parametrize("config", [WeightConfig(), plain(most=1.5), PUBLISHED])
+def test_a_scenario_counts_as_often_as_its_steps_are_drawn(config):
+    """The same as weighing every step by its scenario's score, one by one."""
+    table = table_of(RNG.random((60, 41)), scenarios=RNG.random(60) ** 4)
+    usable = table.drawn & (np.arange(41) < RNG.integers(0, 41, 60)[:, None])
+    usable[np.argsort(table.scenarios)[-20:]] &= np.arange(41) == 0  # the most critical have one step each
+    weights = weights_of(table, config, "scenario", usable)
+    every = table_of(np.broadcast_to(table.scenarios[:, None], (60, 41)))
+    np.testing.assert_allclose(weights, weights_of(every, config, "step", usable), rtol=1e-9)
+    assert weights.max() < config.most * (1 + 1e-9)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [

@@ -1,4 +1,4 @@
-"""From components to scores: their weighted sum at every step, and one score of every scenario."""
+"""From components to scores: their weighted mean at every step, and one score of every scenario."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Combination:
     """How components become scores.
 
     Attributes:
-        weights: Of each component that counts; not negative.
+        weights: Of each component that counts; not negative. What they are among each other counts, not their sum.
         scenario: How steps become the score of their scenario: ``max``, ``mean``, ``std``, ``p99`` (a percentile,
             any from p0 to p100) or ``top10`` (the mean of the ten largest, or of so many others). One for the combined
             score, or one for each component, whose results are then weighted.
@@ -61,7 +61,7 @@ class Combination:
                 raise UsageError(f"there is no component {name!r}", cure=nearest(name, sorted(there)))
 
     def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
-        """Scores in [0, 1]: of every step, ``sum of weight * component`` clipped at 1, and of every scenario.
+        """Scores in [0, 1]: of every step the weighted mean of its components, and of every scenario.
 
         Steps that are not valid score 0, and count for no scenario.
 
@@ -69,16 +69,15 @@ class Combination:
             UsageError: A component that has a weight is not there.
         """
         self.check_components(components)
-        steps = np.zeros(valid.shape)
-        for name, weight in self.weights.items():
-            steps += weight * components[name]
-        steps = np.where(valid, np.clip(steps, 0.0, 1.0), 0.0)
+        shares = {name: weight / sum(self.weights.values()) for name, weight in self.weights.items()}
+        steps = sum(share * components[name] for name, share in shares.items())
+        # A mean of ones may be a rounding above 1.
+        steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
         if isinstance(self.scenario, str):
             return steps, aggregate(steps, valid, self.scenario)
-        scenarios = np.zeros(len(steps))
-        for name, weight in self.weights.items():
-            scenarios += weight * aggregate(components[name], valid, self.scenario[name])
-        return steps, np.clip(scenarios, 0.0, 1.0)
+        each = {name: aggregate(components[name], valid, self.scenario[name]) for name in shares}
+        scenarios = sum((share * each[name] for name, share in shares.items()), np.zeros(len(steps)))
+        return steps, np.minimum(scenarios, 1.0)
 
 
 def check_aggregator(name: str) -> None:

@@ -5,7 +5,8 @@ Per step of the log, all in [0, 1]:
 - urgency is the inverse of the time to collision (Hayward, 1972; the inverse so that no conflict is 0), scaled from
   0 at the horizon of 5 s to 1 at ``urgent_s``;
 - braking is the deceleration that avoids reaching the nearest agent on the driver's own way if it keeps its speed,
-  ``(v - v_leader)^2 / (2 gap)`` (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
+  ``(v - v_leader)^2 / (2 gap)``, where one that comes nearer counts as standing: its own part of the closing speed no
+  braking takes away (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
   can do (the brake threat number of Braennstroem, Sjoeberg and Coelingh, A Situation and Threat Assessment Algorithm
   for a Rear-End Collision Avoidance System, 2008);
 - volatility is the larger of jerk and yaw acceleration, each as a share of a limit, over a Savitzky-Golay window
@@ -112,7 +113,8 @@ def required_braking(
     """Deceleration (m/s2) that avoids reaching the nearest agent on the log's own way at its present speed.
 
     An agent is on the way where its box reaches into the strip as wide as ego along the log's route, on ego's level,
-    up to about 75 m ahead. 0 where nobody is, or the nearest one is not approached.
+    up to about 75 m ahead. One that comes towards ego counts as standing, so that who stands, or has slowed down to let
+    somebody pass, need not brake. 0 where nobody is on the way, or the nearest one is not approached.
 
     Args:
         bank: The scenarios.
@@ -140,8 +142,8 @@ def required_braking(
     gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
     gap = jnp.where(counts & on_way & (hits.along_m > along_m), gap, jnp.inf)
     nearest = jnp.argmin(gap)
-    speed = jnp.sum(frame.velocity[nearest] * hits.heading[nearest])
-    closing = jnp.maximum(speed_mps - speed, 0.0)
+    away = jnp.maximum(jnp.sum(frame.velocity[nearest] * hits.heading[nearest]), 0.0)
+    closing = jnp.maximum(speed_mps - away, 0.0)
     return closing * closing / (2.0 * jnp.maximum(gap[nearest], 0.1))
 
 
@@ -172,19 +174,30 @@ def _volatility(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
     of noise in the speed is some hundredths of a m/s3.
     """
     speed, heading = log.motion[:, 3], log.motion[:, 2]
+    known = log.valid[1:] & log.valid[:-1]
     acceleration = (speed[1:] - speed[:-1]) / DT_S
     turned = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
-    jerk = _derivative(acceleration, _JERK_ORDER, 1)
+    jerk = _derivative(acceleration, known, _JERK_ORDER, 1)
     # At the middle of the action, where the jerk is too.
-    yaw = _derivative((turned[1:] + turned[:-1]) / 2, _YAW_ORDER, 2)
+    yaw = _derivative((turned[1:] + turned[:-1]) / 2, known, _YAW_ORDER, 2)
     share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
     share = jnp.minimum(share, 1.0)
     return jnp.concatenate([share, share[-1:]])
 
 
-def _derivative(signal: Float[Array, " K"], order: int, derivative: int) -> Float[Array, " K"]:
-    matrix = filter_operator(len(signal), _WINDOW, order, derivative)
-    return jnp.asarray(matrix, jnp.float32) @ signal / DT_S**derivative
+def _derivative(
+    signal: Float[Array, " K"], known: Bool[Array, " K"], order: int, derivative: int
+) -> Float[Array, " K"]:
+    """Of the polynomial through the window around each sample, moved so that all of it is known; 0 where none is."""
+    place = jnp.arange(len(signal))
+    first = jax.lax.cummax(jnp.where(known, -1, place)) + 1
+    last = jax.lax.cummin(jnp.where(known, len(signal), place), reverse=True) - 1
+    start = jnp.clip(place - _WINDOW // 2, first, last - (_WINDOW - 1))
+    window = signal[jnp.clip(start[:, None] + jnp.arange(_WINDOW), 0, len(signal) - 1)]
+    # One row for each place in a window.
+    rows = jnp.asarray(filter_operator(_WINDOW, _WINDOW, order, derivative), jnp.float32)
+    found = jnp.sum(rows[place - start] * window, axis=-1) / DT_S**derivative
+    return jnp.where(known & (last - first >= _WINDOW - 1), found, 0.0)
 
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:

@@ -47,8 +47,8 @@ PUBLISHED = Combination(
 RARITY = Combination({"rarity": 1.0}, "p95")
 #: A single component.
 ALL = Combination({"all": 1.0})
-#: Disagreement above this percentile of a set scores 1.
-_MOST = 99.0
+#: Disagreement at this percentile of a set scores a half.
+_HALF = 99.0
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,13 @@ class Method:
         score: From what is asked, with settings, to the table.
         config: Settings by default; None: it has none.
         combination: How its components become scores, from its settings.
-        beside: Components that weigh nothing in it.
+        beside: Components that weigh nothing in it, from its settings.
     """
 
     score: Callable[[Wanted], ScoreTable]
     config: Any = None
     combination: Callable[[Any], Combination] = lambda _: ALL
-    beside: tuple[str, ...] = ()
+    beside: Callable[[Any], tuple[str, ...]] = lambda _: ()
 
 
 def curate(name: str, wanted: Wanted) -> ScoreTable:
@@ -148,14 +148,21 @@ def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> Non
         UsageError: A method with these settings has no such component, or there is no such aggregator or weight.
     """
     usual = METHODS[name].combination(config)
-    replace(usual, **changes).check_components({*usual.weights, *METHODS[name].beside})
+    replace(usual, **changes).check_components({*usual.weights, *METHODS[name].beside(config)})
 
 
 def _disagreement(config: ScoutsConfig) -> Combination:
     """A scenario is as uncertain as its most uncertain second."""
-    likely = config.cloning.loss == "likelihood"
-    names = ["information"] if likely else [f"action_{number}" for number in range(Actions().size)]
-    return Combination(dict.fromkeys(names, 1.0), "top10")
+    name = "information" if config.cloning.loss == "likelihood" else "disagreement"
+    return Combination({name: 1.0}, "top10")
+
+
+def _numbers(config: ScoutsConfig) -> tuple[str, ...]:
+    return () if config.cloning.loss == "likelihood" else tuple(_number(i) for i in range(Actions().size))
+
+
+def _number(place: int) -> str:
+    return f"action_{place}"
 
 
 def _heuristic(name: str) -> Callable[[Wanted], ScoreTable]:
@@ -168,10 +175,9 @@ def _heuristic(name: str) -> Callable[[Wanted], ScoreTable]:
 
 def _rarity(name: str) -> Callable[[Wanted], ScoreTable]:
     def score(wanted: Wanted) -> ScoreTable:
-        expert = ExpertActions()
-        found = score_steps(wanted.data, expert, wanted.progress)
+        found = score_steps(wanted.data, ExpertActions(), wanted.progress)
         components = {"rarity": rarity_steps(wanted.config, found["action"], found["known"])}
-        return table_of(name, wanted.config, wanted.data, components, asdict(expert))
+        return table_of(name, wanted.config, wanted.data, components)
 
     return score
 
@@ -187,8 +193,9 @@ def ensemble_table(
 ) -> ScoreTable:
     """Scores by the disagreement of an ensemble, which may have been trained on another set.
 
-    Components are the disagreement about each number of the action, over the percentile 99 of their sum in the set; of
-    scouts trained by likelihood there is one, the mutual information over its largest possible value. The table's
+    The component is ``d / (d + scale)`` of the disagreement d, so that the order of d stays to the top; beside it are
+    the parts of it about each number of the action. Of scouts trained by likelihood there is one, the mutual
+    information over its largest possible value. The table's
     configuration says how scores and errors of the scouts correlate by rank, over all steps: on the set that they were
     trained on, errors of the one that has not seen the scenario.
 
@@ -196,16 +203,18 @@ def ensemble_table(
         scouts: The ensemble.
         data: The set.
         progress: Called with (scenarios done, scenarios).
-        scale: Disagreement that scores 1; by default the percentile 99 of the set.
+        scale: Disagreement that scores a half; by default the percentile 99 of the set.
     """
     opinions = scouts.opinions(data, progress)
     valid = valid_steps(data)
     if opinions.information is None:
-        disagreement = opinions.disagreement(scouts.deviation)
+        parts = opinions.disagreement(scouts.deviation)
+        whole = parts.sum(axis=-1)
         if scale is None:
-            scale = float(np.percentile(disagreement.sum(axis=-1)[valid], _MOST))
-        parts = np.clip(disagreement / max(scale, np.finfo(np.float64).tiny), 0.0, 1.0)
-        components = {f"action_{number}": part for number, part in enumerate(np.moveaxis(parts, -1, 0))}
+            scale = float(np.percentile(whole[valid], _HALF))
+        parts = parts / np.maximum(whole + scale, np.finfo(np.float64).tiny)[..., None]
+        components = {_number(place): part for place, part in enumerate(np.moveaxis(parts, -1, 0))}
+        components["disagreement"] = parts.sum(axis=-1)
     else:
         components = {"information": opinions.information / math.log(scouts.config.folds)}
     own = data.hash == scouts.set_hash
@@ -261,10 +270,12 @@ def table_of(
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
-        "kinematic": Method(_heuristic("kinematic"), KinematicConfig(), lambda _: KINEMATIC, ("density",)),
+        "kinematic": Method(
+            _heuristic("kinematic"), KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)
+        ),
         "published": Method(_heuristic("published"), PublishedConfig(), lambda _: PUBLISHED),
         "action_rarity": Method(_rarity("action_rarity"), KernelRarity(), lambda _: RARITY),
-        "ensemble": Method(_ensemble, ScoutsConfig(), _disagreement),
+        "ensemble": Method(_ensemble, ScoutsConfig(), _disagreement, _numbers),
         "action_rarity_published": Method(
             _rarity("action_rarity_published"), PublishedRarity(), lambda _: RARITY
         ),

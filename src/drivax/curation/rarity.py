@@ -6,7 +6,7 @@ dimension); a step's score is the inverse of the density at its action.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -27,23 +27,20 @@ Values = Float[np.ndarray[Any, Any], " n"]
 Others = Float[np.ndarray[Any, Any], "m 2"]
 OtherValues = Float[np.ndarray[Any, Any], " m"]
 
+#: What actions mean: that in which imitation and offline learning see them by default.
+_SPACE = Physical()
+
 
 @dataclass(frozen=True)
 class ExpertActions:
-    """The action that follows the log from every step, as imitation and offline learning see it.
-
-    Attributes:
-        space: The action space.
-    """
-
-    space: Physical = field(default_factory=Physical)
+    """The action that follows the log from every step, in units of the default action space."""
 
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Array]:
         """``action [T, 2]`` within the bounds, and ``known [T]``: ego is there at the step and at the next two.
 
         The second of them tells the curvature; without it the action that follows the log is a guess.
         """
-        action = jax.vmap(lambda scene: expert_action(bank, scene, self.space))(log.scene)
+        action = jax.vmap(lambda scene: expert_action(bank, scene, _SPACE))(log.scene)
         later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
         known = log.valid & later[1:-1] & later[2:]
         return {"action": jnp.clip(action, -1.0, 1.0), "known": known}
@@ -108,11 +105,9 @@ class PublishedRarity:
     though it counts it in the upper one, so that standing still is looked up beside itself; here both are the upper.
 
     Attributes:
-        space: What actions mean.
         most: Weight at which clipping begins. It never does: no cell weighs so much.
     """
 
-    space: Physical = field(default_factory=Physical)
     most: float = 3.0
 
     @property
@@ -130,8 +125,8 @@ class PublishedRarity:
         return np.minimum(rarity + 0.01, 1.0)
 
     def _cell(self, actions: Others) -> Int[np.ndarray[Any, Any], " m"]:
-        scale = np.where(actions[:, 0] < 0, self.space.braking_mps2, self.space.acceleration_mps2)
-        values = (actions[:, 0] * scale, actions[:, 1] * self.space.steering)
+        scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)
+        values = (actions[:, 0] * scale, actions[:, 1] * _SPACE.steering)
         row, column = (
             np.searchsorted(edges, value, side="right") - 1
             for edges, value in zip(self.edges, values, strict=True)

@@ -21,7 +21,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.partial import sync_folder
 from drivax.scenario.store import ScenarioSet
 
-SCORES_VERSION = 2
+SCORES_VERSION = 3
 _AGAIN = "run `drivax curate` again"
 _COMPONENT = "component_"
 

@@ -23,6 +23,7 @@ from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.curation.scoring import Progress, each_batch
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import recordings
+from drivax.evaluation.memory import free_memory
 from drivax.learning.driving import Driving
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
 from drivax.learning.imitation import Bc, BcConfig, updated
@@ -58,6 +59,8 @@ class ScoutsConfig:
             being left out. With ``loss: mse`` scouts disagree by the variance of what they would do; with
             ``likelihood`` by how much their distributions differ, so that ``network.distribution: mixture`` can
             disagree about modes.
+        learn_from: About so many scenarios are learned from, whole recordings chosen by lot; null: all, which have to
+            fit on the device. All are scored.
         total_steps: Recorded steps that are drawn for all of them, rounded up to whole iterations of ``cloning``.
         weighted: ``plain``: all steps alike; ``rarity``: drawn by inverse density of the expert's action, clipped
             (:class:`~drivax.curation.rarity.KernelRarity` with its exponent at 1).
@@ -71,6 +74,7 @@ class ScoutsConfig:
             batch=128, network=NetworkConfig(encoder=EntityConfig(), activation="relu")
         )
     )
+    learn_from: int | None = None
     total_steps: int = 384_000
     weighted: Literal["plain", "rarity"] = "plain"
     task: Task = field(default_factory=lambda: Task(observation=_SEEN, metrics="none"))
@@ -81,6 +85,8 @@ class ScoutsConfig:
             raise UsageError(
                 f"{self.folds} folds", cure="use 2 or more: one scout has nobody to disagree with"
             )
+        if self.learn_from is not None and self.learn_from < 1:
+            raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or leave it out")
 
     @property
     def iterations(self) -> int:
@@ -115,14 +121,15 @@ class Opinions:
 
         Args:
             deviation: Standard deviation of what experts do.
-            fold: Of each scenario, whose scout is judged since it has not seen it; None: nobody has seen any, and
-                their mean is judged.
+            fold: Of each scenario, whose scout is judged since it has not seen it; -1, or None for all: nobody has
+                seen it, and their mean is judged.
         """
         action = self.action.astype(np.float64)
         if fold is None:
             one = action.mean(axis=2)
         else:
-            one = np.take_along_axis(action, fold[:, None, None, None], axis=2)[:, :, 0]
+            own = np.take_along_axis(action, fold[:, None, None, None], axis=2)[:, :, 0]
+            one = np.where(fold[:, None, None] < 0, action.mean(axis=2), own)
         return (((one - self.expert) / deviation) ** 2).sum(axis=-1)
 
 
@@ -135,7 +142,7 @@ class Scouts:
         learner: What one scout is.
         parameters: Of all, along a leading axis.
         set_hash: ``ScenarioSet.hash`` of what it was trained on.
-        fold: Of every scenario of that.
+        fold: Of every scenario of that; -1 of those that no scout has seen.
         deviation: Standard deviation of what the experts of those did, in units of the action space.
     """
 
@@ -213,6 +220,17 @@ def folds_of(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers, " N
     return np.random.default_rng(seed).permutation(len(names))[number] % folds
 
 
+def some_of(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
+    """Rows of whole recordings, chosen by lot until there are ``count`` or more, in order; None: all."""
+    names, number = np.unique(clusters, return_inverse=True)
+    if count is None:
+        return np.arange(len(number))
+    place = np.random.default_rng(seed).permutation(len(names))
+    sizes = np.bincount(place[number])
+    # A recording is taken as long as those before it are too few.
+    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[place[number]])
+
+
 def train_scouts(
     config: ScoutsConfig, data: ScenarioSet, say: Callable[[int, int], None] | None = None
 ) -> Scouts:
@@ -220,23 +238,38 @@ def train_scouts(
 
     Args:
         config: What it is.
-        data: Scenarios; all of them are held on the device.
+        data: Scenarios; those that are learned from are held on the device.
         say: Called with (iterations done, iterations).
 
     Raises:
-        UsageError: There are fewer recordings than folds.
+        UsageError: There are fewer recordings than folds, or the scenarios do not fit on the device.
         DataError: No step can be learned from.
     """
     environment = Driving(Simulator(config.task))
     entries = data.entries
     columns = ([str(entry[name]) for entry in entries] for name in ("dataset", "segment", "scenario_id"))
-    clusters = recordings(*columns)
-    fold = folds_of(clusters, config.folds, config.seed)
-    bank = ScenarioBank.from_scenarios(data)
+    clusters = np.array(recordings(*columns))
+    rows = some_of(clusters.tolist(), config.learn_from, config.seed)
+    fold = np.full(len(data), -1)
+    fold[rows] = folds_of(clusters[rows].tolist(), config.folds, config.seed)
+    _refuse_too_many(data, len(rows), free_memory(jax.devices()[0]))
+    bank = ScenarioBank.from_scenarios(data[row] for row in rows)
     experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)
-    parameters = fit(config, learner, experience, fold, say)
+    parameters = fit(config, learner, experience, fold[rows], say)
     return Scouts(config, learner, parameters, data.hash, fold, deviation)
+
+
+def _refuse_too_many(data: ScenarioSet, count: int, free: int | None) -> None:
+    """Refuses more scenarios than the device holds, judged by the first one."""
+    one = ScenarioBank.from_scenarios([data[0]]).nbytes
+    # Each is there twice while a bank is made.
+    if free is not None and 2 * one * count > free:
+        raise UsageError(
+            f"{count:,} scenarios take some {2e-9 * one * count:,.0f} GB, and {free / 1e9:,.0f} GB are free",
+            file=data.path,
+            cure=f"pass --learn_from {free // (4 * one)}: scouts learn from so many, and score all",
+        )
 
 
 def experience_of(
@@ -258,6 +291,7 @@ def fit(
     experience: Experience,
     fold: Int[Numbers, " N"],
     say: Callable[[int, int], None] | None = None,
+    together: bool | None = None,
 ) -> Any:
     """Parameters of all scouts, along a leading axis.
 
@@ -267,8 +301,12 @@ def fit(
         experience: What they learn from.
         fold: Of every scenario.
         say: Called with (iterations done, iterations).
+        together: Whether an update of all is stacked, or done one after the other; the same either way. By default it
+            is stacked but on CPUs, where products of stacked small matrices take thrice as long.
     """
     environment, cloning = recorded(learner.environment), config.cloning
+    if together is None:
+        together = jax.default_backend() != "cpu"
     used = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
@@ -286,9 +324,8 @@ def fit(
 
             return updated(each[1], learner.optimiser, loss)[0]
 
-        # On CPUs products of stacked small matrices take thrice as long as one after the other.
-        together = None if jax.default_backend() == "cpu" else config.folds
-        return jax.lax.map(one, (jnp.arange(config.folds), trained), batch_size=together), None
+        size = config.folds if together else None
+        return jax.lax.map(one, (jnp.arange(config.folds), trained), batch_size=size), None
 
     @partial(jax.jit, donate_argnums=2)
     def iterate(experience: Experience, fold: Array, trained: Any, key: Array) -> Any:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import rankdata
 
 from drivax.curation.scores import ScoreTable
 from drivax.errors import UsageError
@@ -19,12 +17,12 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class WeightConfig:
-    """How a score becomes a weight. All of it is global: over every step, or every scenario, of a set.
+    """How a score becomes a weight. All of it is global: over every step of a set that can be drawn.
 
-    For score s, in this order:
+    For score s of a step, or of its scenario, in this order:
 
-    1. ``quantile``: u is the mid-rank of s among all n, over n, in (0, 1): what a score means no longer depends on how
-       it is spread, and equal scores have equal weights; ``none``: u = s. Then u + ``floor``.
+    1. ``quantile``: u is the mid-rank of s among all n steps, over n, in (0, 1): what a score means no longer depends
+       on how it is spread, and equal scores have equal weights; ``none``: u = s. Then u + ``floor``.
     2. w = u ** (1 / ``temperature``): 1 leaves it, a higher temperature evens it out, a lower one sharpens it.
     3. w clipped so that none is more than ``most`` times the mean of what is then left (where fewer than n / ``most``
        are above 0, those weigh alike), over that mean.
@@ -81,9 +79,11 @@ def weights_of(
         raise UsageError("there is no step that can be drawn", cure="check the set")
     weights = np.zeros(drawn.shape)
     if scale == "step":
-        weights[drawn] = _weighted(table.steps[drawn], config)
+        weights[drawn] = _weighted(table.steps[drawn], np.ones(int(drawn.sum())), config)
     else:
-        weights = np.where(drawn, _weighted(table.scenarios, config)[:, None], 0.0)
+        some = drawn.any(axis=1)
+        each = _weighted(table.scenarios[some], drawn[some].sum(axis=1).astype(np.float64), config)
+        weights[some] = np.where(drawn[some], each[:, None], 0.0)
     if not weights.any():
         raise UsageError(
             "every score is 0, so that nothing has a weight", cure="give floor, or normalise: quantile"
@@ -91,30 +91,36 @@ def weights_of(
     return weights / weights[drawn].mean()
 
 
-def _weighted(scores: Float[Array, " n"], config: WeightConfig) -> Float[Array, " n"]:
+def _weighted(
+    scores: Float[Array, " n"], mass: Float[Array, " n"], config: WeightConfig
+) -> Float[Array, " n"]:
+    """Weights of scores that so many steps have each."""
     score = np.asarray(scores, np.float64)
     if config.normalise == "quantile":
-        score = (rankdata(score) - 0.5) / len(score)
+        _, place = np.unique(score, return_inverse=True)
+        alike = np.bincount(place, mass)
+        score = ((np.cumsum(alike) - alike / 2.0) / mass.sum())[place]
     # In logarithms, so that a low temperature neither overflows nor makes everything 0.
     with np.errstate(divide="ignore"):
         power = np.log(score + config.floor) / config.temperature
     if not np.isfinite(power.max()):
         return np.zeros(len(score))
-    weight = np.exp(power - power.max())
-    weight = _capped(weight, config.most)
-    return (1.0 - config.uniform) * weight / weight.mean() + config.uniform
+    weight = _capped(np.exp(power - power.max()), mass, config.most)
+    return (1.0 - config.uniform) * weight / np.average(weight, weights=mass) + config.uniform
 
 
-def _capped(weight: Float[Array, " n"], most: float) -> Float[Array, " n"]:
+def _capped(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> Float[Array, " n"]:
     """The weights, the largest of them lowered to one value that is ``most`` times the mean of the result."""
-    count, ordered = len(weight), np.sort(weight)[::-1]
-    if ordered[0] <= most * ordered.mean():
+    order = np.argsort(-weight, kind="stable")
+    ordered, own = weight[order], mass[order]
+    if ordered[0] <= most * np.average(weight, weights=mass):
         return weight
-    # If k are lowered to c, then c = most (k c + rest_k) / n, where rest_k is the sum of the others.
-    lowered = np.arange(min(count, math.ceil(count / most)))
-    rest = np.cumsum(ordered[::-1])[::-1][lowered]
-    cap = most * rest / (count - most * lowered)
-    enough = np.flatnonzero((cap >= ordered[lowered]) & (cap > 0.0))
+    # If the first k, of mass m, are lowered to c, then c = most (m c + rest) / n, with rest the sum of all others.
+    lowered = np.cumsum(own) - own
+    rest = np.cumsum((ordered * own)[::-1])[::-1]
+    left = mass.sum() - most * lowered
+    cap = most * rest / np.where(left > 0.0, left, np.inf)
+    enough = np.flatnonzero((left > 0.0) & (cap >= ordered) & (cap > 0.0))
     return np.minimum(weight, cap[enough[0]] if len(enough) else ordered[ordered > 0].min())
 
 
