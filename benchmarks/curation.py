@@ -32,8 +32,8 @@ from drivax.curation.published import PublishedConfig
 from drivax.curation.ranking import (
     auc_interval,
     bootstrap_intervals,
+    correlation_interval,
     precision_at_base_rate,
-    rank_correlation,
     roc_auc,
 )
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
@@ -167,16 +167,11 @@ def scored(
         yield name, tables[0], joined(tables)
 
 
-def error_interval(scouts: Scouts, table: ScoreTable, data: ScenarioSet) -> list[float]:
+def error_interval(scouts: Scouts, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
     """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
     opinions = scouts.opinions(data)
-    error, rng = opinions.error(scouts.deviation, None), np.random.default_rng(0)
-    found = []
-    for _ in range(200):
-        rows = rng.integers(len(data), size=len(data))
-        known = opinions.known[rows]
-        found.append(rank_correlation(table.steps[rows][known], error[rows][known]))
-    return np.quantile(found, (0.025, 0.975)).tolist()
+    error, known = opinions.error(scouts.deviation, None), opinions.known
+    return correlation_interval(table.steps[known], error[known], np.nonzero(known)[0])
 
 
 def joined(tables: list[ScoreTable]) -> ScoreTable:

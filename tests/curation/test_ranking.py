@@ -7,6 +7,7 @@ from scipy import stats
 from drivax.curation.ranking import (
     auc_interval,
     bootstrap_intervals,
+    correlation_interval,
     precision_at_base_rate,
     rank_correlation,
     roc_auc,
@@ -103,3 +104,18 @@ def test_bootstrap_intervals_hold_the_measures_and_agree_with_delong():
     assert auc[0] < roc_auc(SCORES, LABELS, weights) < auc[1]
     assert precision[0] <= precision_at_base_rate(SCORES, LABELS, weights) <= precision[1]
     np.testing.assert_allclose(auc, auc_interval(SCORES, LABELS), atol=0.02)
+
+
+def test_the_interval_of_a_rank_correlation():
+    """Of normal variables Fisher's: tanh(atanh(r) +- 1.96 / sqrt(n - 3)), nearly; what is told thrice tells no more."""
+    rng = np.random.default_rng(3)
+    one, noise = rng.normal(size=(2, 400))
+    other = 0.5 * one + noise
+    rho = rank_correlation(one, other)
+    wanted = np.tanh(np.arctanh(rho) + np.array([-1.96, 1.96]) / np.sqrt(397))
+    for times in (1, 3):
+        found = correlation_interval(
+            np.repeat(one, times), np.repeat(other, times), np.repeat(np.arange(400), times)
+        )
+        np.testing.assert_allclose(found, wanted, atol=0.025)
+    assert np.diff(correlation_interval(one, other, np.arange(400), confidence=0.5)) < np.diff(wanted) / 2

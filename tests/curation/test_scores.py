@@ -102,7 +102,7 @@ FROZEN = {
 
 @pytest.mark.parametrize("method", ["kinematic", "published", "action_rarity", "action_rarity_published"])
 def test_what_scores_mean_changes_with_the_version_alone(data, method):
-    """Tables of before would be taken for today's: where these change, raise SCORES_VERSION and write the new ones down."""
+    """Tables of before would be taken for today's: where these change, raise SCORES_VERSION, too."""
     found = curate(method, Wanted(data))
     assert scores.SCORES_VERSION == 3
     np.testing.assert_allclose([*found.scenarios, *found.steps[1, 10:16]], FROZEN[method], atol=2e-4)

@@ -15,7 +15,10 @@ CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group":
     "rows": "ordinary"}  # fmt: skip
 RESULTS = {
     "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True, "share": 0.05},
-    "conditions": [{"agent": "baseline", "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": True}],
+    "conditions": [
+        {"agent": name, "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": name == "baseline"}
+        for name in ("baseline", "heuristic")
+    ],
     "detectable": dict.fromkeys(METRICS, 0.031),
     "claims": [
         {
@@ -30,10 +33,14 @@ RESULTS = {
     "rates": {name: {"ordinary": RATE, "rare": RATE} for name in ("expert", "baseline")},
     "draws": {"baseline": dict.fromkeys(("effective", "effective_scenarios", "tilt", "largest", "concentration"), 1.0)},
     "rankings": [
-        {"one": "kinematic", "other": "ensemble", "rho": 0.41, "overlap": 0.2, "orthogonal": "contradicted"}
+        {
+            "one": "kinematic", "other": "ensemble", "rho": 0.41, "interval": [0.35, 0.47], "overlap": 0.2,
+            "orthogonal": "contradicted",
+        }
     ],
     "mean_q": {"collision": {"difference": 0.2, "interval": [0.1, 0.3]}},
     "mean_q_agrees": 2,
+    "mean_q_curve": [0.5, 1.25],
 }  # fmt: skip
 
 
@@ -66,7 +73,11 @@ def test_it_says_what_was_found(page):
     assert "▲ supported" in text and "41 seeds each" in text
     assert "1,126 test scenarios (563 of them rare, labelled)" in text
     assert "The conditions of the comparison are not met" not in text
-    assert "kinematic and ensemble" in text and "+0.41" in text
+    assert (
+        "kinematic and ensemble" in text
+        and "+0.41 [+0.35, +0.47]" in text
+        and "over seeds: 0.50, 1.25." in text
+    )
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text

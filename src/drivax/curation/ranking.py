@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -132,6 +133,35 @@ def rank_correlation(one: Numbers, other: Numbers) -> float:
     """The correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN where one of them is constant."""
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
+
+
+def correlation_interval(
+    one: Numbers,
+    other: Numbers,
+    clusters: Sequence[Any] | np.ndarray[Any, Any],
+    resamples: int = 200,
+    confidence: float = 0.95,
+) -> tuple[float, float]:
+    """Interval of :func:`rank_correlation`, by percentiles of a bootstrap that draws whole clusters.
+
+    Davison and Hinkley, Bootstrap Methods, 1997, 3.8.
+
+    Args:
+        one: Some scores.
+        other: Others of the same.
+        clusters: What belongs together: the recording of a scenario, the scenario of a step.
+        resamples: How often.
+        confidence: Of the interval.
+    """
+    number = np.unique(np.asarray(clusters), return_inverse=True)[1]
+    parts = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    rng, found = np.random.default_rng(0), []
+    for _ in range(resamples):
+        rows = np.concatenate([parts[place] for place in rng.integers(len(parts), size=len(parts))])
+        found.append(rank_correlation(one[rows], other[rows]))
+    tail = (1.0 - confidence) / 2
+    low, high = np.quantile(found, (tail, 1.0 - tail))
+    return float(low), float(high)
 
 
 def _check(labels: Labels) -> None:

@@ -13,6 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivax.curation.agents import AGENTS, weighted
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate, refuse_stale
@@ -31,6 +33,7 @@ from drivax.learning.validation import rank
 from drivax.scenario.store import ScenarioSet
 from drivax.show.criticality import criticality_html
 from drivax.studies.longtail_drives import (
+    MEAN_Q,
     Say,
     chosen_steps,
     clusters,
@@ -200,7 +203,7 @@ def study(
         Job(config, sets, out, agent, seed, usable) for seed in range(config.seeds) for agent in config.agents
     ]
     make_all([job for job in jobs if job.agent in FIRST], cores, say)
-    met, least = conditions(config, out), _detectable(config, sets, out)
+    met, least = conditions(config, out, FIRST), _detectable(config, sets, out)
     for one in met:
         say(one.words())
     say(
@@ -214,8 +217,9 @@ def study(
         )
     make_all(jobs, cores, say)
     results = findings(config, sets, out, tables, usable) | {
-        "conditions": [asdict(one) for one in met],
+        "conditions": [asdict(one) for one in conditions(config, out, config.agents)],
         "detectable": least,
+        "mean_q_curve": mean_q_curve(config, out),
     }
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
     _show(results, data, tables, out)
@@ -247,10 +251,10 @@ def _show(results: Mapping[str, Any], data: ScenarioSet, tables: Mapping[str, Sc
     )
 
 
-def conditions(config: LongtailConfig, out: Path) -> list[Condition]:
-    """Whether what everything is compared with drives well."""
+def conditions(config: LongtailConfig, out: Path, agents: Sequence[str]) -> list[Condition]:
+    """Whether agents drive well, and no longer learn; what everything is compared with has to."""
     found = []
-    for agent in FIRST:
+    for agent in agents:
         curves = []
         for seed in range(config.seeds):
             rows = [r for r in read_rows(run_of(out, agent, seed) / "metrics.jsonl") if _PROGRESS in r]
@@ -259,6 +263,15 @@ def conditions(config: LongtailConfig, out: Path) -> list[Condition]:
             )
         found.append(Condition.of(agent, curves, config.progress, config.flat))
     return found
+
+
+def mean_q_curve(config: LongtailConfig, out: Path) -> list[float]:
+    """What the baseline's critics expect of its policy at each validation, mean over seeds."""
+    curves = [
+        [row[MEAN_Q] for row in read_rows(run_of(out, "baseline", seed) / "metrics.jsonl") if MEAN_Q in row]
+        for seed in range(config.seeds)
+    ]
+    return np.mean(curves, axis=0).tolist()
 
 
 def _score(row: Mapping[str, float]) -> float:
@@ -298,7 +311,7 @@ def findings(
             )
             for name in config.agents
         },
-        "rankings": rankings(tables),
+        "rankings": rankings(tables, clusters(data)),
         "mean_q": cost_of_rule(by_mean_q, drives["baseline"], labels, rare, share),
         "mean_q_agrees": sum(one == other for one, other in steps),
     }

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.agents import CURATED, control_of
-from drivax.curation.ranking import rank_correlation
+from drivax.curation.ranking import correlation_interval, rank_correlation
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
 from drivax.evaluation.crossed import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
@@ -116,7 +116,7 @@ def claims(agents: Sequence[str]) -> list[Claim]:
     """All claims about these agents: those of the published study, and those that its controls would have asked."""
     found = []
     curated = [name for name in CURATED if name in agents]
-    for name in (*curated, "cql_bc", "oracle"):
+    for name in (*curated, "cql_bc", "oracle", "oracle_strong"):
         found.append(Claim(f"{name} collides less than the baseline", name, "baseline", "baseline"))
     # A third of the collisions, or fewer: the ratio of the published rates.
     found.append(
@@ -133,12 +133,13 @@ def claims(agents: Sequence[str]) -> list[Claim]:
         found.append(
             Claim(f"{name} collides less than weights as strong, dealt out by lot", name, lot, "lot")
         )
-    for name in curated:
+    for name in (*curated, "oracle"):
         for rows in ("common", "rare"):
             words = f"{name} collides less than the baseline in {rows} scenarios"
             found.append(Claim(words, name, "baseline", "where", rows=rows))
         words = f"{name} collides less than weights as strong, dealt out by lot, in rare scenarios"
         found.append(Claim(words, name, control_of(name), "where", rows="rare"))
+    for name in curated:
         words = f"{name} fails less than the baseline"
         found.append(Claim(words, name, "baseline", "failures", "accuracy"))
     for one, other in (
@@ -336,21 +337,36 @@ def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict
     return {"scenarios" if name == "n" else name: value for name, value in found.items()}
 
 
-def rankings(tables: Mapping[str, ScoreTable]) -> list[dict[str, Any]]:
-    """How alike the rankings of scenarios are: rank correlation, and how many of the most critical are the same."""
+def rankings(tables: Mapping[str, ScoreTable], clusters: Sequence[str]) -> list[dict[str, Any]]:
+    """How alike the rankings of scenarios are: rank correlation, and how many of the most critical are the same.
+
+    They are unrelated or related only where all of the correlation's interval is.
+
+    Args:
+        tables: By method, of one set.
+        clusters: Recording of every scenario, which are drawn anew for the interval.
+    """
     found = []
     for one, other in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
-        first, second = tables[one], tables[other]
-        count = max(round(_TOP * len(first.scenarios)), 1)
-        tops = [set(top_rows(table, count)) for table in (first, second)]
-        rho = rank_correlation(first.scenarios, second.scenarios)
-        shared = len(tops[0] & tops[1]) / count
+        first, second = tables[one].scenarios, tables[other].scenarios
+        count = max(round(_TOP * len(first)), 1)
+        tops = [set(top_rows(tables[name], count)) for name in (one, other)]
+        low, high = correlation_interval(first, second, clusters)
         verdict = "undecided"
-        if abs(rho) < UNRELATED:
+        if max(-low, high) < UNRELATED:
             verdict = "supported"
-        elif abs(rho) > RELATED:
+        elif low > RELATED or high < -RELATED:
             verdict = "contradicted"
-        found.append({"one": one, "other": other, "rho": rho, "overlap": shared, "orthogonal": verdict})
+        found.append(
+            {
+                "one": one,
+                "other": other,
+                "rho": rank_correlation(first, second),
+                "interval": [low, high],
+                "overlap": len(tops[0] & tops[1]) / count,
+                "orthogonal": verdict,
+            }
+        )
     return found
 
 
