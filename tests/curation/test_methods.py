@@ -34,7 +34,11 @@ def data(tmp_path_factory):
     with ScenarioWriter(path, SMALL) as writer:
         for row, (cars, events) in enumerate(drives):
             recording = replace(
-                straight_road(cars), scenario_id=f"drive-{row}", dataset="drivax", events=events
+                straight_road(cars),
+                scenario_id=f"drive-{row}",
+                dataset="drivax",
+                segment=f"recording-{row}",
+                events=events,
             )
             writer.add(assemble(recording, SMALL))
     return ScenarioSet.open(path)

@@ -21,7 +21,8 @@ def write_set(path, speeds):
     with ScenarioWriter(path, Capacity()) as writer:
         for row, speed in enumerate(speeds):
             recording = straight_road([car(speed=speed), car(x=40.0)])
-            writer.add(assemble(replace(recording, scenario_id=f"drive-{row}")))
+            drive = replace(recording, scenario_id=f"drive-{row}", segment=f"recording-{row}")
+            writer.add(assemble(drive))
     return ScenarioSet.open(path)
 
 

@@ -58,7 +58,9 @@ class Curate:
     out: Path
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
-    """Write the N most critical scenarios as the scenario set TOP, the most critical first."""
+    """Write the N most critical scenarios, one of each recording at most, as the scenario set TOP, in their order."""
+    all_windows: bool = False
+    """Let TOP hold several scenarios of one recording; with --export."""
     weights: dict[str, float] | None = None
     """Weights of the components in place of the method's own: --weights urgency 0.5 braking 0.5."""
     scenario: str | None = None
@@ -97,7 +99,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
-        check_top(data, *args.export, overwrite=args.overwrite)
+        check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
         with Progress("scoring", "scenarios", len(data)) as bar:
             wanted = Wanted(
@@ -120,8 +122,11 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     if args.export is not None:
         top, count = args.export
         with Progress("exporting", "scenarios", count) as bar:
-            write_top(table, data, count, top, args.overwrite, lambda done, total: bar.update(done))
-        print(f"{top}: the {count:,} most critical")
+            write_top(
+                table, data, count, top, args.overwrite, lambda done, _: bar.update(done), args.all_windows
+            )
+        each = "" if args.all_windows else ", one of each recording at most"
+        print(f"{top}: the {count:,} most critical{each}")
     return 0
 
 
@@ -136,6 +141,8 @@ def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None
         idle["--config"] = args.config
     if again or args.method not in ("ensemble", "random_matched"):
         idle["--seed"] = args.seed
+    if args.all_windows and args.export is None:
+        raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
     given = [flag for flag, value in idle.items() if value is not None]
     if again or not settable:
         given += overrides
@@ -154,7 +161,7 @@ def _tell(table: ScoreTable, out: Path) -> None:
     from drivax.curation.weights import WeightConfig, draws_of, weights_of
 
     low, middle, high, most = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
-    first = table.scenario_ids[int(table.scenarios.argmax())]
+    first = table.scenario_ids[table.order[0]]
     print(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
     if "error_rank_correlation" in table.config:
         print(

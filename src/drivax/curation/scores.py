@@ -9,14 +9,15 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from drivax.curation.combining import Combination
+from drivax.curation.combining import Combination, aggregate
 from drivax.errors import DataError, UsageError
 from drivax.scenario.partial import sync_folder
 from drivax.scenario.store import ScenarioSet
@@ -54,6 +55,15 @@ class ScoreTable:
     def drawn(self) -> Bool[np.ndarray[Any, Any], "N T"]:
         """Which steps can be drawn: those at which the log knows what ego did, since it is there one step later too."""
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
+
+    @cached_property
+    def order(self) -> Int[np.ndarray[Any, Any], " N"]:
+        """Rows, the most critical scenario first; of equal ones that with the larger mean step, then the first.
+
+        Scores are compared as a file holds them (float32), so that a table that was read has the same order.
+        """
+        steps, scenarios = (part.astype(np.float32) for part in (self.steps, self.scenarios))
+        return np.lexsort((-aggregate(steps.astype(np.float64), self.valid, "mean"), -scenarios))
 
     @property
     def combination(self) -> Combination:

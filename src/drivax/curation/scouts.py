@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.curation.scoring import Progress, each_batch
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import recordings
+from drivax.evaluation.clusters import recordings_of
 from drivax.learning.driving import Driving
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
 from drivax.learning.imitation import Bc, BcConfig, updated
@@ -228,10 +228,7 @@ def train_scouts(
         DataError: No step can be learned from.
     """
     environment = Driving(Simulator(config.task))
-    entries = data.entries
-    columns = ([str(entry[name]) for entry in entries] for name in ("dataset", "segment", "scenario_id"))
-    clusters = recordings(*columns)
-    fold = folds_of(clusters, config.folds, config.seed)
+    fold = folds_of(recordings_of(data.entries), config.folds, config.seed)
     bank = ScenarioBank.from_scenarios(data)
     experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +10,44 @@ import numpy as np
 from drivax.curation.scores import ScoreTable
 from drivax.datasets.export import Exported, refuse_part, write_part
 from drivax.errors import UsageError
+from drivax.evaluation.clusters import recordings_of
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 
-def check_top(data: ScenarioSet, out: Path, count: int, overwrite: bool = False) -> None:
+def check_top(
+    data: ScenarioSet, out: Path, count: int, overwrite: bool = False, all_windows: bool = False
+) -> None:
     """Refuses a subset that cannot be written, before any work is done.
 
     Raises:
-        UsageError: There are not so many scenarios, or ``out`` exists, or is the set itself.
+        UsageError: There are not so many recordings (with ``all_windows``: scenarios), or ``out`` exists, or is the
+            set itself.
     """
-    total = len(data)
+    total, found = len(data), len(set(recordings_of(data.entries)))
+    if not all_windows and found < total and not 1 <= count <= found:
+        raise UsageError(
+            f"the {count} most critical of {found} recordings, one scenario of each",
+            cure=f"ask for 1 to {found}, or pass --all-windows to choose among all {total} scenarios",
+        )
     if not 1 <= count <= total:
         raise UsageError(f"the {count} most critical of {total} scenarios", cure=f"ask for 1 to {total}")
     refuse_part(data, out)
     ScenarioWriter(out, data.capacity, overwrite=overwrite)  # nothing is written before it is entered
 
 
-def top_rows(table: ScoreTable, count: int) -> list[int]:
-    """Rows of the scenarios with the highest scores, the most critical first; of equal ones the first in the set."""
-    return [int(row) for row in np.argsort(-table.scenarios, kind="stable")[:count]]
+def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = None) -> list[int]:
+    """Rows of the most critical scenarios, in their order (``ScoreTable.order``).
+
+    Args:
+        table: The scores.
+        count: How many, at most.
+        recordings: Of every row; only the most critical scenario of each counts. None: all scenarios do.
+    """
+    rows = table.order
+    if recordings is not None:
+        first = np.unique(np.asarray(recordings)[rows], return_index=True)[1]
+        rows = rows[np.sort(first)]
+    return rows[:count].tolist()
 
 
 def write_top(
@@ -38,6 +57,7 @@ def write_top(
     out: Path,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    all_windows: bool = False,
 ) -> Exported:
     """Writes the most critical scenarios as a scenario set, the most critical first.
 
@@ -48,10 +68,13 @@ def write_top(
         out: Folder to create.
         overwrite: Replace an existing scenario set.
         progress: Called with (scenarios done, scenarios).
+        all_windows: Choose among all scenarios, not only the most critical one of each recording.
 
     Raises:
         UsageError: There are not so many, or ``out`` exists.
     """
-    check_top(data, out, count, overwrite)
-    chosen_by = {"most_critical": count, "method": table.method, "config": dict(table.config)}
-    return write_part(data, top_rows(table, count), out, overwrite, progress, chosen_by)
+    check_top(data, out, count, overwrite, all_windows)
+    rows = top_rows(table, count, None if all_windows else recordings_of(data.entries))
+    how = {"most_critical": count, "all_windows": all_windows}
+    chosen_by = {**how, "method": table.method, "config": dict(table.config)}
+    return write_part(data, rows, out, overwrite, progress, chosen_by)
