@@ -51,6 +51,14 @@ def test_scores_weigh_what_is_learned_from(place, capsys):
     assert "there are no scores" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_subset_is_trained_on_by_its_own_scores(place):
+    curate = ["curate", "uniform", "--data", str(place / "set-3"), "--out", str(place / "whole.npz")]
+    assert main([*curate, "--export", str(place / "top"), "1"]) == 0
+    assert trained(place, "top", "by-own", "--scores", str(place / "top" / "scores.npz")) == 0
+    assert len(json.loads((place / "by-own" / "run.json").read_text())["weights"]) == 64
+
+
 def test_what_does_not_go_together(place, capsys):
     assert trained(place, "set-3", "none", "--weighting.temperature", "2") == 2
     assert "--weighting without scores to weight; pass --scores or --agent" in capsys.readouterr().err

@@ -13,6 +13,10 @@ from drivax.errors import UsageError
 
 if TYPE_CHECKING:
     from drivax.curation.scores import ScoreTable
+    from drivax.scenario.store import ScenarioSet
+
+#: So many of the most critical scenarios are told.
+_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,8 @@ class Curate:
     out: Path
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
-    """Write the N most critical scenarios, one of each recording at most, as the scenario set TOP, in their order."""
+    """Write the N most critical scenarios, one of each recording at most, as the scenario set TOP, the most critical
+    first, with their scores in TOP/scores.npz."""
     all_windows: bool = False
     """Let TOP hold several scenarios of one recording; with --export."""
     weights: dict[str, float] | None = None
@@ -82,7 +87,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     from drivax import settings
     from drivax.curation.methods import METHODS, Wanted, check_combination, curate
     from drivax.curation.scores import read_scores, refuse_existing, write_scores
-    from drivax.curation.subset import check_top, write_top
+    from drivax.curation.subset import check_top
     from drivax.scenario.store import ScenarioSet
     from drivax.tracking.progress import Progress
 
@@ -99,6 +104,8 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
+        if args.out.resolve().is_relative_to(args.export[0].resolve()):
+            raise UsageError("lies where --export writes", file=args.out, cure="choose another --out")
         check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
         with Progress("scoring", "scenarios", len(data)) as bar:
@@ -120,13 +127,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     write_scores(table, args.out, args.overwrite)
     _tell(table, args.out)
     if args.export is not None:
-        top, count = args.export
-        with Progress("exporting", "scenarios", count) as bar:
-            write_top(
-                table, data, count, top, args.overwrite, lambda done, _: bar.update(done), args.all_windows
-            )
-        each = "" if args.all_windows else ", one of each recording at most"
-        print(f"{top}: the {count:,} most critical{each}")
+        _export(table, data, *args.export, args.overwrite, args.all_windows)
     return 0
 
 
@@ -153,6 +154,27 @@ def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None
             "random_matched deals out finished scores, which have no components",
             cure="give --weights and --scenario to the method that it is to be like",
         )
+
+
+def _export(
+    table: ScoreTable, data: ScenarioSet, top: Path, count: int, overwrite: bool, all_windows: bool
+) -> None:
+    """Writes the subset, and says where it is and which scenarios it begins with."""
+    from drivax.curation.scores import OWN_SCORES, read_scores
+    from drivax.curation.subset import write_top
+    from drivax.scenario.store import ScenarioSet
+    from drivax.tracking.progress import Progress
+
+    with Progress("exporting", "scenarios", count) as bar:
+        write_top(table, data, count, top, overwrite, lambda done, _: bar.update(done), all_windows)
+    file = top / OWN_SCORES
+    own = read_scores(file, ScenarioSet.open(top))
+    each = "" if all_windows else ", one of each recording at most"
+    print(f"{top}: the {count:,} most critical{each}")
+    print(f"{file}: their scores")
+    print("  rank  score  scenario")
+    for rank, row in enumerate(own.order[:_TOLD], start=1):
+        print(f"  {rank:>4}  {own.scenarios[row]:.3f}  {own.scenario_ids[row]}")
 
 
 def _tell(table: ScoreTable, out: Path) -> None:

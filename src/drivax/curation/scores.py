@@ -23,6 +23,8 @@ from drivax.scenario.partial import sync_folder
 from drivax.scenario.store import ScenarioSet
 
 SCORES_VERSION = 2
+#: Scores of a set that was chosen by them, in its folder.
+OWN_SCORES = "scores.npz"
 _AGAIN = "run `drivax curate` again"
 _COMPONENT = "component_"
 
@@ -183,10 +185,11 @@ def _check_source(version: object, found: object, file: Path, data: ScenarioSet)
     if version != SCORES_VERSION:
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_AGAIN)
     if found != data.hash:
+        own = data.path / OWN_SCORES
         raise DataError(
             f"is of other data (hash {str(found)[:12]}, {data.path} has {data.hash[:12]})",
             file=file,
-            cure=_AGAIN,
+            cure=f"use {own}" if own.is_file() and own != file else _AGAIN,
         )
 
 

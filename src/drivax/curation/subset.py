@@ -1,13 +1,14 @@
-"""The most critical scenarios of a set, as a set of their own."""
+"""The most critical scenarios of a set, as a set of their own that holds their scores."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from drivax.curation.scores import ScoreTable
+from drivax.curation.scores import OWN_SCORES, ScoreTable, write_scores
 from drivax.datasets.export import Exported, refuse_part, write_part
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import recordings_of
@@ -50,6 +51,29 @@ def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = N
     return rows[:count].tolist()
 
 
+def part_of_table(table: ScoreTable, rows: Sequence[int], part: ScenarioSet) -> ScoreTable:
+    """The scores of a part of a set; which one and of what, its configuration says as ``part_of``.
+
+    Args:
+        table: Scores of the whole set.
+        rows: Which of them, in the order of the part.
+        part: The part, as :func:`~drivax.datasets.export.write_part` writes it.
+    """
+    chosen = list(rows)
+    told = part.manifest["source"]["part_of"]
+    told = {name: value for name, value in told.items() if name not in ("method", "config")}
+    return replace(
+        table,
+        config={**table.config, "part_of": told},
+        set_hash=part.hash,
+        scenario_ids=tuple(table.scenario_ids[row] for row in chosen),
+        valid=table.valid[chosen],
+        steps=table.steps[chosen],
+        scenarios=table.scenarios[chosen],
+        components={name: component[chosen] for name, component in table.components.items()},
+    )
+
+
 def write_top(
     table: ScoreTable,
     data: ScenarioSet,
@@ -59,7 +83,7 @@ def write_top(
     progress: Callable[[int, int], None] | None = None,
     all_windows: bool = False,
 ) -> Exported:
-    """Writes the most critical scenarios as a scenario set, the most critical first.
+    """Writes the most critical scenarios as a scenario set, the most critical first, and their scores in its folder.
 
     Args:
         table: Scores of ``data``.
@@ -77,4 +101,8 @@ def write_top(
     rows = top_rows(table, count, None if all_windows else recordings_of(data.entries))
     how = {"most_critical": count, "all_windows": all_windows}
     chosen_by = {**how, "method": table.method, "config": dict(table.config)}
-    return write_part(data, rows, out, overwrite, progress, chosen_by)
+
+    def further(folder: Path) -> None:
+        write_scores(part_of_table(table, rows, ScenarioSet.open(folder)), folder / OWN_SCORES)
+
+    return write_part(data, rows, out, overwrite, progress, chosen_by, further)
