@@ -12,6 +12,7 @@ import tyro
 from drivax.errors import UsageError
 
 if TYPE_CHECKING:
+    from drivax.curation.methods import Wanted
     from drivax.curation.scores import ScoreTable
     from drivax.scenario.store import ScenarioSet
 
@@ -85,11 +86,10 @@ class Curate:
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and say how scores and weights lie."""
     from drivax import settings
-    from drivax.curation.methods import METHODS, Wanted, check_combination, curate
+    from drivax.curation.methods import METHODS, Wanted, check_combination
     from drivax.curation.scores import read_scores, refuse_existing, write_scores
     from drivax.curation.subset import check_top
     from drivax.scenario.store import ScenarioSet
-    from drivax.tracking.progress import Progress
 
     config = METHODS[args.method].config
     _refuse_idle(args, overrides, config is not None)
@@ -108,16 +108,7 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
             raise UsageError("lies where --export writes", file=args.out, cure="choose another --out")
         check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
-        with Progress("scoring", "scenarios", len(data)) as bar:
-            wanted = Wanted(
-                data,
-                args.like,
-                args.seed or 0,
-                config,
-                progress=lambda done, _: bar.update(done),
-                training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
-            )
-            table = curate(args.method, wanted)
+        table = scored(args.method, Wanted(data, args.like, args.seed or 0, config))
     else:
         table = read_scores(args.again, data)
         if table.method != args.method:
@@ -129,6 +120,19 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     if args.export is not None:
         _export(table, data, *args.export, args.overwrite, args.all_windows)
     return 0
+
+
+def scored(method: str, wanted: Wanted) -> ScoreTable:
+    """Scores a set (:func:`~drivax.curation.methods.curate`), and shows how far that is."""
+    from drivax.curation.methods import curate
+    from drivax.tracking.progress import Progress
+
+    with Progress("scoring", "scenarios", len(wanted.data)) as bar:
+
+        def training(done: int, total: int) -> None:
+            bar.update(0, f"training scouts, {done} of {total} iterations")
+
+        return curate(method, replace(wanted, progress=lambda done, _: bar.update(done), training=training))
 
 
 def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None:
