@@ -142,6 +142,30 @@ def test_settings_of_a_method(data, tables, tmp_path, capsys):
     assert "oracle has no such setting; leave out --urgent_s 2" in capsys.readouterr().err
 
 
+def test_a_method_that_aggregates_each_component_can_be_told_otherwise(data, tmp_path):
+    """The aggregators of components that are left out weigh nothing."""
+    out = tmp_path / "scores.npz"
+    call = [
+        "curate",
+        "published",
+        "--data",
+        str(data.path),
+        "--out",
+        str(out),
+        "--weights",
+        "volatility",
+        "1",
+    ]
+    assert main(call) == 0
+    found = read_scores(out, data)
+    assert (
+        found.combination.weights == {"volatility": 1.0} and found.combination.scenario["density"] == "mean"
+    )
+    assert main([*call, "--overwrite", "--scenario", "volatility", "max"]) == 0
+    top = np.where(found.valid, found.components["volatility"], 0.0).max(axis=1)
+    np.testing.assert_allclose(read_scores(out, data).scenarios, top, rtol=1e-6)
+
+
 def test_a_table_that_the_method_would_not_make_now_is_stale(data, tables, tmp_path):
     for name in ("kinematic", "action_rarity", "published", "uniform", "random_matched"):
         write_scores(tables[name], tmp_path / f"{name}.npz")

@@ -63,14 +63,15 @@ class Curate:
     out: Path
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
-    """Write the N most critical scenarios, one of each recording at most, as the scenario set TOP, the most critical
-    first, with their scores in TOP/scores.npz."""
+    """Write the N most critical scenarios, at most one of each recording, as a set with its scores, TOP/scores.npz."""
     all_windows: bool = False
     """Let TOP hold several scenarios of one recording; with --export."""
     weights: dict[str, float] | None = None
     """Weights of the components in place of the method's own: --weights urgency 0.5 braking 0.5."""
-    scenario: str | None = None
-    """How steps become the score of their scenario: max, mean, std, p99, top10, or others of their kind."""
+    scenario: Annotated[
+        str | dict[str, str] | None, tyro.conf.arg(metavar="HOW | NAME HOW [NAME HOW ...]")
+    ] = None
+    """How steps make a scenario's score: max, mean, std, p99, top10, ...; or by component: urgency max braking p95."""
     again: Path | None = None
     """Table of METHOD for the same set, whose components are taken instead of scoring again."""
     like: Path | None = None
