@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import types
 
 import pytest
 
 from drivax.cli import main
+from drivax.curation import methods
+from drivax.errors import UsageError
 from drivax.synthetic.generate import Generation, generate
+from drivax.tracking.progress import Progress
 from drivax.tracking.sinks import read_rows
 
 TINY = {
@@ -51,6 +55,14 @@ def test_scores_weigh_what_is_learned_from(place, capsys):
     assert "there are no scores" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_subset_is_trained_on_by_its_own_scores(place):
+    curate = ["curate", "uniform", "--data", str(place / "set-3"), "--out", str(place / "whole.npz")]
+    assert main([*curate, "--export", str(place / "top"), "1"]) == 0
+    assert trained(place, "top", "by-own", "--scores", str(place / "top" / "scores.npz")) == 0
+    assert len(json.loads((place / "by-own" / "run.json").read_text())["weights"]) == 64
+
+
 def test_what_does_not_go_together(place, capsys):
     assert trained(place, "set-3", "none", "--weighting.temperature", "2") == 2
     assert "--weighting without scores to weight; pass --scores or --agent" in capsys.readouterr().err
@@ -77,6 +89,25 @@ def test_what_does_not_go_together(place, capsys):
     assert main([*call, "--agent", "heuristic", "--scores", str(other)]) == 1
     assert "scores of 'kinematic' with combination" in capsys.readouterr().err
     assert not (place / "none").exists()
+
+
+def test_scoring_for_an_agent_shows_how_far_it_is(place, monkeypatch, capsys):
+    monkeypatch.setattr("drivax.cli.train.train", lambda *_, **__: types.SimpleNamespace(path="a-run"))
+    call = ["train", "offline/cql", "--data", str(place / "set-3"), "--out", str(place / "none")]
+    assert main([*call, "--agent", "heuristic"]) == 0
+    told = capsys.readouterr()
+    assert "scoring: 2 scenarios in" in told.err and told.out == "wrote a-run\n"
+
+    def scouts(config, data, say):
+        say(3, 7)
+        raise UsageError("no scouts today", cure="stop here")
+
+    notes = []
+    monkeypatch.setattr(methods, "train_scouts", scouts)
+    monkeypatch.setattr(Progress, "update", lambda _, done, note="": notes.append((done, note)))
+    assert main([*call, "--agent", "ensemble"]) == 2
+    assert notes == [(0, "training scouts, 3 of 7 iterations")]
+    assert "no scouts today" in capsys.readouterr().err
 
 
 @pytest.mark.slow

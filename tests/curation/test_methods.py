@@ -34,7 +34,11 @@ def data(tmp_path_factory):
     with ScenarioWriter(path, SMALL) as writer:
         for row, (cars, events) in enumerate(drives):
             recording = replace(
-                straight_road(cars), scenario_id=f"drive-{row}", dataset="drivax", events=events
+                straight_road(cars),
+                scenario_id=f"drive-{row}",
+                dataset="drivax",
+                segment=f"recording-{row}",
+                events=events,
             )
             writer.add(assemble(recording, SMALL))
     return ScenarioSet.open(path)
@@ -136,6 +140,30 @@ def test_settings_of_a_method(data, tables, tmp_path, capsys):
     np.testing.assert_allclose(read_scores(out, data).steps, table.steps, atol=1e-6)
     assert main(["curate", "oracle", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 2
     assert "oracle has no such setting; leave out --urgent_s 2" in capsys.readouterr().err
+
+
+def test_a_method_that_aggregates_each_component_can_be_told_otherwise(data, tmp_path):
+    """The aggregators of components that are left out weigh nothing."""
+    out = tmp_path / "scores.npz"
+    call = [
+        "curate",
+        "published",
+        "--data",
+        str(data.path),
+        "--out",
+        str(out),
+        "--weights",
+        "volatility",
+        "1",
+    ]
+    assert main(call) == 0
+    found = read_scores(out, data)
+    assert (
+        found.combination.weights == {"volatility": 1.0} and found.combination.scenario["density"] == "mean"
+    )
+    assert main([*call, "--overwrite", "--scenario", "volatility", "max"]) == 0
+    top = np.where(found.valid, found.components["volatility"], 0.0).max(axis=1)
+    np.testing.assert_allclose(read_scores(out, data).scenarios, top, rtol=1e-6)
 
 
 def test_a_table_that_the_method_would_not_make_now_is_stale(data, tables, tmp_path):

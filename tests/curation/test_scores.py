@@ -22,7 +22,8 @@ def write_set(path, speeds):
     with ScenarioWriter(path, Capacity()) as writer:
         for row, speed in enumerate(speeds):
             recording = straight_road([car(speed=speed), car(x=40.0)])
-            writer.add(assemble(replace(recording, scenario_id=f"drive-{row}")))
+            drive = replace(recording, scenario_id=f"drive-{row}", segment=f"recording-{row}")
+            writer.add(assemble(drive))
     return ScenarioSet.open(path)
 
 
@@ -207,10 +208,22 @@ def test_the_command(data, tmp_path, capsys):
     np.testing.assert_allclose(other.steps, np.where(found.valid, by_hand, 0.0), rtol=1e-6)
     np.testing.assert_array_equal(other.scenarios, other.steps.max(axis=1))
     assert other.combination == Combination({"urgency": 0.5, "density": 0.25}, "max")
+    # And one aggregator for each component.
+    weights, apart = ["--weights", "urgency", "0.5", "braking", "0.25"], ["urgency", "max", "braking", "mean"]
+    assert main([*anew, "--overwrite", *weights, "--scenario", *apart]) == 0
+    other = read_scores(tmp_path / "anew.npz", data)
+    urgency, braking = (np.where(found.valid, found.components[name], 0.0) for name in ("urgency", "braking"))
+    by_hand = 0.5 * urgency.max(axis=1) + 0.25 * braking.sum(axis=1) / found.valid.sum(axis=1)
+    np.testing.assert_allclose(other.scenarios, by_hand, rtol=1e-5)
+    assert other.combination.scenario == {"urgency": "max", "braking": "mean"}
     capsys.readouterr()
     for wrong, words in (
         (["--weights", "urgencies", "1"], "there is no component 'urgencies'; did you mean 'urgency'"),
         (["--scenario", "p101"], "'p101' aggregates no steps"),
+        ([*weights, "--scenario", "urgency", "max"], "no aggregator for 'braking'; name one for each comp"),
+        ([*weights, "--scenario", *apart, "densty", "max"], "'densty'; did you mean 'density'"),
+        ([*weights, "--scenario", "urgency", "max", "braking", "most"], "'most' aggregates no steps"),
+        (["--scenario", "urgency=max", "braking=p95"], "'braking=p95' aggregates no steps"),
     ):
         assert main([*anew, "--overwrite", *wrong]) == 2
         assert words in capsys.readouterr().err
@@ -220,6 +233,7 @@ def test_the_command(data, tmp_path, capsys):
     for wrong, words in (
         (["kinematic", "--weights", "urgency", "-1"], "the weight of 'urgency' is -1.0; use 0 or more"),
         (["kinematic", "--scenario", "p101"], "'p101' aggregates no steps"),
+        (["kinematic", "--scenario", "urgency", "max"], "there is no aggregator for 'braking'"),
         (["ensemble", "--weights", "actoin_0", "1"], "no component 'actoin_0'; did you mean 'action_0'"),
         (["ensemble", *mixture, "--weights", "action_0", "1"], "there is no component 'action_0'"),
     ):

@@ -12,7 +12,12 @@ import tyro
 from drivax.errors import UsageError
 
 if TYPE_CHECKING:
+    from drivax.curation.methods import Wanted
     from drivax.curation.scores import ScoreTable
+    from drivax.scenario.store import ScenarioSet
+
+#: So many of the most critical scenarios are told.
+_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -58,11 +63,15 @@ class Curate:
     out: Path
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
-    """Write the N most critical scenarios as the scenario set TOP, the most critical first."""
+    """Write the N most critical scenarios, at most one of each recording, as a set with its scores, TOP/scores.npz."""
+    all_windows: bool = False
+    """Let TOP hold several scenarios of one recording; with --export."""
     weights: dict[str, float] | None = None
     """Weights of the components in place of the method's own: --weights urgency 0.5 braking 0.5."""
-    scenario: str | None = None
-    """How steps become the score of their scenario: max, mean, std, p99, top10, or others of their kind."""
+    scenario: Annotated[
+        str | dict[str, str] | None, tyro.conf.arg(metavar="HOW | NAME HOW [NAME HOW ...]")
+    ] = None
+    """How steps make a scenario's score: max, mean, std, p99, top10, ...; or by component: urgency max braking p95."""
     again: Path | None = None
     """Table of METHOD for the same set, whose components are taken instead of scoring again."""
     like: Path | None = None
@@ -78,11 +87,10 @@ class Curate:
 def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     """Score, write the table and the subset, and say how scores and weights lie."""
     from drivax import settings
-    from drivax.curation.methods import METHODS, Wanted, check_combination, curate
+    from drivax.curation.methods import METHODS, Wanted, check_combination
     from drivax.curation.scores import read_scores, refuse_existing, write_scores
-    from drivax.curation.subset import check_top, write_top
+    from drivax.curation.subset import check_top
     from drivax.scenario.store import ScenarioSet
-    from drivax.tracking.progress import Progress
 
     config = METHODS[args.method].config
     _refuse_idle(args, overrides, config is not None)
@@ -97,18 +105,11 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     refuse_existing(args.out, args.overwrite)
     data = ScenarioSet.open(args.data)
     if args.export is not None:
-        check_top(data, *args.export, overwrite=args.overwrite)
+        if args.out.resolve().is_relative_to(args.export[0].resolve()):
+            raise UsageError("lies where --export writes", file=args.out, cure="choose another --out")
+        check_top(data, *args.export, args.overwrite, args.all_windows)
     if args.again is None:
-        with Progress("scoring", "scenarios", len(data)) as bar:
-            wanted = Wanted(
-                data,
-                args.like,
-                args.seed or 0,
-                config,
-                progress=lambda done, _: bar.update(done),
-                training=lambda done, total: bar.update(0, f"training scouts, {done} of {total} iterations"),
-            )
-            table = curate(args.method, wanted)
+        table = scored(args.method, Wanted(data, args.like, args.seed or 0, config))
     else:
         table = read_scores(args.again, data)
         if table.method != args.method:
@@ -118,11 +119,21 @@ def run(args: Curate, overrides: Sequence[str] = ()) -> int:
     write_scores(table, args.out, args.overwrite)
     _tell(table, args.out)
     if args.export is not None:
-        top, count = args.export
-        with Progress("exporting", "scenarios", count) as bar:
-            write_top(table, data, count, top, args.overwrite, lambda done, total: bar.update(done))
-        print(f"{top}: the {count:,} most critical")
+        _export(table, data, *args.export, args.overwrite, args.all_windows)
     return 0
+
+
+def scored(method: str, wanted: Wanted) -> ScoreTable:
+    """Scores a set (:func:`~drivax.curation.methods.curate`), and shows how far that is."""
+    from drivax.curation.methods import curate
+    from drivax.tracking.progress import Progress
+
+    with Progress("scoring", "scenarios", len(wanted.data)) as bar:
+
+        def training(done: int, total: int) -> None:
+            bar.update(0, f"training scouts, {done} of {total} iterations")
+
+        return curate(method, replace(wanted, progress=lambda done, _: bar.update(done), training=training))
 
 
 def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None:
@@ -136,6 +147,8 @@ def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None
         idle["--config"] = args.config
     if again or args.method not in ("ensemble", "random_matched"):
         idle["--seed"] = args.seed
+    if args.all_windows and args.export is None:
+        raise UsageError("--all-windows without a subset to choose", cure="pass --export TOP N")
     given = [flag for flag, value in idle.items() if value is not None]
     if again or not settable:
         given += overrides
@@ -148,13 +161,34 @@ def _refuse_idle(args: Curate, overrides: Sequence[str], settable: bool) -> None
         )
 
 
+def _export(
+    table: ScoreTable, data: ScenarioSet, top: Path, count: int, overwrite: bool, all_windows: bool
+) -> None:
+    """Writes the subset, and says where it is and which scenarios it begins with."""
+    from drivax.curation.scores import OWN_SCORES, read_scores
+    from drivax.curation.subset import write_top
+    from drivax.scenario.store import ScenarioSet
+    from drivax.tracking.progress import Progress
+
+    with Progress("exporting", "scenarios", count) as bar:
+        write_top(table, data, count, top, overwrite, lambda done, _: bar.update(done), all_windows)
+    file = top / OWN_SCORES
+    own = read_scores(file, ScenarioSet.open(top))
+    each = "" if all_windows else ", one of each recording at most"
+    print(f"{top}: the {count:,} most critical{each}")
+    print(f"{file}: their scores")
+    print("  rank  score  scenario")
+    for rank, row in enumerate(own.order[:_TOLD], start=1):
+        print(f"  {rank:>4}  {own.scenarios[row]:.3f}  {own.scenario_ids[row]}")
+
+
 def _tell(table: ScoreTable, out: Path) -> None:
     import numpy as np
 
     from drivax.curation.weights import WeightConfig, draws_of, weights_of
 
     low, middle, high, most = np.quantile(table.scenarios, (0.05, 0.5, 0.95, 1.0))
-    first = table.scenario_ids[int(table.scenarios.argmax())]
+    first = table.scenario_ids[table.order[0]]
     print(f"{out}: {len(table.scenario_ids):,} scenarios, {table.method}")
     if "error_rank_correlation" in table.config:
         print(

@@ -12,8 +12,9 @@ from typing import Annotated, Literal
 import tyro
 
 from drivax import settings
+from drivax.cli.curate import scored
 from drivax.curation.agents import AGENTS, Agent, weighted
-from drivax.curation.methods import Wanted, curate, refuse_stale
+from drivax.curation.methods import Wanted, refuse_stale
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, weights_of
 from drivax.errors import UsageError
@@ -147,7 +148,7 @@ def _trained_by(config: TrainConfig) -> str:
 def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
     """Scores by a method of an agent of the study."""
     if args.scores is None:
-        return curate(method, Wanted(data))
+        return scored(method, Wanted(data))
     table = read_scores(args.scores, data)
     # Scores of another method have no settings to compare; who weights refuses them.
     if table.method == method:

@@ -51,12 +51,12 @@ class Combination:
                 )
 
     def check_components(self, there: Collection[str]) -> None:
-        """Refuses to weigh what is not there.
+        """Refuses to weigh or to aggregate what is not there.
 
         Raises:
-            UsageError: A component that has a weight is not there.
+            UsageError: A component that has a weight, or an aggregator of its own, is not there.
         """
-        for name in self.weights:
+        for name in (*self.weights, *(() if isinstance(self.scenario, str) else self.scenario)):
             if name not in there:
                 raise UsageError(f"there is no component {name!r}", cure=nearest(name, sorted(there)))
 

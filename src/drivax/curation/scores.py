@@ -9,19 +9,22 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from drivax.curation.combining import Combination
+from drivax.curation.combining import Combination, aggregate
 from drivax.errors import DataError, UsageError
 from drivax.scenario.partial import sync_folder
 from drivax.scenario.store import ScenarioSet
 
 SCORES_VERSION = 3
+#: Scores of a set that was chosen by them, in its folder.
+OWN_SCORES = "scores.npz"
 _AGAIN = "run `drivax curate` again"
 _COMPONENT = "component_"
 
@@ -54,6 +57,15 @@ class ScoreTable:
     def drawn(self) -> Bool[np.ndarray[Any, Any], "N T"]:
         """Which steps can be drawn: those at which the log knows what ego did, since it is there one step later too."""
         return self.valid & np.pad(self.valid[:, 1:], ((0, 0), (0, 1)))
+
+    @cached_property
+    def order(self) -> Int[np.ndarray[Any, Any], " N"]:
+        """Rows, the most critical scenario first; of equal ones that with the larger mean step, then the first.
+
+        Scores are compared as a file holds them (float32), so that a table that was read has the same order.
+        """
+        steps, scenarios = (part.astype(np.float32) for part in (self.steps, self.scenarios))
+        return np.lexsort((-aggregate(steps.astype(np.float64), self.valid, "mean"), -scenarios))
 
     @property
     def combination(self) -> Combination:
@@ -173,10 +185,11 @@ def _check_source(version: object, found: object, file: Path, data: ScenarioSet)
     if version != SCORES_VERSION:
         raise DataError(f"version {version}, this drivax reads {SCORES_VERSION}", file=file, cure=_AGAIN)
     if found != data.hash:
+        own = data.path / OWN_SCORES
         raise DataError(
             f"is of other data (hash {str(found)[:12]}, {data.path} has {data.hash[:12]})",
             file=file,
-            cure=_AGAIN,
+            cure=f"use {own}" if own.is_file() and own != file else _AGAIN,
         )
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.curation.scoring import Progress, each_batch
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import recordings
+from drivax.evaluation.clusters import recordings_of
 from drivax.evaluation.memory import free_memory
 from drivax.learning.driving import Driving
 from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
@@ -246,9 +246,7 @@ def train_scouts(
         DataError: No step can be learned from.
     """
     environment = Driving(Simulator(config.task))
-    entries = data.entries
-    columns = ([str(entry[name]) for entry in entries] for name in ("dataset", "segment", "scenario_id"))
-    clusters = np.array(recordings(*columns))
+    clusters = np.array(recordings_of(data.entries))
     rows = some_of(clusters.tolist(), config.learn_from, config.seed)
     fold = np.full(len(data), -1)
     fold[rows] = folds_of(clusters[rows].tolist(), config.folds, config.seed)

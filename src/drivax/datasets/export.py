@@ -122,6 +122,7 @@ def write_part(
     overwrite: bool = False,
     progress: Progress | None = None,
     chosen_by: Mapping[str, Any] | None = None,
+    further: Callable[[Path], None] | None = None,
 ) -> Exported:
     """Some scenarios of a set as a set of their own: the records as they are, with their entries.
 
@@ -132,6 +133,7 @@ def write_part(
         overwrite: Replace an existing scenario set; other folders are never replaced.
         progress: Called with (scenarios done, scenarios).
         chosen_by: What the manifest says about how they were chosen, as plain JSON values.
+        further: Called with the folder of the whole set before it gets its name, to write what else it shall hold.
 
     Raises:
         UsageError: ``out`` exists, or is the set that is read.
@@ -139,7 +141,7 @@ def write_part(
     refuse_part(opened, out)
     part = {"set": opened.path.name, "hash": opened.hash, **(chosen_by or {})}
     source = {**opened.manifest["source"], "part_of": part}
-    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite) as writer:
+    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite, further=further) as writer:
         for done, row in enumerate(rows, start=1):
             writer.add(opened[row])
             if progress is not None:

@@ -6,7 +6,7 @@ may lie in strata (kinds of scenario), within which they are resampled or assign
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,12 @@ def recordings(datasets: Iterable[str], segments: Iterable[str], scenarios: Iter
     """The cluster of each scenario: its recording, or itself where no recording (``segment``) is known."""
     rows = zip(datasets, segments, scenarios, strict=True)
     return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
+
+
+def recordings_of(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The recording of each scenario of a set, by the entries of its manifest."""
+    names = ("dataset", "segment", "scenario_id")
+    return recordings(*([str(entry[name]) for entry in entries] for name in names))
 
 
 def numbers(values: Any) -> Values:

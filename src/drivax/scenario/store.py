@@ -6,6 +6,7 @@ A set is a folder::
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
     splits/              lists for training, validation and test, if asked for (``scenario.splits``)
+    scores.npz           criticality of its scenarios, if they were chosen by it (``curation.subset``)
 
 Any tool reads a shard with ``numpy.load(path, mmap_mode="r")``; record ``i`` lies at a fixed offset, so one
 scenario is one range read. Sets appear under their name only when they are complete. Numpy only, so that
@@ -18,7 +19,7 @@ import dataclasses
 import hashlib
 import shutil
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
@@ -56,6 +57,7 @@ class ScenarioWriter:
         shares: Percentages of train, validation and test for the files of ``splits/``; None: no such files.
         identity: What is written, for a set that can be continued: closed shards outlive an exception or a kill, and
             the next writer with the same identity begins after them (:attr:`notes`).
+        further: Called with the folder of the whole set before it gets its name, to write what else it shall hold.
 
     Raises:
         UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
@@ -71,6 +73,7 @@ class ScenarioWriter:
         overwrite: bool = False,
         shares: Shares | None = None,
         identity: Mapping[str, Any] | None = None,
+        further: Callable[[Path], None] | None = None,
     ) -> None:
         if shard_size < 1:
             raise UsageError(f"shard_size is {shard_size}", cure="use 1 or more")
@@ -83,6 +86,7 @@ class ScenarioWriter:
         self.notes: list[Any] = []
         self._shard_size = shard_size
         self._shares = shares
+        self._further = further
         self._buffer = np.zeros(1, record_dtype(capacity))
         self._entries: list[dict[str, Any]] = []
         self._known: set[tuple[str, str]] = set()
@@ -212,6 +216,8 @@ class ScenarioWriter:
         if self._shares is not None:
             write_splits(self._partial.content, self._entries, self._shares)
         write_json(self._partial.content / MANIFEST, manifest)
+        if self._further is not None:
+            self._further(self._partial.content)
         self._refuse_existing()  # someone may have written it in the meantime
         self._partial.publish()
 

@@ -26,7 +26,7 @@ def criticality_html(table: ScoreTable, row: int) -> str:
         name.replace("_", " "): (stroke(place), np.column_stack([time, values[valid]]))
         for place, (name, values) in enumerate(series.items())
     }
-    rank = int((table.scenarios > table.scenarios[row]).sum()) + 1
+    rank = int(np.flatnonzero(table.order == row)[0]) + 1
     words = f"score {table.scenarios[row]:.3f}, rank {rank:,} of {len(table.scenarios):,} by {table.method}"
     return (
         f"<h3>Criticality</h3><p>{escape(words)}</p>"

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import recordings
+from drivax.evaluation.clusters import recordings_of
 from drivax.evaluation.runs import EvaluationConfig, run_evaluation
 from drivax.evaluation.stored import read_evaluation
 from drivax.learning.policies import load_policy
@@ -141,5 +141,4 @@ def driven(config: LongtailConfig, out: Path, agent: str) -> dict[str, Float[np.
 
 def clusters(test: ScenarioSet) -> list[str]:
     """The recording of every scenario."""
-    names = ("dataset", "segment", "scenario_id")
-    return recordings(*([str(entry[name]) for entry in test.entries] for name in names))
+    return recordings_of(test.entries)
