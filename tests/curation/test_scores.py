@@ -213,7 +213,7 @@ def test_the_command(data, tmp_path, capsys):
     assert main([*anew, "--overwrite", *weights, "--scenario", *apart]) == 0
     other = read_scores(tmp_path / "anew.npz", data)
     urgency, braking = (np.where(found.valid, found.components[name], 0.0) for name in ("urgency", "braking"))
-    by_hand = 0.5 * urgency.max(axis=1) + 0.25 * braking.sum(axis=1) / found.valid.sum(axis=1)
+    by_hand = (2 * urgency.max(axis=1) + braking.sum(axis=1) / found.valid.sum(axis=1)) / 3
     np.testing.assert_allclose(other.scenarios, by_hand, rtol=1e-5)
     assert other.combination.scenario == {"urgency": "max", "braking": "mean"}
     capsys.readouterr()

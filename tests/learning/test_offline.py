@@ -74,7 +74,7 @@ def on_the_host(tree):
 
 
 def test_cql_against_numpy(part, improved):
-    config = replace(CQL, gap=1.5, imitation=0.7, penalty_temperature=2.0)
+    config = replace(CQL, gap=1.5, imitation=0.7, penalty_temperature=2.0, backup_actions=2)
     learner, trained, target = begun(config)
     key = jax.random.key(7)
     total, logs = losses(learner, trained, target, part, improved, key)
@@ -88,7 +88,7 @@ def test_cql_against_numpy(part, improved):
         following = learner.distribution(trained["policy"], part.following)
         now = learner.distribution(trained["policy"], part.observation)
         there = learner.distribution(trained["policy"], improved[0])
-        then = jnp.tanh(following.sample(next_key))
+        then = jnp.stack([jnp.tanh(following.sample(own)) for own in jax.random.split(next_key, 2)])
         uniform = jax.random.uniform(uniform_key, (ACTIONS, COUNT, 1), minval=-1.0)
         rows = {"uniform": [], "now": [], "then": []}
         for number in range(ACTIONS):
@@ -109,7 +109,9 @@ def test_cql_against_numpy(part, improved):
         }
 
     found = on_the_host(outputs(trained))
-    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, found["target"].min(axis=0))
+    value = found["target"].min(axis=0).max(axis=0)
+    assert (value > found["target"].min(axis=0)[0]).any()
+    goal = np.asarray(part.reward) + 0.9 * np.where(part.terminated, 0.0, value)
     error = 0.5 * ((found["q"] - goal) ** 2).mean()
     stacked = np.concatenate([
         found["q_uniform"] / 2 + np.log(2.0),
@@ -346,6 +348,7 @@ def test_what_cannot_be_learned_is_refused():
         (partial(IqlConfig, expectile=1.0), "an expectile of 1"),
         (partial(IqlConfig, inverse_temperature=-1.0), "weights of IQL"),
         (partial(CqlConfig, actions=0), "too small"),
+        (partial(CqlConfig, backup_actions=0), "too small"),
         (partial(CqlConfig, penalty=0.0, gap=1.0), "nothing for a multiplier"),
         (partial(Td3BcConfig, delay=0), "a delay of 1"),
     ):

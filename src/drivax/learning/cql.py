@@ -35,6 +35,8 @@ class CqlConfig(OfflineConfig):
         actions: Actions from each distribution that the penalty samples.
         next_actions: Whether actions of the policy at the next state are among them, beside uniform ones and those of
             the policy at the state.
+        backup_actions: Of so many actions of the policy at the next state the one of the highest value is backed up. One
+            alone is in the mean worth less than what the expert does next, and that adds up from step to step.
         importance: Whether each is divided by its density; if not, the action of the data stands among them instead.
         penalty_temperature: Of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. If there is one, the
@@ -50,6 +52,7 @@ class CqlConfig(OfflineConfig):
     penalty_rate: float = 3e-4
     actions: int = 10
     next_actions: bool = True
+    backup_actions: int = 1
     importance: bool = True
     penalty_temperature: float = 1.0
     imitation: float = 0.0
@@ -60,7 +63,7 @@ class CqlConfig(OfflineConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse_choices()
-        if self.actions < 1 or min(self.temperature, self.penalty_temperature) <= 0.0:
+        if min(self.actions, self.backup_actions) < 1 or min(self.temperature, self.penalty_temperature) <= 0.0:
             raise UsageError("actions or a temperature of CQL is too small", cure="use more than 0")
         if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):
             raise UsageError(
@@ -107,9 +110,9 @@ class Cql(Offline):
         next_key, sample_key = jax.random.split(key)
         policy = jax.lax.stop_gradient(trained["policy"])
         following = self.distribution(policy, part.following)
-        then = following.action(following.sample(next_key))
+        then = following.action(by_key(following.sample, next_key, self.config.backup_actions))
         # As in the reference implementation the target has no entropy, though the policy's loss has.
-        value = jnp.min(self.q(target["critic"], part.following, then), axis=0)
+        value = jnp.max(jnp.min(self.q(target["critic"], part.following, then), axis=0), axis=0)
         goal = td_target(part.reward, value, part.terminated, self.config.gamma)
         now = self.distribution(policy, part.observation)
         action, log_density = self._sampled(now, following, part.action, sample_key)
