@@ -2,10 +2,13 @@
 
     drivax generate sets/bench --benchmark
     python benchmarks/curation.py events --bench sets/bench [--method NAME ...]
+    python benchmarks/curation.py check --data sets/bench/validation sets/fresh
     python benchmarks/curation.py speed --data sets/bench/validation
     python benchmarks/curation.py table
 
 ``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
+``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
+nobody had seen (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
 as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
 ``test`` alone says; scouts are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
@@ -167,6 +170,24 @@ def scored(
         yield name, tables[0], joined(tables)
 
 
+def checked(paths: list[Path]) -> dict[str, Any]:
+    """How well ``kinematic`` finds the events that force a reaction in each of some sets."""
+    found = {}
+    for path in paths:
+        data = ScenarioSet.open(path)
+        truth, scores = Truth.of([data]), curate("kinematic", Wanted(data)).scenarios
+        wanted = truth.groups()["forced"]
+        rows = wanted | (truth.kind == 0)
+        found[path.name] = {
+            "hash": data.hash,
+            "scenarios": int(rows.sum()),
+            "events": int(wanted.sum()),
+            "auc": roc_auc(scores[rows], wanted[rows]),
+            "auc_interval": auc_interval(scores[rows], wanted[rows]),
+        }
+    return {"checks": found}
+
+
 def error_interval(scouts: Scouts, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
     """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
     opinions = scouts.opinions(data)
@@ -258,6 +279,14 @@ def scouts_table(stored: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def checks_table(stored: dict[str, Any]) -> str:
+    """What ``kinematic`` finds in other sets."""
+    lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
+    for name, one in stored["checks"].items():
+        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {told(one, 'auc', 3)} |")
+    return "\n".join(lines)
+
+
 def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
     """One measure by kind of event and method."""
     methods = stored["methods"]
@@ -309,6 +338,7 @@ def filled(text: str, stored: dict[str, Any]) -> str:
         "step auc": kinds_table(stored, "step_auc", 3),
         "step precision": kinds_table(stored, "step_precision", 2),
         "scouts": scouts_table(stored),
+        "checks": checks_table(stored),
         "draws": draws_table(stored),
         "speed": speed_table(stored),
     }
@@ -324,21 +354,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("events", "speed", "table"))
+    parser.add_argument("what", choices=("events", "check", "speed", "table"))
     parser.add_argument("--bench", type=Path)
     parser.add_argument("--method", nargs="+", choices=SCORED, default=[])
-    parser.add_argument("--data", type=Path)
+    parser.add_argument("--data", type=Path, nargs="+")
     parser.add_argument("--count", type=int, default=1024)
     args = parser.parse_args()
     stored = json.loads(STORED.read_text()) if STORED.exists() else {}
     if args.what == "table":
         PAGE.write_text(filled(PAGE.read_text(), stored))
         return
-    made = (
-        events(args.bench, args.method, stored)
-        if args.what == "events"
-        else {"speed": speed(args.data, args.count)}
-    )
+    if args.what == "events":
+        made = events(args.bench, args.method, stored)
+    elif args.what == "check":
+        made = checked(args.data)
+    else:
+        made = {"speed": speed(args.data[0], args.count)}
     STORED.write_text(json.dumps(stored | made, indent=1) + "\n")
 
 

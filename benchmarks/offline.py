@@ -43,13 +43,14 @@ SCENARIOS, DRAWS = 10_000, 1_000_000
 
 def seconds(call: Callable[[], Any], repeats: int) -> float:
     """Median time of a call, the first of which is not counted."""
-    times = []
-    for turn in range(repeats + 1):
-        began = time.perf_counter()
-        jax.block_until_ready(call())
-        if turn:
-            times.append(time.perf_counter() - began)
-    return statistics.median(times)
+    return statistics.median([elapsed(call) for _ in range(repeats + 1)][1:])
+
+
+def elapsed(call: Callable[[], Any]) -> float:
+    """Seconds that a call takes."""
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - began
 
 
 def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
@@ -77,11 +78,25 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
     }
 
 
-def updates(config: TrainConfig, data: ScenarioSet, repeats: int) -> dict[str, Any]:
-    """Of one training: updates per second, its size, and what preparing the steps took."""
-    iterate, size = training(config, data)
-    algorithm: Any = config.algorithm
-    return {"updates_per_second": round(algorithm.updates / seconds(iterate, repeats), 1), **size}
+def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
+    """Of every algorithm, by turns: updates per second with the slowest and quickest, and its size."""
+    configs = {name: replace(settings.load(TrainConfig, f"offline/{name}"), devices=1) for name in ALGORITHMS}
+    made = {name: training(config, data) for name, config in configs.items()}
+    rates = {name: list[float]() for name in ALGORITHMS}
+    for turn in range(repeats + 1):
+        for name, (iterate, _) in made.items():
+            took = elapsed(iterate)
+            if turn:  # the first time it is compiled
+                algorithm: Any = configs[name].algorithm
+                rates[name].append(algorithm.updates / took)
+    return {
+        name: {
+            "updates_per_second": round(statistics.median(rates[name]), 1),
+            "range": [round(min(rates[name]), 1), round(max(rates[name]), 1)],
+            **size,
+        }
+        for name, (_, size) in made.items()
+    }
 
 
 def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
@@ -121,9 +136,13 @@ def draws() -> int:
 
 def table(result: dict[str, Any]) -> str:
     """What the page shows."""
-    rows = ["| algorithm | updates/s | batch | parameters |", "|---|---:|---:|---:|"]
+    rows = [
+        "| algorithm | updates/s | slowest to quickest | batch | parameters |",
+        "|---|---:|---:|---:|---:|",
+    ]
     rows += [
-        f"| `offline/{name}` | {one['updates_per_second']} | {one['batch']} | {one['parameters']:,} |"
+        f"| `offline/{name}` | {one['updates_per_second']:.0f} | {one['range'][0]:.0f} to {one['range'][1]:.0f} | "
+        f"{one['batch']} | {one['parameters']:,} |"
         for name, one in result["algorithms"].items()
     ]
     one = result["scouts"]
@@ -159,12 +178,7 @@ def main() -> None:
         "scenarios": len(data),
         "draws_per_second": draws(),
         "scouts": scouts(data, args.repeats),
-        "algorithms": {
-            name: updates(
-                replace(settings.load(TrainConfig, f"offline/{name}"), devices=1), data, args.repeats
-            )
-            for name in ALGORITHMS
-        },
+        "algorithms": updates(data, args.repeats),
         "versions": versions(),
     }
     print(json.dumps(result, indent=1))
