@@ -310,6 +310,19 @@ def test_arms_that_nobody_pulled(bandit, config, stays):
         assert float(action[0]) > 0.05, "better than what is done on average"
 
 
+@pytest.mark.slow
+def test_a_multiplier_finds_the_weight_that_a_gap_takes():
+    """Arms from 0.2 to 0.4 alone: the lower the penalty is to be, the larger its weight; above what there is, nothing."""
+    action = np.random.default_rng(0).uniform(0.2, 0.4, 500)
+    settings = {"network": NETWORK, "penalty": 1.0, "penalty_rate": 0.01, **FAST}
+    found = {}
+    for gap in (1.0, -0.5, -1.0):
+        _, _, logs = learned(CqlConfig(gap=gap, **settings), arms(action, action), iterations=60)
+        found[gap] = logs["loss/penalty_weight"], logs["loss/penalty"]
+    assert found[1.0][0] < 1e-2 < found[-0.5][0] < 1.0 < found[-1.0][0] < 100.0
+    assert found[1.0][1] > found[-0.5][1] > found[-1.0][1]
+
+
 def test_a_timeout_is_worth_what_follows():
     """One state for ever, paid 1 a step: 1 / (1 - gamma) where episodes are cut off, 1 where they end."""
     ones, number = jnp.ones((20, 10)), jnp.broadcast_to(jnp.arange(10), (20, 10))
