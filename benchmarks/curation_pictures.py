@@ -36,7 +36,7 @@ Beside = Callable[[list[Axes], int, int], None]
 
 def picture(data: ScenarioSet, table: ScoreTable, plots: int, beside: Beside, out: Path) -> None:
     """The most critical scenario at its most critical step, and plots beside it."""
-    row = int(table.scenarios.argmax())
+    row = int(table.order[0])
     step = int(table.steps[row].argmax())
     page = Figure(figsize=SIZE, dpi=DPI, facecolor="white", layout="constrained")
     grid = page.add_gridspec(plots, 2, width_ratios=(1, 1.45))

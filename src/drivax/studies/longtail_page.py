@@ -243,7 +243,7 @@ def _scores(tables: Mapping[str, ScoreTable]) -> str:
         for name, table in tables.items()
     )
     tops = [
-        (name, *(table.scenario_ids[row] for row in np.argsort(-table.scenarios, kind="stable")[:3]))
+        (name, *(table.scenario_ids[row] for row in table.order[:3]))
         for name, table in tables.items()
         if name != "oracle"  # labels do not rank what they mark
     ]
