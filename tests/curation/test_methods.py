@@ -8,6 +8,8 @@ import pytest
 
 from drivax.cli import main
 from drivax.cli.curate import Curate
+from drivax.cli.train import Train
+from drivax.curation.agents import AGENTS
 from drivax.curation.combining import Combination
 from drivax.curation.controls import event_kinds, event_steps
 from drivax.curation.kinematic import KinematicConfig
@@ -74,6 +76,7 @@ def test_what_a_method_says_that_it_weighs_is_there(tables):
 def test_the_command_offers_every_method():
     hints = get_type_hints(Curate, include_extras=True)
     assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)
+    assert {*get_args(get_args(get_type_hints(Train)["agent"])[0])} == set(AGENTS)
 
 
 def test_what_they_prefer(data, tables):

@@ -118,4 +118,6 @@ def test_the_interval_of_a_rank_correlation():
             np.repeat(one, times), np.repeat(other, times), np.repeat(np.arange(400), times)
         )
         np.testing.assert_allclose(found, wanted, atol=0.025)
+    assert correlation_interval(one, other, np.zeros(400)) == (-1.0, 1.0)
+    assert correlation_interval(one, (np.arange(400) == 7).astype(float), np.arange(400)) == (-1.0, 1.0)
     assert np.diff(correlation_interval(one, other, np.arange(400), confidence=0.5)) < np.diff(wanted) / 2

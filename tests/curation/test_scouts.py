@@ -161,14 +161,25 @@ def test_scouts_that_learn_from_a_part_score_all(data):
     trained = train_scouts(replace(TINY, learn_from=6), data)
     assert sorted(np.bincount(trained.fold + 1)) == [2, 2, 2, 4]
     assert len({*np.flatnonzero(trained.fold < 0) // 2}) == 2  # two recordings of two windows
-    table = ensemble_table(trained, data)
-    assert table.steps.min(axis=1).shape == (10,) and (table.steps.max(axis=1) > 0).all()
+    table, told, unseen = ensemble_table(trained, data), trained.opinions(data), trained.fold < 0
+    whole = told.disagreement(trained.deviation).sum(axis=-1)
+    for rows, scale in zip((~unseen, unseen), table.config["scale"], strict=True):
+        assert scale == pytest.approx(np.percentile(whole[rows], 99.0))
+        np.testing.assert_allclose(table.steps[rows], whole[rows] / (whole[rows] + scale))
+    known = told.known & unseen[:, None]
+    error = told.error(trained.deviation, trained.fold)
+    np.testing.assert_allclose(error[unseen], told.error(trained.deviation, None)[unseen])
+    by_hand = scipy.stats.spearmanr(table.steps[known], error[known]).statistic
+    assert table.config["error_rank_correlation"] == pytest.approx(by_hand)
 
 
 def test_more_scenarios_than_fit_are_refused(data, monkeypatch):
-    monkeypatch.setattr(scouts_module, "free_memory", lambda device: 1_000_000)
-    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* pass --learn_from \d"):
+    one = ScenarioBank.from_scenarios(list(data)).nbytes / 10
+    monkeypatch.setattr(scouts_module, "free_memory", lambda device: int(16.5 * one))
+    with pytest.raises(UsageError, match=r"10 scenarios take .* GB, .* pass --learn_from 4:"):
         train_scouts(TINY, data)
+    with pytest.raises(UsageError, match="are free; free memory"):
+        train_scouts(replace(TINY, folds=5), data)
 
 
 @pytest.mark.slow
@@ -234,7 +245,8 @@ def test_the_table_of_an_ensemble(data, scouts, weighted):
     # A half at the percentile 99, more beyond it: the order stays to the top.
     wanted = whole / (whole + np.percentile(whole, 99.0))
     np.testing.assert_allclose(table.steps, wanted)
-    np.testing.assert_allclose(table.components["action_0"] + table.components["action_1"], wanted)
+    one = told.disagreement(trained.deviation)[..., 0]
+    np.testing.assert_allclose(table.components["action_0"], one / (one + np.percentile(whole, 99.0)))
     assert np.unique(table.steps[wanted > 0.5]).size > 5 and table.steps.max() < 1.0
     error = told.error(trained.deviation, trained.fold)[told.known]
     by_hand = scipy.stats.spearmanr(table.steps[told.known], error).statistic

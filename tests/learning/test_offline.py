@@ -312,7 +312,7 @@ def test_arms_that_nobody_pulled(bandit, config, stays):
 
 @pytest.mark.slow
 def test_a_multiplier_finds_the_weight_that_a_gap_takes():
-    """Arms from 0.2 to 0.4 alone: the lower the penalty is to be, the larger its weight; above what there is, nothing."""
+    """Arms from 0.2 to 0.4: the lower the penalty is to be, the larger its weight; above what there is, nothing."""
     action = np.random.default_rng(0).uniform(0.2, 0.4, 500)
     settings = {"network": NETWORK, "penalty": 1.0, "penalty_rate": 0.01, **FAST}
     found = {}

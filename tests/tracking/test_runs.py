@@ -120,11 +120,13 @@ def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "metrics.jsonl").write_text("beside the package")
     assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": False}
-    new = file.with_name("new.py")
-    for changed in (new, file):
+    new, preset = file.with_name("new.py"), tmp_path / "configs" / "preset.yaml"
+    preset.parent.mkdir()
+    for changed in (new, preset, file):
         changed.write_text("two")
         assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": True}
-        new.unlink(missing_ok=True)
+        for made in (new, preset):
+            made.unlink(missing_ok=True)
 
 
 def test_where_a_planner_was_trained(tmp_path):

@@ -55,7 +55,8 @@ class Train:
     agent: (
         Literal[
             "bc", "baseline", "cql_bc", "heuristic", "heuristic_scenario", "ensemble", "ensemble_scenario",
-            "action_rarity", "action_rarity_scenario", "random_matched", "random_matched_scenario", "oracle",
+            "action_rarity", "action_rarity_scenario", "random_matched", "random_matched_ensemble",
+            "random_matched_action_rarity", "random_matched_scenario", "oracle", "oracle_strong",
             "random_matched_oracle",
         ]
         | None

@@ -5,8 +5,8 @@ Per step of the log, all in [0, 1]:
 - urgency is the inverse of the time to collision (Hayward, 1972; the inverse so that no conflict is 0), scaled from
   0 at the horizon of 5 s to 1 at ``urgent_s``;
 - braking is the deceleration that avoids reaching the nearest agent on the driver's own way if it keeps its speed,
-  ``(v - v_leader)^2 / (2 gap)``, where one that comes nearer counts as standing: its own part of the closing speed no
-  braking takes away (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
+  ``(v - v_leader)^2 / (2 gap)``, where one that drives towards it counts as standing: its own part of the closing speed
+  no braking takes away (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
   can do (the brake threat number of Braennstroem, Sjoeberg and Coelingh, A Situation and Threat Assessment Algorithm
   for a Rear-End Collision Avoidance System, 2008);
 - volatility is the larger of jerk and yaw acceleration, each as a share of a limit, over a Savitzky-Golay window

@@ -193,35 +193,42 @@ def ensemble_table(
 ) -> ScoreTable:
     """Scores by the disagreement of an ensemble, which may have been trained on another set.
 
-    The component is ``d / (d + scale)`` of the disagreement d, so that the order of d stays to the top; beside it are
-    the parts of it about each number of the action. Of scouts trained by likelihood there is one, the mutual
-    information over its largest possible value. The table's
-    configuration says how scores and errors of the scouts correlate by rank, over all steps: on the set that they were
-    trained on, errors of the one that has not seen the scenario.
+    The component is ``d / (d + scale)`` of the disagreement d, so that the order of d stays to the top; beside it is
+    the same of each number of the action. Of scouts trained by likelihood there is one, the mutual information over its
+    largest possible value. The table's configuration says how scores and errors of the scouts correlate by rank, over
+    all steps: on the set that they were trained on, errors of the one that has not seen the scenario; where they
+    learned from a part of it, errors of their mean, over the rest.
 
     Args:
         scouts: The ensemble.
         data: The set.
         progress: Called with (scenarios done, scenarios).
-        scale: Disagreement that scores a half; by default the percentile 99 of the set.
+        scale: Disagreement that scores a half; by default the percentile 99 of the set; of what scouts learned from
+            and of the rest, of which they know less, apart.
     """
     opinions = scouts.opinions(data, progress)
-    valid = valid_steps(data)
+    valid, own = valid_steps(data), data.hash == scouts.set_hash
+    unseen = scouts.fold < 0 if own else np.ones(len(data), bool)
+    groups = [rows for rows in (~unseen, unseen) if rows.any()]
+    scales: list[Any] = [scale] * len(groups)
     if opinions.information is None:
         parts = opinions.disagreement(scouts.deviation)
         whole = parts.sum(axis=-1)
         if scale is None:
-            scale = float(np.percentile(whole[valid], _HALF))
-        parts = parts / np.maximum(whole + scale, np.finfo(np.float64).tiny)[..., None]
-        components = {_number(place): part for place, part in enumerate(np.moveaxis(parts, -1, 0))}
-        components["disagreement"] = parts.sum(axis=-1)
+            scales = [float(np.percentile(whole[rows][valid[rows]], _HALF)) for rows in groups]
+        half = np.zeros((len(data), 1))
+        for rows, one in zip(groups, scales, strict=True):
+            half[rows] = np.maximum(one, np.finfo(np.float64).tiny)
+        components = {
+            _number(place): part / (part + half) for place, part in enumerate(np.moveaxis(parts, -1, 0))
+        }
+        components["disagreement"] = whole / (whole + half)
     else:
         components = {"information": opinions.information / math.log(scouts.config.folds)}
-    own = data.hash == scouts.set_hash
     error = opinions.error(scouts.deviation, scouts.fold if own else None)
-    about = {"trained_on": scouts.set_hash, "scale": scale}
+    about = {"trained_on": scouts.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
     table = table_of("ensemble", scouts.config, data, components, about)
-    known = opinions.known
+    known = opinions.known & groups[-1][:, None]
     told = {"error_rank_correlation": rank_correlation(table.steps[known], error[known])}
     return replace(table, config={**table.config, **told})
 

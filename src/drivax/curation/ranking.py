@@ -144,7 +144,8 @@ def correlation_interval(
 ) -> tuple[float, float]:
     """Interval of :func:`rank_correlation`, by percentiles of a bootstrap that draws whole clusters.
 
-    Davison and Hinkley, Bootstrap Methods, 1997, 3.8.
+    Davison and Hinkley, Bootstrap Methods, 1997, 3.8. From -1 to 1 where nothing can be said: of a single cluster, or
+    where nearly all scores are the same.
 
     Args:
         one: Some scores.
@@ -159,6 +160,8 @@ def correlation_interval(
     for _ in range(resamples):
         rows = np.concatenate([parts[place] for place in rng.integers(len(parts), size=len(parts))])
         found.append(rank_correlation(one[rows], other[rows]))
+    if len(parts) < 2 or np.isnan(found).any():
+        return -1.0, 1.0
     tail = (1.0 - confidence) / 2
     low, high = np.quantile(found, (tail, 1.0 - tail))
     return float(low), float(high)

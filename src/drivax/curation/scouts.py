@@ -32,6 +32,7 @@ from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
 from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.sizes import Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.features import Features
@@ -40,6 +41,8 @@ from drivax.tasks.task import Task
 
 #: Logs whose steps are observed at once.
 _AT_ONCE = 8
+#: Scenarios whose opinions are computed with at once.
+_BLOCK = 4096
 #: Actions that are drawn from every scout to measure how much their distributions differ.
 _DRAWN = 16
 
@@ -112,7 +115,8 @@ class Opinions:
 
     def disagreement(self, deviation: Float[Numbers, " D"]) -> Float[Numbers, "N T D"]:
         """Variance among the scouts (unbiased), in units of the variance of what experts do."""
-        return self.action.astype(np.float64).var(axis=2, ddof=1) / deviation**2
+        variance = [self.action[rows].astype(np.float64).var(axis=2, ddof=1) for rows in self._blocks()]
+        return np.concatenate(variance) / deviation**2
 
     def error(
         self, deviation: Float[Numbers, " D"], fold: Int[Numbers, " N"] | None
@@ -124,13 +128,18 @@ class Opinions:
             fold: Of each scenario, whose scout is judged since it has not seen it; -1, or None for all: nobody has
                 seen it, and their mean is judged.
         """
-        action = self.action.astype(np.float64)
-        if fold is None:
-            one = action.mean(axis=2)
-        else:
-            own = np.take_along_axis(action, fold[:, None, None, None], axis=2)[:, :, 0]
-            one = np.where(fold[:, None, None] < 0, action.mean(axis=2), own)
-        return (((one - self.expert) / deviation) ** 2).sum(axis=-1)
+        judged = np.full(len(self.action), -1) if fold is None else fold
+        found = []
+        for rows in self._blocks():
+            action, place = self.action[rows].astype(np.float64), judged[rows, None, None]
+            own = np.take_along_axis(action, place[..., None], axis=2)[:, :, 0]
+            one = np.where(place < 0, action.mean(axis=2), own)
+            found.append((((one - self.expert[rows]) / deviation) ** 2).sum(axis=-1))
+        return np.concatenate(found)
+
+    def _blocks(self) -> list[slice]:
+        """Rows that are computed with at once: in double precision all of a large set take several times its memory."""
+        return [slice(first, first + _BLOCK) for first in range(0, len(self.action), _BLOCK)]
 
 
 @dataclass(frozen=True)
@@ -250,7 +259,7 @@ def train_scouts(
     rows = some_of(clusters.tolist(), config.learn_from, config.seed)
     fold = np.full(len(data), -1)
     fold[rows] = folds_of(clusters[rows].tolist(), config.folds, config.seed)
-    _refuse_too_many(data, len(rows), free_memory(jax.devices()[0]))
+    _refuse_too_many(config, data, len(rows), free_memory(jax.devices()[0]))
     bank = ScenarioBank.from_scenarios(data[row] for row in rows)
     experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)
@@ -258,15 +267,20 @@ def train_scouts(
     return Scouts(config, learner, parameters, data.hash, fold, deviation)
 
 
-def _refuse_too_many(data: ScenarioSet, count: int, free: int | None) -> None:
-    """Refuses more scenarios than the device holds, judged by the first one."""
-    one = ScenarioBank.from_scenarios([data[0]]).nbytes
+def _refuse_too_many(config: ScoutsConfig, data: ScenarioSet, count: int, free: int | None) -> None:
+    """Refuses more scenarios than the device holds."""
+    if free is None:
+        return
+    one = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
     # Each is there twice while a bank is made.
-    if free is not None and 2 * one * count > free:
+    if 2 * one * count > free:
+        fits = free // (4 * one)
         raise UsageError(
             f"{count:,} scenarios take some {2e-9 * one * count:,.0f} GB, and {free / 1e9:,.0f} GB are free",
             file=data.path,
-            cure=f"pass --learn_from {free // (4 * one)}: scouts learn from so many, and score all",
+            cure=f"pass --learn_from {fits}: scouts learn from so many, and score all"
+            if fits >= config.folds
+            else "free memory",
         )
 
 

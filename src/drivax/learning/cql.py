@@ -35,8 +35,9 @@ class CqlConfig(OfflineConfig):
         actions: Actions from each distribution that the penalty samples.
         next_actions: Whether actions of the policy at the next state are among them, beside uniform ones and those of
             the policy at the state.
-        backup_actions: Of so many actions of the policy at the next state the one of the highest value is backed up. One
-            alone is in the mean worth less than what the expert does next, and that adds up from step to step.
+        backup_actions: Of so many actions of the policy at the next state the one of the highest value (of the smaller
+            critic) is backed up. One alone is in the mean worth less than what the expert does next, and that adds up
+            from step to step.
         importance: Whether each is divided by its density; if not, the action of the data stands among them instead.
         penalty_temperature: Of the penalty's soft maximum.
         imitation: Weight of the squared error of the policy's mode from the expert's action. If there is one, the
@@ -63,7 +64,10 @@ class CqlConfig(OfflineConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse_choices()
-        if min(self.actions, self.backup_actions) < 1 or min(self.temperature, self.penalty_temperature) <= 0.0:
+        if (
+            min(self.actions, self.backup_actions) < 1
+            or min(self.temperature, self.penalty_temperature) <= 0.0
+        ):
             raise UsageError("actions or a temperature of CQL is too small", cure="use more than 0")
         if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):
             raise UsageError(

@@ -34,7 +34,7 @@ from drivax.studies.longtail_plan import (
 from drivax.tracking.runs import RunFolder
 from drivax.tracking.sinks import read_rows
 
-#: What critics expect of the policy on held-out steps: by it the published study chose its checkpoints.
+#: What critics expect of the policy on held-out steps: by it the published study advises to choose checkpoints.
 MEAN_Q = "validation/mean_q"
 Say = Callable[[str], None]
 

@@ -208,9 +208,9 @@ def machine() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Commit of the checkout that ``folder`` belongs to, and whether the package there is another; None without one.
+    """Commit of the checkout that ``folder`` belongs to, and whether package or presets are others; None without one.
 
-    What lies beside the package, as a run folder may, changes nothing of what runs.
+    What lies beside them, as a run folder may, changes nothing of what runs.
     """
 
     def git(*arguments: str) -> str:
@@ -221,7 +221,8 @@ def git_state(folder: Path) -> dict[str, Any] | None:
         # An installed package may lie inside a foreign repository: only a checkout that tracks this file counts.
         own = Path(__file__).resolve()
         git("ls-files", "--error-unmatch", str(own))
-        changed = git("status", "--porcelain", "--", str(own.parents[1]))
+        top = git("rev-parse", "--show-toplevel")
+        changed = git("status", "--porcelain", "--", str(own.parents[1]), f"{top}/configs")
         return {"commit": git("rev-parse", "HEAD"), "changed": bool(changed)}
     except (OSError, subprocess.SubprocessError):
         return None
