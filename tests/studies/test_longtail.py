@@ -22,6 +22,7 @@ from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.studies import longtail
 from drivax.studies.longtail_plan import LongtailConfig, Sets
+from drivax.studies.longtail_rankings import rankings
 from drivax.studies.longtail_results import (
     METRICS,
     Condition,
@@ -31,7 +32,6 @@ from drivax.studies.longtail_results import (
     detectable,
     judge,
     needed,
-    rankings,
     rates,
 )
 from scenes import SMALL, car, straight_road

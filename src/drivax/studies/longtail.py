@@ -62,6 +62,7 @@ from drivax.studies.longtail_plan import (
     drive_of,
     run_of,
 )
+from drivax.studies.longtail_rankings import rankings
 from drivax.studies.longtail_results import (
     METRICS,
     Condition,
@@ -69,7 +70,6 @@ from drivax.studies.longtail_results import (
     cost_of_rule,
     detectable,
     judge,
-    rankings,
     rates,
     summary,
 )

@@ -14,7 +14,8 @@ from drivax.curation.scores import ScoreTable
 from drivax.show.histograms import histogram
 from drivax.show.page import page, publish
 from drivax.studies.longtail_plan import FIRST
-from drivax.studies.longtail_results import METRICS, RELATED, UNRELATED
+from drivax.studies.longtail_rankings import RELATED, UNRELATED
+from drivax.studies.longtail_results import METRICS
 
 _SHORT = {
     "collision": "collision", "at_fault_collision": "at fault", "offroad": "off-road", "accuracy": "accuracy",

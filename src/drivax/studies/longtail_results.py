@@ -5,16 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.agents import CURATED, control_of
-from drivax.curation.ranking import correlation_interval, rank_correlation
-from drivax.curation.scores import ScoreTable
-from drivax.curation.subset import top_rows
 from drivax.evaluation.crossed import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
 from drivax.evaluation.hypotheses import holm
 
@@ -31,10 +27,6 @@ Group = Literal["baseline", "lot", "where", "failures", "methods"]
 METRICS = {
     "collision": -1, "at_fault_collision": -1, "offroad": -1, "accuracy": 1, "progress_ratio": 1, "vmax_score": 1,
 }  # fmt: skip
-#: Two rankings below this correlation (and above its negative) are called unrelated, above the other one related.
-UNRELATED, RELATED = 0.1, 0.3
-#: Share of the scenarios that are compared as the most critical ones of two methods.
-_TOP = 0.05
 _LEVEL = 0.05
 #: What the published study reports of its best agent: 16.0 % of collisions to 5.5 %.
 PUBLISHED_CHANGE = 5.5 / 16.0 - 1.0
@@ -335,39 +327,6 @@ def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict
     """Mean, interval within what all of these metrics lie in, and how many scenarios it is of."""
     found = agents_interval(values, labels, weights, share=True).as_dict()
     return {"scenarios" if name == "n" else name: value for name, value in found.items()}
-
-
-def rankings(tables: Mapping[str, ScoreTable], clusters: Sequence[str]) -> list[dict[str, Any]]:
-    """How alike the rankings of scenarios are: rank correlation, and how many of the most critical are the same.
-
-    They are unrelated or related only where all of the correlation's interval is.
-
-    Args:
-        tables: By method, of one set.
-        clusters: Recording of every scenario, which are drawn anew for the interval.
-    """
-    found = []
-    for one, other in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
-        first, second = tables[one].scenarios, tables[other].scenarios
-        count = max(round(_TOP * len(first)), 1)
-        tops = [set(top_rows(tables[name], count)) for name in (one, other)]
-        low, high = correlation_interval(first, second, clusters)
-        verdict = "undecided"
-        if max(-low, high) < UNRELATED:
-            verdict = "supported"
-        elif low > RELATED or high < -RELATED:
-            verdict = "contradicted"
-        found.append(
-            {
-                "one": one,
-                "other": other,
-                "rho": rank_correlation(first, second),
-                "interval": [low, high],
-                "overlap": len(tops[0] & tops[1]) / count,
-                "orthogonal": verdict,
-            }
-        )
-    return found
 
 
 def summary(judged: Judged) -> dict[str, Any]:
