@@ -62,7 +62,7 @@ def write_page(
         _section("Before the comparison", _conditions(results)),
         _section("Verdicts", _verdicts(results)),
         _section("How the agents drove", "".join(_rates(results, kind) for kind in _KINDS)),
-        _section("How the weights lie", _table(*draws(results))),
+        _section("How the weights lie", _table(*draws(results), "dense")),
         _section("Are the methods different?", _rankings(results)),
         _section("Choosing checkpoints by the highest mean Q", _mean_q(results)),
         _section("Scores", _scores(scored)),
@@ -174,7 +174,7 @@ def mean_q(results: Mapping[str, Any]) -> Cells:
 
 def _conditions(results: Mapping[str, Any]) -> str:
     found = ", ".join(f"{_SHORT[name]} {value:.3f}" for name, value in results["detectable"].items())
-    return _table(*conditions(results)) + (
+    return _table(*conditions(results), "dense") + (
         "<p>The smallest difference in ordinary traffic that so many seeds and scenarios find with a probability of "
         "80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
         f"{escape(found)}. A score that stands still is that of this budget and these learning rates. Baseline and bc "
@@ -190,9 +190,9 @@ def _verdicts(results: Mapping[str, Any]) -> str:
         "drawn by chance (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). "
         "A claim is supported or contradicted below 0.05, otherwise undecided; how many seeds or recordings would "
         "decide is reckoned as if the difference were the one found, at the strictest level of its group. A claim "
-        "about a size is tested against that size. A lot has the same distribution of weights; how many scenarios it "
-        "spreads them over may differ (see how the weights lie). Scores are made once: claims are about these scores, "
-        "at this strength of weighting.</small></p>"
+        "about a size is tested against that size. How alike the weights of a method and of its lot are, stands under "
+        "how the weights lie. Scores are made once: claims are about these scores, at this strength of "
+        "weighting.</small></p>"
     )
 
 

@@ -250,8 +250,8 @@ def needed(found: Crossed, together: int) -> str:
     ways = [f"{seeds:,} seeds each"] if seeds is not None else []
     ways += [f"{recordings:,} test recordings"] if recordings is not None else []
     if ways:
-        return " or ".join(ways) + " would find a difference of this size"
-    return "neither seeds nor recordings alone would find a difference of this size"
+        return " or ".join(ways) + " would decide"
+    return "neither seeds nor recordings alone would decide"
 
 
 def level(together: int) -> float:
