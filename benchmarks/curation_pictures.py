@@ -95,7 +95,7 @@ def ensemble(data: ScenarioSet, out: Path) -> None:
         valid = np.flatnonzero(table.valid[row])
         axes[2].fill_between(valid * DT_S, table.steps[row, valid], color=LIGHT["mark"])
         axes[2].set_ylim(0.0, 1.0)
-        over_time(axes[2], step, "score: the variance among them")
+        over_time(axes[2], step, "score, by the variance among them")
 
     picture(data, table, 3, beside, out)
 

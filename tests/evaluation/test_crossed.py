@@ -221,6 +221,10 @@ def test_intervals_of_agents():
     assert agents_interval(few).low < 0.0 == agents_interval(few, share=True).low
     never = agents_interval(np.zeros((3, 60)), clusters, share=True)
     assert never == replace(wilson(0, 30), n=60)
+    # Twenty of which ten weigh 19 times as much tell as much as (190 + 10)^2 / (10 * 19^2 + 10) alike.
+    heavy = agents_interval(np.zeros((3, 20)), weights=np.repeat([19.0, 1.0], 10), share=True)
+    assert heavy.high == pytest.approx(wilson(0, 200**2 / 3620).high)
+    assert heavy.n == 20
     for count in (6, 1000):  # shares of which do not add up to 1 in floats
         assert agents_interval(np.ones((3, count)), share=True) == replace(wilson(count, count), n=count)
     assert agents_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)

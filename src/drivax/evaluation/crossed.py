@@ -185,12 +185,13 @@ def agents_interval(
         clusters: The same.
         weights: The same.
         confidence: Coverage.
-        share: The interval lies within 0 and 1; where all is 0, or all is 1, it is Wilson's of as many clusters.
+        share: The interval lies within 0 and 1; where all is 0, or all is 1, it is Wilson's of as many clusters (with
+            weights of their effective number, Kish 1965).
 
     Returns:
         ``n`` counts scenarios that all agents define; no bounds with fewer than two clusters of them.
     """
-    _, keep = _counted(values, values, weights)
+    weight, keep = _counted(values, values, weights)
     number = int(keep.sum())
     labels = dense(clusters, values.shape[1], "cluster")
     if np.unique(labels[keep]).size < 2:
@@ -199,7 +200,9 @@ def agents_interval(
     low, high = found.interval(confidence)
     only = np.unique(values[:, keep])
     if share and only.size == 1 and only[0] in (0.0, 1.0):
-        return replace(wilson(float(only[0]) * found.clusters, found.clusters, confidence), n=number)
+        mass = np.bincount(labels[keep], weight[keep])
+        trials = found.clusters if weights is None else float(mass.sum() ** 2 / (mass**2).sum())
+        return replace(wilson(float(only[0]) * trials, trials, confidence), n=number)
     if share:
         low, high = max(low, 0.0), min(high, 1.0)
     return Interval(found.difference, low, high, number)
