@@ -35,7 +35,7 @@ _CELLS, _SIZE = 48, 336
 _STYLE = """
 table.wide td, table.wide th { text-align: left; }
 table.wide th[scope=row] { min-width: 19em; }
-table.wide td:last-child { min-width: 14em; }
+table.wide td:last-child { min-width: 11em; }
 table.dense td, table.dense th[scope=row] { white-space: nowrap; max-width: none; font-size: 0.85rem; }
 table.wide td:nth-child(n+3):nth-child(-n+6) { white-space: nowrap; }
 h3 { margin-top: 1.5em; }
