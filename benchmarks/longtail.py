@@ -75,6 +75,7 @@ def filled(page: str, results: dict[str, Any]) -> str:
         "draws": longtail_page.draws(results),
         "rankings": longtail_page.rankings(results),
         "mean q": longtail_page.mean_q(results),
+        "mean q curve": longtail_page.mean_q_curve(results),
         **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(Group)},
         **{f"rates {kind}": longtail_page.rates(results, kind) for kind in ("ordinary", "common", "rare")},
         "detectable": (

@@ -10,6 +10,7 @@ import types
 import numpy as np
 import pytest
 
+from drivax.evaluation.hypotheses import holm
 from drivax.studies.longtail_plan import REFERENCES
 
 
@@ -182,6 +183,13 @@ def test_the_long_tail_study_found_what_its_agents_drove(script, found):
         rare = about["rare"] / about["test"]
         whole = rare * rates["rare"]["collision"]["mean"] + (1 - rare) * rates["common"]["collision"]["mean"]
         np.testing.assert_allclose(np.mean(means), whole, atol=1e-9)
+
+
+def test_the_long_tail_study_decides_the_same_if_all_claims_are_adjusted_together(found):
+    """As its page says."""
+    claims = found["claims"]
+    together = holm([one["p"] for one in claims])
+    assert [p < 0.05 for p in together] == [one["verdict"] != "undecided" for one in claims]
 
 
 def test_the_page_of_offline_learning_shows_how_fast_it_is(script, stored):

@@ -5,8 +5,9 @@ import pytest
 
 from drivax.curation.controls import matched
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import PUBLISHED, WeightConfig, draws_of, effective_share, weights_of
+from drivax.curation.weights import PUBLISHED, WeightConfig, draws_of, weights_of
 from drivax.errors import UsageError
+from drivax.evaluation.statistics import effective_size
 
 RNG = np.random.default_rng(1)
 
@@ -43,7 +44,9 @@ def test_quantiles_to_a_power(temperature):
 
 def test_mixture_with_uniform():
     """(1 - m) w + m has the variance (1 - m)^2 var(w), so 1 / effective share - 1 shrinks by that factor."""
-    before, after = (effective_share(weights_of(TABLE, plain(uniform=m), "step")[DRAWN]) for m in (0.0, 0.3))
+    before, after = (
+        effective_size(weights_of(TABLE, plain(uniform=m), "step")[DRAWN]) / DRAWN.sum() for m in (0.0, 0.3)
+    )
     assert 1 / after - 1 == pytest.approx(0.7**2 * (1 / before - 1), rel=1e-6)
     assert (weights_of(TABLE, plain(uniform=1.0), "step")[DRAWN] == 1.0).all()
 
@@ -88,7 +91,7 @@ def test_published_weights_tilt_as_the_study_says(mean, deviation, share):
     """Scores of a mean and deviation, drawn with 0.01 on top (the study's own statistics of its scores)."""
     table = table_of(np.resize((mean - deviation, mean + deviation), (40, 51)))
     weights = weights_of(table, PUBLISHED, "step")
-    assert effective_share(weights[table.drawn]) == pytest.approx(share, abs=1e-3)
+    assert effective_size(weights[table.drawn]) / table.drawn.sum() == pytest.approx(share, abs=1e-3)
 
 
 def test_equal_scores_are_uniform_at_either_scale():

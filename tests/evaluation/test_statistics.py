@@ -11,6 +11,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.statistics import (
     Interval,
     bootstrap_mean,
+    effective_size,
     interquartile_bootstrap,
     interquartile_mean,
     paired_bootstrap,
@@ -35,6 +36,12 @@ def test_wilson_by_hand():
     one_sigma = math.erf(1 / math.sqrt(2))
     found = wilson(1.5, 3, one_sigma)
     assert (found.low, found.high) == pytest.approx((0.25, 0.75), abs=1e-12)
+
+
+def test_effective_sizes():
+    assert effective_size(np.ones((4, 5))) == pytest.approx(20.0)
+    assert effective_size(np.array([[3.0, 1.0, 0.0]])) == pytest.approx(16 / 10)
+    assert effective_size(np.zeros((2, 2))) == 0.0
 
 
 def test_nothing_defined_is_nothing():

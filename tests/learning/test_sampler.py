@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from drivax.errors import DataError
-from drivax.learning.sampler import Sampler, draw, effective_size, sampler
+from drivax.learning.sampler import Sampler, draw, sampler
 
 COUNT = 200_000
 _draw = partial(jax.jit, static_argnums=2)(draw)
@@ -67,11 +67,6 @@ def test_draws_follow_from_the_key_alone(weights):
     np.testing.assert_array_equal(one, again)
     assert (np.asarray(one) != np.asarray(other)).any()
 
-
-def test_effective_sizes():
-    assert effective_size(np.ones((4, 5))) == pytest.approx(20.0)
-    assert effective_size(np.array([[3.0, 1.0, 0.0]])) == pytest.approx(16 / 10)
-    assert effective_size(np.zeros((2, 2))) == 0.0
     assert float(sampler(np.array([[3.0, 1.0, 0.0]])).effective) == pytest.approx(1.6)
 
 

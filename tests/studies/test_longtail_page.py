@@ -7,7 +7,7 @@ import pytest
 
 from browser import acted, browse, needs_browser
 from drivax.curation.scores import ScoreTable
-from drivax.studies.longtail_page import write_page
+from drivax.studies.longtail_page import mean_q_curve, write_page
 from drivax.studies.longtail_results import METRICS
 
 RATE = {metric: {"mean": 0.1234, "low": 0.1, "high": 0.15} for metric in METRICS}
@@ -39,8 +39,10 @@ RESULTS = {
         }
     ],
     "mean_q": {"collision": {"difference": 0.2, "interval": [0.1, 0.3]}},
-    "mean_q_agrees": 2,
-    "mean_q_curve": [0.5, 1.25],
+    "validations": [
+        {"mean_q": [1.0, 0.5], "score": [0.25, 0.5], "progress": [0.5, 0.75]},
+        {"mean_q": [0.0, 2.0], "score": [0.5, 0.75], "progress": [0.5, 0.75]},
+    ],
 }  # fmt: skip
 
 
@@ -76,13 +78,17 @@ def test_it_says_what_was_found(page):
     assert (
         "kinematic and ensemble" in text
         and "+0.41 [+0.35, +0.47]" in text
-        and "over seeds: 0.50, 1.25." in text
+        and "the same checkpoint of 1 of the 2 seeds" in text
     )
+    rows = [("mean Q, over seeds", "0.50", "1.25"), ("score, over seeds", "0.375", "0.625")]
+    rows += [("seeds whose highest mean Q it is", "1", "1"), ("seeds whose best score it is", "0", "2")]
+    assert mean_q_curve(RESULTS) == (("validation", "1", "2"), rows)
+    assert "seeds whose highest mean Q it is" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text
     assert "Better than the same weights dealt out by lot?" in text and "than the baseline?" not in text
-    assert "of which they are 5.0%" in text and "the same checkpoint of 2 of the 5 seeds" in text
+    assert "of which they are 5.0%" in text
     assert "Common scenarios" not in text  # there are none in these results
 
 

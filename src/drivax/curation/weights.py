@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from drivax.curation.scores import ScoreTable
 from drivax.errors import UsageError
+from drivax.evaluation.statistics import effective_size
 
 Scale = Literal["step", "scenario"]
 Array = np.ndarray[Any, Any]
@@ -155,14 +156,9 @@ def draws_of(weights: Float[Array, "N T"], drawn: Bool[Array, "N T"]) -> Draws:
     some = drawn.any(axis=1)
     ordered = np.sort(one)[::-1]
     return Draws(
-        effective=effective_share(one),
-        effective_scenarios=effective_share(weights.sum(axis=1)[some]),
+        effective=effective_size(one) / one.size,
+        effective_scenarios=effective_size(weights.sum(axis=1)[some]) / int(some.sum()),
         tilt=float(np.quantile(one, 0.99) / one.mean()),
         largest=float(ordered[0] / one.mean()),
         concentration=float(ordered[: max(round(len(one) * 0.05), 1)].sum() / one.sum()),
     )
-
-
-def effective_share(weights: Float[Array, " n"]) -> float:
-    """``(sum w)^2 / (n sum w^2)`` (Kish, Survey Sampling, 1965)."""
-    return float(weights.sum() ** 2 / (len(weights) * np.sum(weights**2)))

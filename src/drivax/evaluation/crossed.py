@@ -17,7 +17,7 @@ from scipy import special
 from drivax.errors import UsageError
 from drivax.evaluation.clusters import dense
 from drivax.evaluation.effects import ROUNDING
-from drivax.evaluation.statistics import Interval, wilson
+from drivax.evaluation.statistics import Interval, effective_size, wilson
 
 #: Values of the agents of one kind, one column per scenario.
 Values = Float64[np.ndarray, "agent scenario"]
@@ -201,7 +201,7 @@ def agents_interval(
     only = np.unique(values[:, keep])
     if share and only.size == 1 and only[0] in (0.0, 1.0):
         mass = np.bincount(labels[keep], weight[keep])
-        trials = found.clusters if weights is None else float(mass.sum() ** 2 / (mass**2).sum())
+        trials = found.clusters if weights is None else effective_size(mass)
         return replace(wilson(float(only[0]) * trials, trials, confidence), n=number)
     if share:
         low, high = max(low, 0.0), min(high, 1.0)

@@ -56,6 +56,13 @@ class Interval:
 NOTHING = Interval(None, None, None, 0)
 
 
+def effective_size(weights: Any) -> float:
+    """``(sum w)^2 / sum w^2``: how many of equal weight tell as much (Kish, Survey Sampling, 1965); 0 without any."""
+    weights = np.asarray(weights, np.float64)
+    squares = float(np.sum(weights**2))
+    return float(np.sum(weights)) ** 2 / squares if squares > 0.0 else 0.0
+
+
 def wilson(successes: float | int, n: float | int, confidence: float = 0.95) -> Interval:
     """Score interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927).
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.statistics import effective_size
 from drivax.scenario.record import record, static
 
 _LAST = 2**32 - 1
@@ -26,7 +27,7 @@ class Sampler:
 
     Attributes:
         cumulative: Share of all weight up to each step, scenario by scenario, in units of ``1 / (2^32 - 1)``.
-        effective: Effective sample size, see :func:`effective_size`.
+        effective: Effective sample size, see :func:`~drivax.evaluation.statistics.effective_size`.
         steps: Steps of a scenario.
     """
 
@@ -58,13 +59,6 @@ def draw(sampler: Sampler, key: Array, shape: tuple[int, ...]) -> Places:
     # The first step whose share reaches beyond the number: a step without weight never does.
     place = jnp.searchsorted(sampler.cumulative, number, side="right").astype(jnp.int32)
     return place // sampler.steps, place % sampler.steps
-
-
-def effective_size(weights: np.ndarray) -> float:
-    """``(sum w)^2 / sum w^2``: how many equally weighted steps tell as much (Kish 1965); 0 without any weight."""
-    weights = np.asarray(weights, np.float64)
-    squares = float(np.sum(weights**2))
-    return float(np.sum(weights)) ** 2 / squares if squares > 0.0 else 0.0
 
 
 def checked_weights(weights: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

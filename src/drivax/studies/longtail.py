@@ -13,8 +13,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from drivax.curation.agents import AGENTS, weighted
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate, refuse_stale
@@ -35,7 +33,6 @@ from drivax.show.criticality import criticality_html
 from drivax.studies.longtail_drives import (
     MEAN_Q,
     Say,
-    chosen_steps,
     clusters,
     drive,
     drive_references,
@@ -219,7 +216,6 @@ def study(
     results = findings(config, sets, out, tables, usable) | {
         "conditions": [asdict(one) for one in conditions(config, out, config.agents)],
         "detectable": least,
-        "mean_q_curve": mean_q_curve(config, out),
     }
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
     _show(results, data, tables, out)
@@ -255,23 +251,23 @@ def conditions(config: LongtailConfig, out: Path, agents: Sequence[str]) -> list
     """Whether agents drive well, and no longer learn; what everything is compared with has to."""
     found = []
     for agent in agents:
-        curves = []
-        for seed in range(config.seeds):
-            rows = [r for r in read_rows(run_of(out, agent, seed) / "metrics.jsonl") if _PROGRESS in r]
-            curves.append(
-                {"score": [_score(row) for row in rows], "progress": [row[_PROGRESS] for row in rows]}
-            )
-        found.append(Condition.of(agent, curves, config.progress, config.flat))
+        found.append(Condition.of(agent, validations(config, out, agent), config.progress, config.flat))
     return found
 
 
-def mean_q_curve(config: LongtailConfig, out: Path) -> list[float]:
-    """What the baseline's critics expect of its policy at each validation, mean over seeds."""
-    curves = [
-        [row[MEAN_Q] for row in read_rows(run_of(out, "baseline", seed) / "metrics.jsonl") if MEAN_Q in row]
-        for seed in range(config.seeds)
-    ]
-    return np.mean(curves, axis=0).tolist()
+def validations(config: LongtailConfig, out: Path, agent: str) -> list[dict[str, list[float]]]:
+    """Of each seed ``score``, ``progress`` and, if there are critics, ``mean_q`` at its validations in their order."""
+    found = []
+    for seed in range(config.seeds):
+        rows = [row for row in read_rows(run_of(out, agent, seed) / "metrics.jsonl") if _PROGRESS in row]
+        found.append(
+            {
+                "score": [_score(row) for row in rows],
+                "progress": [row[_PROGRESS] for row in rows],
+                "mean_q": [row[MEAN_Q] for row in rows if MEAN_Q in row],
+            }
+        )
+    return found
 
 
 def _score(row: Mapping[str, float]) -> float:
@@ -291,7 +287,6 @@ def findings(
         drove = read_evaluation(out / DRIVES / name).metrics
         drives[name] = {metric: drove[metric][None] for metric in METRICS}
     by_mean_q = drives[BY_MEAN_Q]
-    steps = [chosen_steps(run_of(out, "baseline", seed)) for seed in range(config.seeds)]
     return {
         "about": {
             "seeds": config.seeds,
@@ -313,5 +308,5 @@ def findings(
         },
         "rankings": rankings(tables, clusters(data)),
         "mean_q": cost_of_rule(by_mean_q, drives["baseline"], labels, rare, share),
-        "mean_q_agrees": sum(one == other for one, other in steps),
+        "validations": validations(config, out, "baseline"),
     }

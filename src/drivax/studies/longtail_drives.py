@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +16,6 @@ from drivax.evaluation.clusters import recordings_of
 from drivax.evaluation.runs import EvaluationConfig, run_evaluation
 from drivax.evaluation.stored import read_evaluation
 from drivax.learning.policies import load_policy
-from drivax.learning.validation import rank
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -88,7 +86,7 @@ def drive(out: Path, agent: str, seed: int) -> None:
     for name in names(agent):
         folder = drive_of(out, name, seed)
         if not folder.is_dir():
-            step = chosen_steps(run)[0] if name == BY_MEAN_Q else None
+            step = step_by_mean_q(run) if name == BY_MEAN_Q else None
             planner, task = load_policy(run, bank, step=step)
             told = str(run) if step is None else f"{run}@{step}"
             run_evaluation(EvaluationConfig(told), planner, test, folder, task=task)
@@ -125,12 +123,10 @@ def _refuse_older(folder: Path, run: Path) -> None:
         )
 
 
-def chosen_steps(run: Path) -> tuple[int, int]:
-    """The steps of the validations at which critics expected most, and at which the policy drove best."""
+def step_by_mean_q(run: Path) -> int:
+    """The step of the validation at which critics expected most."""
     rows = [row for row in read_rows(run / "metrics.jsonl") if MEAN_Q in row]
-    expected = max(rows, key=lambda row: row[MEAN_Q])
-    best = max(rows, key=lambda row: rank("score", row) or (-math.inf,))
-    return int(expected["step"]), int(best["step"])
+    return int(max(rows, key=lambda row: row[MEAN_Q])["step"])
 
 
 def driven(config: LongtailConfig, out: Path, agent: str) -> dict[str, Float[np.ndarray, "seed scenario"]]:
