@@ -331,7 +331,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     assert again == results
     arguments[arguments.index(str(tmp_path / "restored"))] = str(out)
     blocks = [f"claims {group}" for group in get_args(Group)]
-    blocks += ["conditions", "detectable", "draws", "rankings", "mean q"]
+    blocks += ["conditions", "detectable", "draws", "rankings", "mean q", "mean q curve"]
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
     page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
     assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
