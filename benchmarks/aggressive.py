@@ -37,14 +37,14 @@ from drivax.evaluation.tables import paired_differences
 from drivax.learning.policies import load_policy, pack_policy
 from drivax.learning.policy_traffic import find_traffic, policy_traffic
 from drivax.planners.catalogue import make_planner
-from drivax.planners.driven import with_driver
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.planners.planner_traffic import with_driver
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 ROOT = Path(__file__).resolve().parent
 RESULT = ROOT / "results" / "aggressive.json"

@@ -22,19 +22,19 @@ import numpy as np
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.crossed import agents_interval, difference_interval
 from drivax.evaluation.results import SHARES, Results, interval_of
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.statistics import Interval, bootstrap_mean, paired_bootstrap
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
 from drivax.planners.planner import Planner
 from drivax.planners.simple import RandomActions
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
+from drivax.stats.intervals import Interval, bootstrap_mean, paired_bootstrap
+from drivax.stats.seeds import agents_interval, difference_interval
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 from learning_tables import interval, table
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 
 from drivax.datasets.convert import Conversion, convert, convert_file
-from drivax.datasets.export_tfrecord import write_record
-from drivax.datasets.messages import scenario_class
-from drivax.datasets.tfrecord import read_records
-from drivax.datasets.womd_scenario import WomdScenario
+from drivax.datasets.export.tfrecord import write_record
+from drivax.datasets.womd.messages import scenario_class
+from drivax.datasets.womd.scenario_reader import WomdScenario
+from drivax.datasets.womd.tfrecord import read_records
 from drivax.evaluation.audit import audit
 from drivax.scenario.schema import record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter

@@ -29,24 +29,24 @@ import numpy as np
 
 from drivax import settings
 from drivax.curation.controls import event_kinds, event_steps, matched
+from drivax.curation.ensemble import Scouts, ScoutsConfig, train_scouts
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.methods import Wanted, curate, ensemble_table, table_of
 from drivax.curation.published import PublishedConfig
-from drivax.curation.ranking import (
+from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
+from drivax.curation.scores import ScoreTable
+from drivax.curation.scoring import BATCH, score_steps
+from drivax.curation.weights import WeightConfig, draws_of, weights_of
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.store import ScenarioSet
+from drivax.stats.ranking import (
     auc_interval,
     bootstrap_intervals,
     correlation_interval,
     precision_at_base_rate,
     roc_auc,
 )
-from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
-from drivax.curation.scores import ScoreTable
-from drivax.curation.scoring import BATCH, score_steps
-from drivax.curation.scouts import Scouts, ScoutsConfig, train_scouts
-from drivax.curation.weights import WeightConfig, draws_of, weights_of
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.sizes import Sizes
-from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.events import EventKind
 
 REPOSITORY = Path(__file__).resolve().parent.parent

@@ -15,15 +15,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from drivax.curation.ensemble import ScoutsConfig, train_scouts
 from drivax.curation.methods import Wanted, curate, ensemble_table
 from drivax.curation.rarity import ExpertActions, KernelRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.scoring import score_steps
-from drivax.curation.scouts import ScoutsConfig, train_scouts
+from drivax.report.pictures.palette import LIGHT, SERIES
+from drivax.report.pictures.still import draw_on
 from drivax.scenario.schema import DT_S, STEPS
 from drivax.scenario.store import ScenarioSet
-from drivax.show.palette import LIGHT, SERIES
-from drivax.show.scene import draw_on
 
 mpl.use("Agg")
 

@@ -20,10 +20,10 @@ from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate, lanes
 from drivax.learning.policy_traffic import find_traffic
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 from simulator import machine_ms
 
 ROOT = Path(__file__).resolve().parents[1]

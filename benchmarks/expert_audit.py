@@ -29,13 +29,13 @@ from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, replay
 from drivax.geometry.boxes import corners
-from drivax.scenario.assemble import assemble, windows, with_ego
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble, windows, with_ego
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag, Scenario
 from drivax.synthetic.world import generate_recording
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULT = ROOT / "benchmarks" / "results" / "expert_audit.json"
@@ -222,7 +222,7 @@ def offenders(rows: list[dict[str, Any]]) -> str:
 
 def draw(row: Mapping[str, Any], scenario: Scenario, folder: Path) -> None:
     """A picture of a fault at its first step."""
-    from drivax.show.scene import draw_scenario
+    from drivax.report.pictures.still import draw_scenario
 
     steps = [row[name] for name in ("collision_step", "first_offroad_step", "red_light_step")]
     step = min(step for step in steps if step is not None)

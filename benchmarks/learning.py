@@ -28,10 +28,10 @@ from drivax import settings
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import pack_policy
-from drivax.scenario.bank import ScenarioBank
+from drivax.report.loaded_runs import read_runs
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.show.runs import read_runs
-from drivax.tracking.runs import RunFolder, seed_folders, versions
+from drivax.tracking.run_folder import RunFolder, seed_folders, versions
 from drivax.tracking.workers import one_core_each
 from learning_tables import COLUMNS, CURVES, drawn, filled, pages, picture
 

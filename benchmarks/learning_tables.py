@@ -13,8 +13,8 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from drivax.show.curves import compact
-from drivax.show.palette import LIGHT, SERIES
+from drivax.report.charts.curves import compact
+from drivax.report.pictures.palette import LIGHT, SERIES
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 FOLDER = DOCS / "algorithms"

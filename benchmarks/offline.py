@@ -24,15 +24,15 @@ import jax
 import numpy as np
 
 from drivax import settings
-from drivax.curation.scouts import ScoutsConfig, train_scouts
-from drivax.learning.agents import Agents
+from drivax.curation.ensemble import ScoutsConfig, train_scouts
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
+from drivax.learning.members import Agents
 from drivax.learning.program import Program
 from drivax.learning.sampler import draw, sampler
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 RESULT = Path(__file__).resolve().parent / "results" / "offline.json"
 PAGE = RESULT.parents[2] / "docs" / "algorithms" / "offline.md"

@@ -24,11 +24,11 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.stored import EpisodeTable
 from drivax.learning.policy_traffic import find_traffic
-from drivax.scenario.assemble import assemble, windows
-from drivax.scenario.bank import ScenarioBank
+from drivax.report.episode_selection import outcome
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.schema import Scenario
-from drivax.show.selection import outcome
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "real_files.json"

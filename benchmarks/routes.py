@@ -21,13 +21,13 @@ import numpy as np
 
 from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
-from drivax.scenario.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.route_coverage import SHARE, candidate_coverage, coverage, lane_coverage
+from drivax.scenario.build.routes import RouteStyle
 from drivax.scenario.recording import Recording
-from drivax.scenario.route_coverage import SHARE, candidate_coverage, coverage, lane_coverage
-from drivax.scenario.routes import RouteStyle
 from drivax.scenario.schema import AgentKind, Flag, Scenario
 from drivax.synthetic.world import generate_recording
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -22,13 +22,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.catalogue import make_traffic, prepared
-from drivax.simulator.override import OverrideTraffic, with_given
-from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
+from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.override import OverrideTraffic, with_given
+from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.studies.bench import (
     BenchConfig,
     bench,
@@ -41,7 +41,7 @@ from drivax.studies.bench import (
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
 from drivax.testing.worlds import padded
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "simulator.json"

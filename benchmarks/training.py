@@ -22,14 +22,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from drivax import settings
-from drivax.learning.agents import Agents
+from drivax.learning.algorithms.ppo import Ppo
 from drivax.learning.collector import collect
 from drivax.learning.config import TrainConfig
-from drivax.learning.ppo import Ppo
+from drivax.learning.members import Agents
 from drivax.learning.program import Program
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 RESULT = Path(__file__).resolve().parent / "results" / "training.json"
 SCENARIOS = 1024

@@ -31,13 +31,13 @@ from drivax.api import evaluate, load
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
-from drivax.synthetic.comfort import LIMITS
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import EventKind
 from drivax.synthetic.events.kinds import SEVERITY_MPS2
+from drivax.synthetic.expert.comfort import LIMITS
 from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
-from drivax.tracking.runs import versions, write_text
+from drivax.tracking.run_folder import versions, write_text
 from world_measures import (
     NEAR_S,
     against,

@@ -23,11 +23,11 @@ from matplotlib.patches import Polygon
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.scenario.assemble import assemble
+from drivax.report.pictures.palette import LIGHT
+from drivax.report.pictures.roads import road_lines
+from drivax.report.pictures.still import draw_on
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CURRENT_STEP, Scenario
-from drivax.show.palette import LIGHT
-from drivax.show.roads import road_lines
-from drivax.show.scene import draw_on
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import EventKind
 from drivax.synthetic.world import WorldConfig, generate_one

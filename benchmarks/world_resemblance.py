@@ -24,10 +24,10 @@ from scipy.stats import ks_2samp
 
 from drivax.datasets.formats import reader_named, survey
 from drivax.errors import DrivaxError, UsageError
-from drivax.scenario.assemble import assemble, windows
+from drivax.report.pictures.palette import BLUE, VERMILLION
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CAPACITIES, DT_S, STEPS, AgentKind, Scenario
-from drivax.show.palette import BLUE, VERMILLION
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 from world_measures import everybody

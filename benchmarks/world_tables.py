@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivax.synthetic.faults import EGO_SKIN_M
+from drivax.synthetic.expert.violations import EGO_SKIN_M
 
 GUIDE = Path(__file__).resolve().parents[1] / "docs" / "guide" / "world.md"
 #: The table of targets stands between these lines of the guide.

@@ -12,7 +12,7 @@ from drivax.evaluation.rollout import judging
 from drivax.metrics.episode import episode_metrics, first_steps
 from drivax.metrics.steps import step_metrics
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import logged_history
+from drivax.simulator.traffic.log import logged_history
 from drivax.tasks.task import Task
 from scenes import bank_of
 

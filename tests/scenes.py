@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CAPACITIES, STEPS, AgentKind, Flag, LightState, RoadKind
 from drivax.tasks.observations import ObservationConfig

@@ -13,8 +13,8 @@ import own_terms
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.named import dotted_name, find_named, is_dotted
 from drivax.planners.catalogue import make_planner
+from drivax.plugins import dotted_name, find_named, is_dotted
 from drivax.tasks.observations import ObservationConfig, OwnGroup
 from drivax.tasks.rewards import OwnTerm, RewardConfig
 

@@ -10,7 +10,7 @@ import types
 import numpy as np
 import pytest
 
-from drivax.evaluation.hypotheses import holm
+from drivax.stats.significance import holm
 from drivax.studies.longtail_plan import REFERENCES
 
 

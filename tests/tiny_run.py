@@ -11,9 +11,9 @@ import numpy as np
 
 from drivax import settings
 from drivax.learning.config import TrainConfig
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.runs import RunFolder
+from drivax.tracking.run_folder import RunFolder
 
 TINY = {
     "task": {

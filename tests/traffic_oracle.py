@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drivax.geometry.boxes import overlap
-from drivax.scenario.agent_paths import PATH_X, PATH_Y, PROFILE_SPEED, PROFILE_Z
-from drivax.simulator.reactive import DRIVES, IdmTraffic
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.agent_paths import PATH_X, PATH_Y, PROFILE_SPEED, PROFILE_Z
+from drivax.simulator.traffic.log import alone
+from drivax.simulator.traffic.reactive import DRIVES, IdmTraffic
 from drivax.tasks.task import Task
 
 TRAFFIC = IdmTraffic()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drivax.api import evaluate, load, make_simulator
     from drivax.learning.loop import train
     from drivax.planners.functions import jax_planner, python_planner
-    from drivax.scenario.bank import ScenarioBank
+    from drivax.scenario.bank.scenario_bank import ScenarioBank
     from drivax.scenario.store import ScenarioSet
     from drivax.tasks.task import Task
 
@@ -26,7 +26,7 @@ _HOMES = {
     "train": "drivax.learning.loop",
     "jax_planner": "drivax.planners.functions",
     "python_planner": "drivax.planners.functions",
-    "ScenarioBank": "drivax.scenario.bank",
+    "ScenarioBank": "drivax.scenario.bank.scenario_bank",
     "ScenarioSet": "drivax.scenario.store",
     "Task": "drivax.tasks.task",
 }

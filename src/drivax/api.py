@@ -10,23 +10,23 @@ from typing import Any
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.results import Results
+from drivax.evaluation.run_evaluation import with_metrics
 from drivax.evaluation.runner import evaluate_scenarios
-from drivax.evaluation.runs import with_metrics
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
-from drivax.named import is_dotted
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.choice import chosen
+from drivax.plugins import is_dotted
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import Scenario
-from drivax.scenario.sizes import Sizes
+from drivax.scenario.select.choice import chosen
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
-from drivax.tracking.runs import run_and_step
+from drivax.tracking.run_folder import run_and_step
 from drivax.tracking.zoo import is_policy, zoo
 
 
@@ -62,7 +62,7 @@ def load(
     Args:
         data: Folder of a scenario set, or scenarios.
         limit: Only the first so many of those that the others leave.
-        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.choice``).
+        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.select.choice``).
         scenarios: Only those of a set that are named by their ids, or in files with one id per line.
 
     Raises:

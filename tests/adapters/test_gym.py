@@ -19,7 +19,7 @@ from drivax.errors import DataError, UsageError
 from drivax.evaluation.rollout import judging
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import ConstantVelocity
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioWriter
 from drivax.tasks.observations import SPEED_MPS, ObservationConfig
 from drivax.tasks.task import Task

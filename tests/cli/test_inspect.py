@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.scenario.assemble import assemble
+from drivax.report.inspection import Inspection
+from drivax.report.inspection_tables import finding_text
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.store import ScenarioWriter
-from drivax.show.inspection import Inspection
-from drivax.show.inspection_tables import finding_text
 from scenes import car, straight_road
 
 COLUMNS = 100
@@ -215,8 +215,8 @@ def test_wrong_calls_get_one_line(words, said, status, sets, inspect):
 
 
 def test_a_sample_is_spread_evenly(sets, monkeypatch):
-    from drivax.scenario.selection import Selection
-    from drivax.show import inspection
+    from drivax.report import inspection
+    from drivax.scenario.select.filters import Selection
 
     one = Inspection.open(sets[0], Selection())
     assert [scenario.id for scenario in one.sample()] == ["s0", "s1", "s2", "s3"]

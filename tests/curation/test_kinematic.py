@@ -11,7 +11,7 @@ from drivax.curation.logged import of_logs
 from drivax.curation.methods import KINEMATIC
 from drivax.curation.scoring import score_steps
 from drivax.errors import UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import bank_of, car, moved, straight_road

@@ -9,7 +9,7 @@ import pytest
 from drivax.cli import main
 from drivax.cli.curate import Curate
 from drivax.cli.train import Train
-from drivax.curation.agents import AGENTS
+from drivax.curation.arms import AGENTS
 from drivax.curation.combining import Combination
 from drivax.curation.controls import event_kinds, event_steps
 from drivax.curation.kinematic import KinematicConfig
@@ -17,7 +17,7 @@ from drivax.curation.methods import METHODS, Wanted, curate, refuse_stale
 from drivax.curation.scores import read_scores, write_scores
 from drivax.curation.subset import top_rows, write_top
 from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import SMALL, car, straight_road

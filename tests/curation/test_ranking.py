@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from drivax.curation.ranking import (
+from drivax.errors import UsageError
+from drivax.stats.ranking import (
     auc_interval,
     bootstrap_intervals,
     correlation_interval,
@@ -12,7 +13,6 @@ from drivax.curation.ranking import (
     rank_correlation,
     roc_auc,
 )
-from drivax.errors import UsageError
 
 RNG = np.random.default_rng(5)
 SCORES = RNG.integers(0, 12, 150) / 12  # with ties

@@ -12,7 +12,7 @@ from drivax.curation.combining import Combination
 from drivax.curation.methods import Wanted, curate
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenes import car, straight_road

@@ -10,11 +10,8 @@ import pytest
 import scipy.stats
 
 from drivax.cli import main
-from drivax.curation import scouts as scouts_module
-from drivax.curation.methods import ensemble_table
-from drivax.curation.rarity import KernelRarity
-from drivax.curation.scores import read_scores
-from drivax.curation.scouts import (
+from drivax.curation import ensemble as scouts_module
+from drivax.curation.ensemble import (
     Opinions,
     ScoutsConfig,
     experience_of,
@@ -24,15 +21,18 @@ from drivax.curation.scouts import (
     some_of,
     train_scouts,
 )
+from drivax.curation.methods import ensemble_table
+from drivax.curation.rarity import KernelRarity
+from drivax.curation.scores import read_scores
 from drivax.errors import UsageError
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.driving import Driving
-from drivax.learning.imitation import BcConfig
 from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
 from drivax.networks.entity import EntityConfig
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.simulator.simulator import Simulator
 from quick import quick

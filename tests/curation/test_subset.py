@@ -12,10 +12,10 @@ from drivax.curation.methods import Wanted, curate
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import check_top, top_rows, write_top
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.clusters import recordings_of
-from drivax.scenario.assemble import assemble
+from drivax.report.pages.criticality import criticality_html
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.show.criticality import criticality_html
+from drivax.stats.clusters import recordings_of
 from scenes import SMALL, car, straight_road
 
 #: Data set and recording of each scenario.

@@ -7,7 +7,7 @@ from drivax.curation.controls import matched
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import PUBLISHED, WeightConfig, draws_of, weights_of
 from drivax.errors import UsageError
-from drivax.evaluation.statistics import effective_size
+from drivax.stats.intervals import effective_size
 
 RNG = np.random.default_rng(1)
 

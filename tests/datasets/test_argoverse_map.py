@@ -12,10 +12,10 @@ import pytest
 
 from datasets.samples import av2_motion
 from datasets.samples.av2_motion import IDS, OUTSIDE, height, place
-from drivax.datasets.argoverse_map import read_map
+from drivax.datasets.argoverse.map import read_map
 from drivax.errors import DataError
 from drivax.geometry.polylines import project
-from drivax.scenario.lanes import lane_graph
+from drivax.scenario.build.lanes import lane_graph
 from drivax.scenario.schema import LANE_KINDS, RoadKind
 
 

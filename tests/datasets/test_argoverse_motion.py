@@ -13,12 +13,12 @@ import pytest
 
 from datasets.samples import av2_motion
 from datasets.samples.av2_motion import height, place
-from drivax.datasets.argoverse_motion import ArgoverseMotion, decode
+from drivax.datasets.argoverse.motion import ArgoverseMotion, decode
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import UsageError
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import project
-from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import EDGE_KINDS, AgentKind, Flag
 

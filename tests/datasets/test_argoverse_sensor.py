@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from datasets.samples import av2_motion, av2_sensor
 from datasets.samples.av2_sensor import FRAMES, LOG, TURN
-from drivax.datasets.argoverse_sensor import ArgoverseSensor, decode, rotate
+from drivax.datasets.argoverse.sensor import ArgoverseSensor, decode, rotate
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.geometry.angles import wrap
-from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import AgentKind, Flag
 
@@ -311,7 +311,7 @@ def test_real_motion_is_smooth_and_headings_fit_it(real):
 
 def test_real_class_default_sizes_of_the_forecasting_reader_fit_the_measured_ones(real):
     """Forecasting files hold no sizes; those of their classes lie within a tenth of the medians here."""
-    from drivax.datasets.argoverse_motion import _TYPES
+    from drivax.datasets.argoverse.motion import _TYPES
 
     size = real.tracks.size.max(axis=1)
     cars = (real.tracks.kind == AgentKind.VEHICLE) & (size[:, 0] < 5.5)

@@ -24,7 +24,7 @@ from drivax.datasets.estimate import estimate
 from drivax.datasets.formats import survey
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario, record_dtype
 from drivax.scenario.store import ScenarioSet
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from drivax import cli
-from drivax.datasets import export as exports
-from drivax.datasets.export import NOTE, Export, export
+from drivax.datasets.export import subset as exports
+from drivax.datasets.export.subset import NOTE, Export, export
 from drivax.datasets.formats import survey
 from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from scenario.recordings import driving, make_recording, make_tracks

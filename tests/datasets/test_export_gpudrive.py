@@ -10,10 +10,10 @@ import pytest
 from datasets.samples import womd_scenario
 from datasets.test_restore import assert_same_map
 from drivax.datasets import gpudrive
-from drivax.datasets import womd_scenario as protos
-from drivax.datasets.export_gpudrive import file_name, gpudrive_scene
-from drivax.datasets.restore import restore
-from drivax.scenario.assemble import assemble
+from drivax.datasets.export.gpudrive import file_name, gpudrive_scene
+from drivax.datasets.export.restore import restore
+from drivax.datasets.womd import scenario_reader as protos
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
 from scenario.recordings import FAR, driving, make_recording, make_tracks, moved
 

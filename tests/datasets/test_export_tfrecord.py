@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datasets.samples import womd_example, womd_scenario
-from drivax.datasets.export_tfrecord import example, shard_name, varints, write_record
-from drivax.datasets.messages import example_class
-from drivax.datasets.tfrecord import read_records
+from drivax.datasets.export.tfrecord import example, shard_name, varints, write_record
+from drivax.datasets.womd.messages import example_class
+from drivax.datasets.womd.tfrecord import read_records
 
 
 @given(arrays.arrays(np.int64, st.integers(0, 40)))

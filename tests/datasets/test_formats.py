@@ -12,7 +12,7 @@ import pytest
 from datasets import samples
 from drivax.datasets.convert import convert
 from drivax.datasets.formats import READERS, detect, find_files, reader_named, survey
-from drivax.datasets.womd_scenario import WomdScenario
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 
 
@@ -93,7 +93,7 @@ def test_a_missing_extra_is_told_for_the_files_that_need_it_only(sampled, tmp_pa
     def fail():
         raise UsageError("reading TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'")
 
-    monkeypatch.setattr("drivax.datasets.tfrecord._crc32c", fail)
+    monkeypatch.setattr("drivax.datasets.womd.tfrecord._crc32c", fail)
     others = survey(sampled[0]).formats - Counter({"womd-scenario": 9})
     assert set(others) == {name.replace("_", "-") for name in SAMPLES if not name.startswith("womd")} - {
         "scenariomax"

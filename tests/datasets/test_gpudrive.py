@@ -12,7 +12,7 @@ from datasets.samples import gpudrive as sample
 from drivax.datasets.gpudrive import GpuDrive, decode
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind
 

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from datasets.samples import nuplan as sample
-from drivax.datasets import nuplan_log
-from drivax.datasets.nuplan import NuPlan
-from drivax.datasets.nuplan_log import TimeLine, pieces, yaw_of
-from drivax.datasets.nuplan_map import feature_id
+from drivax.datasets.nuplan import log as nuplan_log
+from drivax.datasets.nuplan.log import TimeLine, pieces, yaw_of
+from drivax.datasets.nuplan.map import feature_id
+from drivax.datasets.nuplan.reader import NuPlan
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import STEPS, AgentKind, Flag, LightState, RoadKind
 

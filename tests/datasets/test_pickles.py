@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.datasets import pickles
+from drivax.datasets.scenarionet import pickles
 from drivax.errors import DataError
 
 

@@ -9,9 +9,9 @@ import pytest
 import shapely
 
 from datasets.samples import gpudrive as sample
+from drivax.datasets.export.restore import restore
 from drivax.datasets.gpudrive import GpuDrive
-from drivax.datasets.restore import restore
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, POLYGON_KINDS, AgentKind, Flag, RoadKind
 from scenario.recordings import (

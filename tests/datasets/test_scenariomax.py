@@ -10,12 +10,12 @@ import pytest
 
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.scenariomax import ScenarioMax, decode
-from drivax.datasets.womd import flavour
-from drivax.datasets.womd_example import WomdExample
-from drivax.datasets.womd_example import decode as decode_womd
-from drivax.datasets.womd_scenario import WomdScenario
+from drivax.datasets.womd.example_reader import WomdExample
+from drivax.datasets.womd.example_reader import decode as decode_womd
+from drivax.datasets.womd.records import flavour
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
 

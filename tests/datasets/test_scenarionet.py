@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from datasets.samples import scenarionet as sample
-from drivax.datasets import pickles
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.datasets.scenarionet import ScenarioNet, decode
-from drivax.datasets.scenarionet_edges import drivable_on_left, inside, outlines_on_left
-from drivax.datasets.scenarionet_map import third_column_is_heading
+from drivax.datasets.scenarionet import pickles
+from drivax.datasets.scenarionet.edges import drivable_on_left, inside, outlines_on_left
+from drivax.datasets.scenarionet.map import third_column_is_heading
+from drivax.datasets.scenarionet.reader import ScenarioNet, decode
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.recording import MapFeature, Recording
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, AgentKind, Flag, LightState, RoadKind
 

@@ -9,7 +9,7 @@ import zlib
 
 import pytest
 
-from drivax.datasets.tfrecord import count_records, looks_framed, masked, read_records
+from drivax.datasets.womd.tfrecord import count_records, looks_framed, masked, read_records
 from drivax.errors import DataError, UsageError
 
 PAYLOADS = (b"first", b"", b"third record", b"x" * 300)

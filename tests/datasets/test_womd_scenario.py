@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.datasets import messages
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.datasets.womd_scenario import WomdScenario, decode
+from drivax.datasets.womd import messages
+from drivax.datasets.womd.scenario_reader import WomdScenario, decode
 from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.recording import MapFeature, Recording
 from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, RoadKind
 
@@ -285,7 +285,7 @@ def test_sensor_fields_are_skipped(wire, tmp_path):
     path = tmp_path / "payload"
     path.write_bytes(payload)
     program = (
-        "import resource, sys; from pathlib import Path; from drivax.datasets.womd_scenario import decode\n"
+        "import resource, sys; from pathlib import Path; from drivax.datasets.womd.scenario_reader import decode\n"
         "payload = Path(sys.argv[1]).read_bytes()\n"
         "def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
         "before = peak(); decode(payload); print((peak() - before) / len(payload))"

@@ -15,7 +15,7 @@ from drivax import settings
 from drivax.api import find_planner, load
 from drivax.cli import main
 from drivax.errors import UsageError
-from drivax.evaluation.runs import EvaluationConfig
+from drivax.evaluation.run_evaluation import EvaluationConfig
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.generate import Generation, generate

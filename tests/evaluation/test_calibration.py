@@ -8,15 +8,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.evaluation.crossed import certain, crossed_difference
-from drivax.evaluation.hypotheses import (
+from drivax.evaluation.split import assign
+from drivax.stats.seeds import certain, crossed_difference
+from drivax.stats.significance import (
     holm,
     mcnemar,
     paired_bootstrap_test,
     paired_permutation,
     split_permutation,
 )
-from drivax.evaluation.split import assign
 
 TRIALS, RESAMPLES = 4000, 400
 CLUSTERS = np.repeat(np.arange(40), [1, 2, 3, 4] * 10)

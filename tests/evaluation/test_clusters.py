@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import defined, dense, design_effect, stratum_of_clusters
+from drivax.stats.clusters import defined, dense, design_effect, stratum_of_clusters
 
 
 def test_undefined_values_leave_and_their_clusters_close_up():

@@ -13,11 +13,11 @@ import scipy.stats
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.comparison import compare
-from drivax.evaluation.effects import power, scenarios_needed
-from drivax.evaluation.hypotheses import holm, mcnemar, paired_permutation
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.statistics import paired_bootstrap, rate
 from drivax.evaluation.stored import EpisodeTable, read_evaluation, read_seeds
+from drivax.stats.effects import power, scenarios_needed
+from drivax.stats.intervals import paired_bootstrap, rate
+from drivax.stats.significance import holm, mcnemar, paired_permutation
 
 N = 60
 PLAN = ComparisonPlan(minimum_scenarios=10, resamples=400, secondary=("collision", "comfortable"))

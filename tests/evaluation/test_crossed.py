@@ -8,15 +8,8 @@ import pytest
 from scipy import stats
 
 from drivax.errors import UsageError
-from drivax.evaluation.crossed import (
-    Crossed,
-    agents_interval,
-    certain,
-    crossed_difference,
-    crossed_mean,
-    log_ratio,
-)
-from drivax.evaluation.statistics import Interval, wilson
+from drivax.stats.intervals import Interval, wilson
+from drivax.stats.seeds import Crossed, agents_interval, certain, crossed_difference, crossed_mean, log_ratio
 
 
 def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, both=0.0, shift=0.0):

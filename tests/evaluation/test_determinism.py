@@ -13,8 +13,8 @@ import pytest
 from drivax.evaluation.rollout import drive, judging
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import RandomActions
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task

@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 from drivax.errors import UsageError
-from drivax.evaluation.hypotheses import (
+from drivax.stats.significance import (
     holm,
     mcnemar,
     paired_bootstrap_test,

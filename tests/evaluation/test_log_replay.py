@@ -12,8 +12,8 @@ from drivax.datasets.formats import detect, find_files
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
-from drivax.scenario.assemble import assemble, windows
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.synthetic.world import generate_recording
 
 EXACT, DRIVEN = Expert(), Expert(replays=False)

@@ -22,8 +22,8 @@ from drivax.evaluation.rollout import judging
 from drivax.planners.planner import Memoryless
 from drivax.planners.simple import Expert
 from drivax.scenario.record import record, static
-from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import Physical, Published
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig, OwnGroup

@@ -10,12 +10,12 @@ from shapely import affinity
 
 import drivax
 from drivax.cli import main
-from drivax.evaluation.others import packed, unpacked
+from drivax.evaluation.traffic_trajectories import packed, unpacked
+from drivax.report.episode_selection import ranked
+from drivax.report.episodes import DrivenSet, drives_of
+from drivax.report.loaded_runs import read_runs
+from drivax.report.pictures.episode import as_driven
 from drivax.scenario.store import ScenarioSet
-from drivax.show.drives import DrivenSet, drives_of
-from drivax.show.episode import as_driven
-from drivax.show.runs import read_runs
-from drivax.show.selection import ranked
 from drivax.synthetic.generate import Generation, generate
 
 

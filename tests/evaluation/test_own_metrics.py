@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 
 from drivax.errors import UsageError
+from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.runs import EvaluationConfig, run_evaluation
 from drivax.metrics.selection import selected
 from drivax.planners.catalogue import make_planner
-from drivax.scenario.assemble import assemble
+from drivax.report.html_tables import explanations, planner_table
+from drivax.report.loaded_runs import read_runs
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.show.runs import read_runs
-from drivax.show.tables import explanations, planner_table
 from drivax.tasks.task import Task
 from scenes import SMALL, bank_of, car, straight_road
 

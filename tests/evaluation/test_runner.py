@@ -12,14 +12,14 @@ from drivax.api import load
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.results import ADDED, FAILED, KEYS, with_crashes
+from drivax.evaluation.run_evaluation import format_crashes
 from drivax.evaluation.runner import evaluate, evaluate_in, evaluate_scenarios
-from drivax.evaluation.runs import format_crashes
 from drivax.evaluation.stored import EpisodeTable, read_episodes, read_evaluation
 from drivax.evaluation.tables import paired_difference, paired_differences, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioWriter
 from drivax.simulator.simulator import Simulator

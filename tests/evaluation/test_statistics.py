@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 
 from drivax.errors import UsageError
-from drivax.evaluation.statistics import (
+from drivax.stats.intervals import (
     Interval,
     bootstrap_mean,
     effective_size,
@@ -148,7 +148,7 @@ def test_seeds_repeat_and_chunks_do_not_matter(monkeypatch):
     values = np.random.default_rng(0).normal(size=40)
     first = bootstrap_mean(values, seed=1)
     assert first == bootstrap_mean(values, seed=1) != bootstrap_mean(values, seed=2)
-    monkeypatch.setattr("drivax.evaluation.statistics._CHUNK", 400)
+    monkeypatch.setattr("drivax.stats.intervals._CHUNK", 400)
     chunked = bootstrap_mean(values, seed=1)
     assert (chunked.low, chunked.high) == pytest.approx((first.low, first.high), abs=0.02)
 

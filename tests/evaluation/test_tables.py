@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivax.evaluation.statistics import wilson
 from drivax.evaluation.stored import EpisodeTable
 from drivax.evaluation.tables import (
     READINGS,
@@ -20,6 +19,7 @@ from drivax.evaluation.tables import (
     transfer_table,
 )
 from drivax.simulator.contact import CollisionType
+from drivax.stats.intervals import wilson
 
 N = 12
 

@@ -11,14 +11,14 @@ import numpy as np
 from test_resume import ALGORITHMS, SHOWN, TINY
 
 from drivax.errors import UsageError
-from drivax.learning.agents import Agents
+from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
-from drivax.learning.iql import IqlConfig
 from drivax.learning.loop import train
+from drivax.learning.members import Agents
 from drivax.learning.program import Program
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.generate import Generation, generate

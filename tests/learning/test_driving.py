@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.collector import collect
 from drivax.learning.driving import Driving, _draw
 from drivax.learning.environment import Environment
-from drivax.learning.imitation import BcConfig
-from drivax.learning.ppo import PpoConfig
 from drivax.learning.replay import ReplayConfig
-from drivax.learning.sac import SacConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Discrete

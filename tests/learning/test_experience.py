@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
+from drivax.learning.algorithms.cql import CqlConfig
+from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.config import TrainConfig
-from drivax.learning.cql import CqlConfig
 from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, Recorded, transitions
 from drivax.learning.loop import usable_steps
-from drivax.learning.ppo import PpoConfig
 from drivax.planners.simple import Expert, logged_motion
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task

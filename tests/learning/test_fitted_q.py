@@ -10,10 +10,10 @@ import pytest
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
+from drivax.learning.algorithms.fitted_q import FittedQ, FittedQConfig
+from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
-from drivax.learning.fitted_q import FittedQ, FittedQConfig
-from drivax.learning.iql import IqlConfig
 from drivax.learning.validation import rank
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.rollout import drive
+from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
+from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
 from drivax.learning.driving import Driving
-from drivax.learning.imitation import BcConfig, Cloning
-from drivax.learning.ppo import PpoConfig
 from drivax.learning.replay import ReplayConfig
-from drivax.learning.sac import SacConfig
-from drivax.learning.warm_start import BcPpoConfig, BcSacConfig, WarmStart
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording

@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 from drivax.errors import UsageError
-from drivax.learning.imitation import BcConfig, Cloning
-from drivax.learning.ppo import PpoConfig
-from drivax.learning.sac import SacConfig
-from drivax.learning.warm_start import BcPpoConfig, WarmStart
+from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
+from drivax.learning.algorithms.warm_start import BcPpoConfig, WarmStart
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Grid, SquashedGaussian
 from drivax.networks.encoders import MlpConfig

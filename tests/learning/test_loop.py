@@ -17,12 +17,12 @@ from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.stopping import patience_is_up
 from drivax.learning.validation import rank
-from drivax.scenario.bank import ScenarioBank
+from drivax.report.loaded_runs import read_runs
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.show.runs import read_runs
 from drivax.synthetic.generate import Generation, generate
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.runs import learned_from, seed_folders
+from drivax.tracking.run_folder import learned_from, seed_folders
 from drivax.tracking.sinks import read_rows
 from toy_learner import Toy, ToyConfig, ToyState
 

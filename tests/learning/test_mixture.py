@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from drivax.learning.algorithm import training_data
-from drivax.learning.cql import CqlConfig
-from drivax.learning.imitation import BcConfig
-from drivax.learning.iql import IqlConfig
-from drivax.learning.td3_bc import Td3BcConfig
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.cql import CqlConfig
+from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import MAX_TORQUE, returns

@@ -12,18 +12,18 @@ from scipy import special
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
+from drivax.learning.algorithms.cql import CqlConfig
+from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.learning.config import TrainConfig
-from drivax.learning.cql import CqlConfig
 from drivax.learning.experience import ExperienceConfig, WeightedSet
-from drivax.learning.iql import IqlConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.replay import Transitions
-from drivax.learning.td3_bc import Td3BcConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.sinks import read_rows

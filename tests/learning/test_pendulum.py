@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.environment import Environments
-from drivax.learning.imitation import BcConfig
-from drivax.learning.ppo import PpoConfig
 from drivax.learning.replay import ReplayConfig
-from drivax.learning.sac import SacConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import MAX_TORQUE, Demonstrations, Pendulum, Swing, returns

@@ -13,8 +13,8 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policy_traffic import policy_traffic
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.catalogue import prepared
-from drivax.simulator.reactive import IdmTraffic
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.synthetic.generate import Generation, generate
 
 TINY = {

@@ -6,10 +6,10 @@ import numpy as np
 import optax
 import pytest
 
+from drivax.learning.algorithms.behaviour_cloning import Cloning
+from drivax.learning.algorithms.optimisers import clip_apart, clipped_adam
+from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.collector import Rollout
-from drivax.learning.imitation import Cloning
-from drivax.learning.optimisers import clip_apart, clipped_adam
-from drivax.learning.ppo import PpoConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import Pendulum

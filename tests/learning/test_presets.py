@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 
 from drivax import settings
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.cql import CqlConfig
+from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
+from drivax.learning.algorithms.td3_bc import Td3BcConfig
+from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
 from drivax.learning.config import TrainConfig
-from drivax.learning.cql import CqlConfig
-from drivax.learning.imitation import BcConfig
-from drivax.learning.iql import IqlConfig
-from drivax.learning.ppo import PpoConfig
-from drivax.learning.sac import SacConfig
-from drivax.learning.td3_bc import Td3BcConfig
-from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.tasks.observations import PRESETS
 
 OFFLINE = {"bc": BcConfig, "cql": CqlConfig, "cql_bc": CqlConfig, "iql": IqlConfig, "td3_bc": Td3BcConfig}

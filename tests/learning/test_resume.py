@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError
+from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
+from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
 from drivax.learning.first_state import Origin, with_networks
-from drivax.learning.imitation import BcConfig, Cloning
 from drivax.learning.loop import logged
-from drivax.learning.ppo import PpoConfig
 from drivax.learning.replay import ReplayConfig
-from drivax.learning.sac import SacConfig
-from drivax.learning.warm_start import BcPpoConfig, BcSacConfig, WarmStart
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.testing import check_algorithm

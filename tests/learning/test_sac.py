@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
+from drivax.learning.algorithms.sac import SacConfig, Trained
 from drivax.learning.replay import ReplayConfig, Transitions
-from drivax.learning.sac import SacConfig, Trained
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import Pendulum

@@ -19,10 +19,10 @@ from drivax.errors import DataError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import PACKED, load_policy, pack_policy
 from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_traffic
-from drivax.simulator.catalogue import prepared
-from drivax.simulator.reactive import IdmTraffic
-from drivax.simulator.traffic import LogTraffic
-from drivax.tracking.runs import RunFolder
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.traffic.reactive import IdmTraffic
+from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.zoo import is_policy, policy_folder, zoo
 from scenes import bank_of, car, straight_road
 from tiny_run import TINY, write_run
@@ -99,7 +99,7 @@ def test_policies_load_when_what_drove_beside_them_is_gone(run, bank, tmp_path):
 
 def test_traffic_is_found_by_name(run, tmp_path):
     assert find_traffic("log") == LogTraffic() and find_traffic("idm") == IdmTraffic()
-    assert isinstance(find_traffic("drivax.simulator.reactive:IdmTraffic"), IdmTraffic)
+    assert isinstance(find_traffic("drivax.simulator.traffic.reactive:IdmTraffic"), IdmTraffic)
     path = str(run.path)
     assert find_traffic(path) == policy_traffic(path) and find_traffic(path).name == "driven_by_bold"
     mixed = find_traffic(f"{path}+idm")

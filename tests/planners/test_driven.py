@@ -9,12 +9,12 @@ import pytest
 from flax import nnx
 
 from drivax.errors import UsageError
-from drivax.planners.driven import PlannerTraffic, with_driver
-from drivax.planners.network import NetworkPlanner
+from drivax.planners.network_planner import NetworkPlanner
+from drivax.planners.planner_traffic import PlannerTraffic, with_driver
 from drivax.planners.simple import Expert
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.log import alone
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import bank_of, car, straight_road

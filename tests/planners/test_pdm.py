@@ -13,14 +13,14 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.planners.brake import BrakeConfig, EmergencyBrake, braking, is_emergency
-from drivax.planners.forecast import Forecast
-from drivax.planners.pdm import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
-from drivax.planners.pdm_paths import LINE_BEND, LINE_PLACE, Lines, unrolled
-from drivax.planners.pdm_scoring import ScoringConfig
+from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency
+from drivax.planners.pdm.forecast import Forecast
+from drivax.planners.pdm.planner import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
+from drivax.planners.pdm.proposals import LINE_BEND, LINE_PLACE, Lines, unrolled
+from drivax.planners.pdm.scoring import ScoringConfig
 from drivax.planners.simple import ConstantVelocity
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.planners.forecast import Forecast, fault_times, until_overlap
-from drivax.planners.pdm_scoring import (
+from drivax.planners.pdm.forecast import Forecast, fault_times, until_overlap
+from drivax.planners.pdm.scoring import (
     Ground,
     Judgement,
     ScoringConfig,

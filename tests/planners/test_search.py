@@ -14,8 +14,8 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.prediction import rolled_out
 from drivax.planners.search import SearchPlanner, advanced
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize_scalar
 
-from drivax.planners.tracking import (
+from drivax.planners.pdm.tracking import (
     Car,
     Reference,
     TrackingConfig,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.datasets.womd_example import WomdExample
-from drivax.datasets.womd_scenario import WomdScenario
+from drivax.datasets.womd.example_reader import WomdExample
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.assemble import assemble, with_ego
+from drivax.scenario.build.assemble import assemble, with_ego
 from drivax.scenario.schema import AgentKind, Flag, Scenario
 
 FILES = {

@@ -7,19 +7,19 @@ import pytest
 from scipy.signal import savgol_filter
 
 from drivax.cli import main
+from drivax.curation.ensemble import ScoutsConfig
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.logged import of_logs
 from drivax.curation.methods import Wanted, curate
 from drivax.curation.published import PublishedConfig
 from drivax.curation.scores import read_scores
-from drivax.curation.scouts import ScoutsConfig
 from drivax.curation.subset import top_rows
-from drivax.datasets.womd_scenario import WomdScenario
-from drivax.evaluation.clusters import recordings_of
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.datasets.womd.scenario_reader import WomdScenario
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Capacity
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.stats.clusters import recordings_of
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 from drivax.datasets.formats import detect
 from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
-from drivax.scenario.assemble import assemble, windows, with_ego
-from drivax.scenario.bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.build.assemble import assemble, windows, with_ego
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from shapely.geometry import LineString, Point
 
-from drivax.datasets.womd_scenario import WomdScenario
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.planners.simple import logged_motion
-from drivax.scenario.assemble import assemble, with_ego
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.build.assemble import assemble, with_ego
 from drivax.scenario.schema import CAR_LANE_KINDS, AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.rewards import RewardConfig

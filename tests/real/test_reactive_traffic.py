@@ -9,8 +9,8 @@ import pytest
 
 from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.reader import BadRecord
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
-from drivax.simulator.reactive import DRIVES, REPLAYS
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.simulator.traffic.reactive import DRIVES, REPLAYS
 from traffic_oracle import TRAFFIC, compare, meetings, runs_of
 from traffic_oracle import Path as Line
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from drivax.datasets.reader import BadRecord
-from drivax.scenario.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.route_coverage import SHARE, candidate_coverage, lane_coverage
 from drivax.scenario.recording import Recording
-from drivax.scenario.route_coverage import SHARE, candidate_coverage, lane_coverage
 from drivax.scenario.schema import AgentKind, Flag
 
 

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.scenario.agents import (
+from drivax.scenario.build.lanes import LaneSegments, lane_graph
+from drivax.scenario.build.segments import cut, road_lines
+from drivax.scenario.build.tracks import (
     DEFAULT_EGO_SIZE,
     DEFAULT_SIZES,
     extend,
@@ -16,9 +18,7 @@ from drivax.scenario.agents import (
     median_pose,
     place,
 )
-from drivax.scenario.lanes import LaneSegments, lane_graph
 from drivax.scenario.schema import AgentKind
-from drivax.scenario.segments import cut, road_lines
 
 from .recordings import FAR, arc, driving, lane, line, make_tracks
 

@@ -11,7 +11,7 @@ import pytest
 
 from drivax.errors import DataError, UsageError
 from drivax.scenario.arrays import differentiate, recording_from_arrays, resample
-from drivax.scenario.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble, windows
 from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind, Scenario
 
 T = np.arange(91) * 0.1

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.assemble import assemble, count_source, windows, with_ego
-from drivax.scenario.filling import MISSING, blank
+from drivax.scenario.build.assemble import assemble, count_source, windows, with_ego
+from drivax.scenario.build.filling import MISSING, blank
 from drivax.scenario.recording import Event, MapFeature
 from drivax.scenario.schema import CAPACITIES, AgentKind, Capacity, Flag, LightState, RoadKind, record_dtype
 

@@ -10,8 +10,8 @@ import pytest
 from drivax.errors import DataError, DrivaxError
 from drivax.evaluation.rollout import drive, judging
 from drivax.planners.idm import IdmPlanner
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.choice import chosen
+from drivax.scenario.select.choice import chosen
 
 
 def entry(number, dataset="one", **tags):

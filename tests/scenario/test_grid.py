@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.grid import Grid, arrange
+from drivax.scenario.build.grid import Grid, arrange
+from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.schema import CAPACITIES
-from drivax.scenario.segments import cut, road_lines
 
 from .recordings import edge, lane, line
 

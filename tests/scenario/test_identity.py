@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.identity import identities
+from drivax.scenario.bank.identity import identities
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from scenes import SMALL, car, straight_road
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError
-from drivax.scenario.lane_paths import walk
-from drivax.scenario.lanes import LaneSegments, lane_graph, lane_of_feature, select
+from drivax.scenario.build.lane_paths import walk
+from drivax.scenario.build.lanes import LaneSegments, lane_graph, lane_of_feature, select
+from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.schema import Flag, RoadKind
-from drivax.scenario.segments import cut, road_lines
 
 from .recordings import FAR, arc, edge, lane, line
 

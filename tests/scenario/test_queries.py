@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.exhaustive import without_grid
-from drivax.scenario.queries import (
+from drivax.scenario.bank.exhaustive import without_grid
+from drivax.scenario.bank.queries import (
     EDGE_CUTOFF_M,
     LANE_CUTOFF_M,
     around_lanes,
@@ -21,6 +19,8 @@ from drivax.scenario.queries import (
     route_ahead,
     vertex_distances,
 )
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.synthetic.world import generate_recording
 from scenes import bank_of, car, line, straight_road
 

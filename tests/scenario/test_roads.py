@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivax.scenario.build.roads import rank, road_rows
+from drivax.scenario.build.segments import road_lines
 from drivax.scenario.recording import MapFeature
-from drivax.scenario.roads import rank, road_rows
 from drivax.scenario.schema import RoadKind
-from drivax.scenario.segments import road_lines
 
 from .recordings import arc, edge, lane, line
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.scenario.assemble import assemble
-from drivax.scenario.route_coverage import candidate_coverage, coverage, lane_coverage
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.build.route_coverage import candidate_coverage, coverage, lane_coverage
 
 from .recordings import driving, make_recording, make_tracks
 

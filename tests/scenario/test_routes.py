@@ -7,16 +7,16 @@ from hypothesis import strategies as st
 
 from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import project
-from drivax.scenario.agents import local_tracks
-from drivax.scenario.assemble import ego_log
-from drivax.scenario.lane_paths import trace
-from drivax.scenario.lane_search import LaneSearch
-from drivax.scenario.lanes import LaneSegments, lane_graph
-from drivax.scenario.route_published import LEAST_M, published_ways, score
-from drivax.scenario.route_start import join
-from drivax.scenario.routes import Intent, Route, RouteStyle, find_routes, log_progress
+from drivax.scenario.build.assemble import ego_log
+from drivax.scenario.build.lane_paths import trace
+from drivax.scenario.build.lane_search import LaneSearch
+from drivax.scenario.build.lanes import LaneSegments, lane_graph
+from drivax.scenario.build.route_published import LEAST_M, published_ways, score
+from drivax.scenario.build.route_start import join
+from drivax.scenario.build.routes import Intent, Route, RouteStyle, find_routes, log_progress
+from drivax.scenario.build.segments import cut, road_lines
+from drivax.scenario.build.tracks import local_tracks
 from drivax.scenario.schema import RoadKind
-from drivax.scenario.segments import cut, road_lines
 
 from .recordings import arc, driving, lane, line, make_tracks
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.datasets.restore import restore
+from drivax.datasets.export.restore import restore
 from drivax.errors import DataError
-from drivax.scenario.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble, windows, with_ego
 from scenario.recordings import driving, make_recording, make_tracks, straight_road
 
 

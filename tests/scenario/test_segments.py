@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.geometry.polylines import arc_lengths
+from drivax.scenario.build.segments import cut, inside_box, path_distance, road_lines, thin_path
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
-from drivax.scenario.segments import cut, inside_box, path_distance, road_lines, thin_path
 
 from .recordings import FAR, arc, edge, lane, line
 

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.errors import UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.manifest import manifest_entry
 from drivax.scenario.schema import CAPACITIES, Flag
-from drivax.scenario.selection import FINDINGS, OVERFLOWS, Selection, vocabulary
+from drivax.scenario.select.filters import FINDINGS, OVERFLOWS, Selection, vocabulary
 from scenes import GREEN, car, straight_road
 
 ENTRY = {

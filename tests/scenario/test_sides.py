@@ -5,10 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.grid import Grid
+from drivax.scenario.build.grid import Grid
+from drivax.scenario.build.segments import cut, road_lines
+from drivax.scenario.build.sides import CUTOFF_M, DRIVABLE, SPLIT, cell_sides, packed
 from drivax.scenario.schema import CAPACITIES
-from drivax.scenario.segments import cut, road_lines
-from drivax.scenario.sides import CUTOFF_M, DRIVABLE, SPLIT, cell_sides, packed
 
 from .recordings import edge, line
 

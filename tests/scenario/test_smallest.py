@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from drivax.scenario.smallest import first_smallest, number_of, numbered
+from drivax.scenario.bank.smallest import first_smallest, number_of, numbered
 
 smallest = jax.jit(first_smallest, static_argnames=("axis", "least"))
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.errors import UsageError
-from drivax.scenario.splits import NAMES, parse_shares, split_of, write_splits
+from drivax.scenario.select.splits import NAMES, parse_shares, split_of, write_splits
 
 
 def entries(recordings: int, windows: int = 3) -> list[dict[str, str]]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.partial import begun
+from drivax.files import begun
 from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Flag, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.scenario.assemble import assemble
-from drivax.scenario.lanes import lane_graph
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.build.lanes import lane_graph
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
-from drivax.scenario.tags import TAGS, junction_lanes
+from drivax.scenario.select.tags import TAGS, junction_lanes
 
 from .recordings import arc, driving, lane, light, line, make_recording, make_tracks, straight_road
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.agent_paths import PATH_POINTS, AgentPaths
-from drivax.simulator.corridor import FREE_M, SIDE_M, Movers, leaders
+from drivax.simulator.traffic.agent_paths import PATH_POINTS, AgentPaths
+from drivax.simulator.traffic.corridor import FREE_M, SIDE_M, Movers, leaders
 from drivax.simulator.types import Frame
 
 RADIUS, BEFORE, LENGTH = 8.0, 20.0, 180.0

@@ -8,12 +8,12 @@ import pytest
 
 from drivax.evaluation.rollout import drive, judging
 from drivax.planners.simple import ConstantVelocity
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.simulator import situation
-from drivax.simulator.catalogue import make_traffic, prepared
-from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.override import OverrideTraffic, with_given
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.rollout import judging
-from drivax.simulator.catalogue import prepared
-from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.log import alone
+from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import DELTA_LOCAL, DIRECT_STATE, PHYSICAL, PUBLISHED, Physical
 from drivax.tasks.task import Task
 from scenes import RED, bank_of, car, straight_road

@@ -10,7 +10,7 @@ import pytest
 
 from drivax.evaluation.rollout import drive
 from drivax.planners.simple import ConstantVelocity
-from drivax.scenario.bank import AGENT_Z
+from drivax.scenario.bank.scenario_bank import AGENT_Z
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 from drivax.simulator.simulator import Simulator

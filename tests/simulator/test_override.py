@@ -10,12 +10,12 @@ import pytest
 from drivax.errors import UsageError
 from drivax.metrics.episode import episode_metrics
 from drivax.scenario.schema import AgentKind
-from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.contact import CollisionType
-from drivax.simulator.override import OverrideTraffic, motions_of_actions, with_given
-from drivax.simulator.reactive import IdmTraffic
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import LogTraffic, alone
+from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.log import LogTraffic, alone
+from drivax.simulator.traffic.override import OverrideTraffic, motions_of_actions, with_given
+from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road
 
@@ -139,7 +139,7 @@ def test_a_bank_that_tells_nobody_what_to_do_is_refused(bank):
 
 def test_traffic_is_found_by_name(bank):
     assert isinstance(make_traffic("log"), LogTraffic) and isinstance(make_traffic("idm"), IdmTraffic)
-    assert isinstance(make_traffic("drivax.simulator.reactive:IdmTraffic"), IdmTraffic)
+    assert isinstance(make_traffic("drivax.simulator.traffic.reactive:IdmTraffic"), IdmTraffic)
     assert prepared(LogTraffic(), bank) is bank
     for name, words in (("idn", "there is no traffic"), ("drivax.tasks.task:Task", "makes no traffic")):
         with pytest.raises(UsageError, match=words):

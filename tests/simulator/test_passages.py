@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from drivax.planners.simple import logged_motion
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, STEPS, RoadKind
 from drivax.simulator.simulator import Simulator
-from drivax.synthetic.families.highway import Highway
-from drivax.synthetic.families.lane_drop import LaneDrop
-from drivax.synthetic.roads import map_features
+from drivax.synthetic.roads.families.highway import Highway
+from drivax.synthetic.roads.families.lane_drop import LaneDrop
+from drivax.synthetic.roads.network import map_features
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task
 from metric_scenes import two_way_road

@@ -9,7 +9,7 @@ import pytest
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners, overlap
-from drivax.scenario.queries import OFFROAD_TOLERANCE_M, around_lanes, offroad_distance
+from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, offroad_distance
 from drivax.simulator.potentials import collision_potential, offroad_potential, separation
 from drivax.simulator.types import Frame
 from scenes import bank_of, car, straight_road

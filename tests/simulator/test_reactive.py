@@ -9,13 +9,20 @@ import numpy as np
 import pytest
 
 from drivax.errors import UsageError
-from drivax.scenario.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, PATH_X, PATH_Y, PROFILE_SPEED
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, LightState
 from drivax.simulator.idm import IdmParameters
-from drivax.simulator.reactive import DRIVES, LEFT, REPLAYS, WAITS, IdmTraffic
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.agent_paths import (
+    PATH_COS,
+    PATH_POINTS,
+    PATH_SIN,
+    PATH_X,
+    PATH_Y,
+    PROFILE_SPEED,
+)
+from drivax.simulator.traffic.log import alone
+from drivax.simulator.traffic.reactive import DRIVES, LEFT, REPLAYS, WAITS, IdmTraffic
 from drivax.tasks.task import Task
 from scenes import GREEN, RED, SMALL, bank_of, car, straight_road
 from traffic_oracle import compare

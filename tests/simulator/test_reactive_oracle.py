@@ -9,9 +9,9 @@ from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.geometry.boxes import overlap
 from drivax.planners.simple import ConstantVelocity
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
-from drivax.simulator.reactive import DRIVES, WAITS
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
+from drivax.simulator.traffic.reactive import DRIVES, WAITS
 from drivax.synthetic.world import generate_recording
 from traffic_oracle import SIMULATOR, TRAFFIC, Path, compare, meetings, rolled, runs_of
 

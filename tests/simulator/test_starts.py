@@ -11,14 +11,14 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import corners, overlap
 from drivax.learning.config import TrainConfig
 from drivax.planners.simple import ConstantVelocity, Expert
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN
+from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN
+from drivax.scenario.build.assemble import assemble
 from drivax.settings import dump, load, parse_yaml
 from drivax.simulator.contact import Contact
 from drivax.simulator.dynamics import GRIP_MPS2, command_between
-from drivax.simulator.override import OverrideTraffic, with_given
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
+from drivax.simulator.traffic.override import OverrideTraffic, with_given
 from drivax.tasks.task import Task
 from scenes import LANE_M, SMALL, bank_of, car, straight_road
 

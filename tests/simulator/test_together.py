@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.bank import AGENT_VALID
-from drivax.simulator.reactive import IdmTraffic
+from drivax.scenario.bank.scenario_bank import AGENT_VALID
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.together import is_driven, slots_of
+from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road

@@ -10,16 +10,16 @@ import pytest
 
 from drivax import settings
 from drivax.cli import main
-from drivax.curation.agents import AGENTS, CURATED, weighted
+from drivax.curation.arms import AGENTS, CURATED, weighted
 from drivax.curation.methods import Wanted, curate
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draws_of
 from drivax.errors import UsageError
-from drivax.evaluation.crossed import Crossed
-from drivax.evaluation.hypotheses import holm
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.stats.seeds import Crossed
+from drivax.stats.significance import holm
 from drivax.studies import longtail
 from drivax.studies.longtail_plan import LongtailConfig, Sets
 from drivax.studies.longtail_rankings import rankings

@@ -8,16 +8,16 @@ import math
 import numpy as np
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.cast import Cast, Motion, Scripted
-from drivax.synthetic.curves import Pose, straight, turn
-from drivax.synthetic.drafting import Draft
-from drivax.synthetic.drivers import Drivers
 from drivax.synthetic.events import (
     EventKind,
 )
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.roads import Control, Line, RoadNetwork
-from drivax.synthetic.signals import LightGroup, SignalPlan
+from drivax.synthetic.roads.curves import Pose, straight, turn
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.network import Control, Line, RoadNetwork
+from drivax.synthetic.roads.signals import LightGroup, SignalPlan
+from drivax.synthetic.traffic.drivers import Drivers
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.roles import Cast, Motion, Scripted
 
 FIRST, STEPS = 60, 151
 CURRENT = FIRST + 10

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.cast import Cast, EgoPlan, Motion
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.expert import drawn_expert
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.roads import Lane, Line, RoadNetwork
+from drivax.synthetic.expert.driver import drawn_expert
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.network import Lane, Line, RoadNetwork
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion
 
 WIDTH, LENGTH, LIMIT = 3.5, 400.0, 14.0
 CAR = (4.6, 1.9, 1.5)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivax.synthetic.aims import (
+from drivax.synthetic.events.destinations import (
     Aim,
     AimedWay,
     aimed_way,
@@ -16,11 +16,11 @@ from drivax.synthetic.aims import (
     open_road,
     rearranged,
 )
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.drafting import Draft
-from drivax.synthetic.population import Placement
-from drivax.synthetic.roads import Control, RoadNetwork, Start
-from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.network import Control, RoadNetwork, Start
+from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
+from drivax.synthetic.traffic.population import Placement
 
 LIMIT = 10.0
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.claims import HARD_M, NEAR_M, NEAR_PEOPLE_M, arrivals, meetings, walls
-from drivax.synthetic.curves import Pose
-from drivax.synthetic.faults import user_boxes
-from drivax.synthetic.roads import Control
-from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
-from drivax.synthetic.ways import SPACING_M, Shift, shifted_way
+from drivax.synthetic.expert.reservations import HARD_M, NEAR_M, NEAR_PEOPLE_M, arrivals, meetings, walls
+from drivax.synthetic.expert.trajectories import SPACING_M, Shift, shifted_way
+from drivax.synthetic.expert.violations import user_boxes
+from drivax.synthetic.roads.curves import Pose
+from drivax.synthetic.roads.network import Control
+from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
 
 from .oracles import box_corners, shared_area
 from .staged_scenes import CAR, TIMES, crossed, road, scene, user

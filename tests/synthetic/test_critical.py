@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import CURRENT_STEP, STEPS
-from drivax.synthetic.critical import critical_steps
-from drivax.synthetic.roads import Control
-from drivax.synthetic.signals import Colour
+from drivax.synthetic.events.conflict_start import critical_steps
+from drivax.synthetic.roads.network import Control
+from drivax.synthetic.roads.signals import Colour
 
 from .traffic_scenes import crossroads, run, twins
 

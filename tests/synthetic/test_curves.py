@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.curves import (
+from drivax.synthetic.roads.curves import (
     STEP_M,
     Curve,
     Pose,

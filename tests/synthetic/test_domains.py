@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.synthetic.domains import DOMAINS
-from drivax.synthetic.families import FAMILIES
+from drivax.synthetic.roads.families import FAMILIES
 
 NAMES = {family.name for family in FAMILIES}
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.cast import Scripted, Staging
 from drivax.synthetic.events import (
     SEVERITY_MPS2,
     EventKind,
@@ -20,9 +19,10 @@ from drivax.synthetic.events import (
     possible,
     threatens,
 )
+from drivax.synthetic.events.adversary import in_its_cross_way, required_deceleration, waiting_room
 from drivax.synthetic.events.leading import leader_requires
 from drivax.synthetic.events.merging import cut_in_gap
-from drivax.synthetic.events.threat import in_its_cross_way, required_deceleration, waiting_room
+from drivax.synthetic.traffic.roles import Scripted, Staging
 
 from .event_scenes import (
     FIRST,

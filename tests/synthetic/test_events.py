@@ -9,7 +9,6 @@ import pytest
 from drivax.geometry.boxes import overlap
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.idm import IdmParameters, idm_acceleration
-from drivax.synthetic.cast import Cast, Override, Scripted, Staging, Tailgate
 from drivax.synthetic.events import (
     SCRIPTS,
     SEVERITY_MPS2,
@@ -18,9 +17,10 @@ from drivax.synthetic.events import (
     drawn_severity,
     stage,
 )
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.population import Density, drawn_drivers
-from drivax.synthetic.traffic import Traffic
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.population import Density, drawn_drivers
+from drivax.synthetic.traffic.roles import Cast, Override, Scripted, Staging, Tailgate
+from drivax.synthetic.traffic.simulation import Traffic
 
 from .event_scenes import FIRST, STEPS, junction, occasion, road, scene
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.synthetic import expert
-from drivax.synthetic.cast import Override, Staging
-from drivax.synthetic.expert import drawn_expert, drive, expert_lanes, expert_path
-from drivax.synthetic.families import CurvedRoad
-from drivax.synthetic.faults import touching, user_boxes
-from drivax.synthetic.roads import Control
-from drivax.synthetic.style import GRID
+from drivax.synthetic.expert import driver as expert
+from drivax.synthetic.expert.driver import drawn_expert, drive, expert_lanes, expert_path
+from drivax.synthetic.expert.violations import touching, user_boxes
+from drivax.synthetic.roads.families import CurvedRoad
+from drivax.synthetic.roads.network import Control
+from drivax.synthetic.roads.style import GRID
+from drivax.synthetic.traffic.roles import Override, Staging
 
 from .staged_scenes import CAR, TIMES, crossed, driven, road, scene, user
 

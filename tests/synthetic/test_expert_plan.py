@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.cast import Override, Staging
-from drivax.synthetic.comfort import discomfort
-from drivax.synthetic.curves import Pose, joined, resampled, straight, turn
-from drivax.synthetic.expert_plan import plan_ego
-from drivax.synthetic.faults import fault
-from drivax.synthetic.roads import Control
-from drivax.synthetic.signals import LightGroup, SignalPlan
+from drivax.synthetic.expert.comfort import discomfort
+from drivax.synthetic.expert.plan import plan_ego
+from drivax.synthetic.expert.violations import fault
+from drivax.synthetic.roads.curves import Pose, joined, resampled, straight, turn
+from drivax.synthetic.roads.network import Control
+from drivax.synthetic.roads.signals import LightGroup, SignalPlan
+from drivax.synthetic.traffic.roles import Override, Staging
 
 from .staged_scenes import CAR, TIMES, WIDTH, crossed, driven, road, scene, user
 

@@ -9,10 +9,10 @@ import pytest
 import shapely
 
 from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, LANE_KINDS, RoadKind
-from drivax.synthetic.families import FAMILIES
-from drivax.synthetic.paths import random_lanes
-from drivax.synthetic.roads import Control, map_features
-from drivax.synthetic.style import GRID, RING
+from drivax.synthetic.roads.families import FAMILIES
+from drivax.synthetic.roads.network import Control, map_features
+from drivax.synthetic.roads.style import GRID, RING
+from drivax.synthetic.traffic.paths import random_lanes
 
 from .oracles import box_corners, signed_area, winding_number
 from .pursuit import covering_routes, driven

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.audit import audit
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.cast import Staging
-from drivax.synthetic.families import CurvedRoad, SignalisedJunction
-from drivax.synthetic.faults import (
+from drivax.synthetic.expert.violations import (
     against_traffic,
     fault,
     goes_against_traffic,
@@ -21,10 +19,12 @@ from drivax.synthetic.faults import (
     touching,
     user_boxes,
 )
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.roads import Control
-from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
-from drivax.synthetic.style import GRID
+from drivax.synthetic.roads.families import CurvedRoad, SignalisedJunction
+from drivax.synthetic.roads.network import Control
+from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
+from drivax.synthetic.roads.style import GRID
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.roles import Staging
 from drivax.synthetic.world import WorldConfig, generate_recording
 
 from .oracles import box_corners, shared_area, winding_number

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import Capacity, RoadKind
-from drivax.synthetic.families.all_way_stop import AllWayStop
-from drivax.synthetic.families.corridor import Corridor
-from drivax.synthetic.families.junction import CrossSection, Geometry
-from drivax.synthetic.families.signalised_junction import SignalisedJunction
-from drivax.synthetic.families.t_junction import TJunction
-from drivax.synthetic.families.unprotected_left import UnprotectedLeft
-from drivax.synthetic.population import Density, placed
-from drivax.synthetic.roads import CLEARANCE_M, Control, map_features
-from drivax.synthetic.signals import Colour
-from drivax.synthetic.style import GRID, RING
+from drivax.synthetic.roads.families.all_way_stop import AllWayStop
+from drivax.synthetic.roads.families.corridor import Corridor
+from drivax.synthetic.roads.families.junction import CrossSection, Geometry
+from drivax.synthetic.roads.families.signalised_junction import SignalisedJunction
+from drivax.synthetic.roads.families.t_junction import TJunction
+from drivax.synthetic.roads.families.unprotected_left import UnprotectedLeft
+from drivax.synthetic.roads.network import CLEARANCE_M, Control, map_features
+from drivax.synthetic.roads.signals import Colour
+from drivax.synthetic.roads.style import GRID, RING
+from drivax.synthetic.traffic.population import Density, placed
 
 from .oracles import distance_to_polyline, winding_number
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from drivax.simulator.idm import IdmParameters, idm_acceleration
-from drivax.synthetic.cast import Override, Staging
-from drivax.synthetic.lane_changes import LaneChains, LaneChanges, Situation
-from drivax.synthetic.obstacles import Boxes
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.roads import RoadNetwork
-from drivax.synthetic.tables import PathTables
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.lane_changes import LaneChains, LaneChanges, Situation
+from drivax.synthetic.traffic.obstacles import Boxes
+from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.roles import Override, Staging
 
 from .traffic_scenes import drivers, road, run
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.leaders import Leaders
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.tables import PathTables
+from drivax.synthetic.traffic.leaders import Leaders
+from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.paths import Sway, lane_path
 
 from .traffic_scenes import drivers, road
 

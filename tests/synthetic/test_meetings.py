@@ -6,10 +6,10 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from drivax.synthetic.families import FAMILIES
-from drivax.synthetic.meetings import giving_way, met_on, with_feeders
-from drivax.synthetic.paths import LaneChange, Sway, lane_path
-from drivax.synthetic.roads import Control
+from drivax.synthetic.roads.families import FAMILIES
+from drivax.synthetic.roads.network import Control
+from drivax.synthetic.traffic.conflicts import giving_way, met_on, with_feeders
+from drivax.synthetic.traffic.paths import LaneChange, Sway, lane_path
 
 from .traffic_scenes import crossroads, road
 

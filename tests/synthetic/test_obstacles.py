@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.cast import Scripted, Staging
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.lateral import around, change_onto, displaced, quintic_step
-from drivax.synthetic.obstacles import Boxes, Standing, extents
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.roads import Line, RoadKind, RoadNetwork
-from drivax.synthetic.scripted import boxes_at
-from drivax.synthetic.tables import PathTables
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.network import Line, RoadKind, RoadNetwork
+from drivax.synthetic.traffic.lateral import around, change_onto, displaced, quintic_step
+from drivax.synthetic.traffic.obstacles import Boxes, Standing, extents
+from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.roles import Scripted, Staging
+from drivax.synthetic.traffic.scripted import boxes_at
 
 from .oracles import box_corners, distance_to_polyline, shared_area
 from .traffic_scenes import drivers, road, run

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.drafting import Draft
-from drivax.synthetic.parking import parked_cars
-from drivax.synthetic.roads import Bay, RoadNetwork
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.network import Bay, RoadNetwork
+from drivax.synthetic.traffic.parking import parked_cars
 
 
 def street(width=3.5, oncoming=True):

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.curves import STEP_M, joined
-from drivax.synthetic.families import CurvedRoad, SignalisedJunction
-from drivax.synthetic.paths import LaneChange, Sway, lane_path, random_lanes
+from drivax.synthetic.roads.curves import STEP_M, joined
+from drivax.synthetic.roads.families import CurvedRoad, SignalisedJunction
+from drivax.synthetic.traffic.paths import LaneChange, Sway, lane_path, random_lanes
 
 from .oracles import distance_to_polyline
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.cast import Scripted
-from drivax.synthetic.curves import Pose
-from drivax.synthetic.families import CurvedRoad
-from drivax.synthetic.population import Density, drawn_drivers, driven_path, joined_drivers, placed
+from drivax.synthetic.roads.curves import Pose
+from drivax.synthetic.roads.families import CurvedRoad
+from drivax.synthetic.traffic.population import Density, drawn_drivers, driven_path, joined_drivers, placed
+from drivax.synthetic.traffic.roles import Scripted
 
 from .traffic_scenes import drivers, road
 

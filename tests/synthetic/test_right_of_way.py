@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.cast import EgoPlan
-from drivax.synthetic.right_of_way import conflict_zones, time_to_cover
-from drivax.synthetic.roads import CLEARANCE_M, Control
+from drivax.synthetic.roads.network import CLEARANCE_M, Control
+from drivax.synthetic.traffic.right_of_way import conflict_zones, time_to_cover
+from drivax.synthetic.traffic.roles import EgoPlan
 
 from .traffic_scenes import crossroads, drivers, entered, run, twins
 

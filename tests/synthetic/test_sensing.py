@@ -6,7 +6,7 @@ import shapely
 
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
-from drivax.synthetic.faults import touching
+from drivax.synthetic.expert.violations import touching
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, visible
 
 SENSOR = SensorConfig()

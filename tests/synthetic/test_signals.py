@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import LightState
-from drivax.synthetic.families import SignalisedJunction
-from drivax.synthetic.signals import (
+from drivax.synthetic.roads.families import SignalisedJunction
+from drivax.synthetic.roads.signals import (
     Colour,
     LightGroup,
     SignalPlan,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import LinearConstraint, minimize
 
-from drivax.synthetic import smoothing
-from drivax.synthetic.smoothing import Bounds, smoothed
+from drivax.synthetic.expert import smoothing
+from drivax.synthetic.expert.smoothing import Bounds, smoothed
 
 
 def bounds(steps, low=-np.inf, high=np.inf, top=40.0, acceleration=(-6.0, 2.3), jerk=25.0):

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from drivax.synthetic import speed_search
-from drivax.synthetic.speed_search import COARSE, Claims, search
+from drivax.synthetic.expert import speed_search
+from drivax.synthetic.expert.speed_search import COARSE, Claims, search
 
 STEPS = 40  # 4 s
 

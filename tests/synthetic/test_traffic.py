@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.cast import Cast, EgoPlan, Override, Scripted, Staging, Walker
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.drafting import Draft
-from drivax.synthetic.families import FAMILIES, CurvedRoad
-from drivax.synthetic.paths import Sway, lane_path, random_lanes
-from drivax.synthetic.population import Density, drawn_drivers, driven_path, placed
-from drivax.synthetic.roads import Crossing, RoadNetwork
-from drivax.synthetic.signals import LightGroup, SignalPlan
-from drivax.synthetic.tables import speed_profile
-from drivax.synthetic.traffic import Traffic
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.families import FAMILIES, CurvedRoad
+from drivax.synthetic.roads.network import Crossing, RoadNetwork
+from drivax.synthetic.roads.signals import LightGroup, SignalPlan
+from drivax.synthetic.traffic.path_arrays import speed_profile
+from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
+from drivax.synthetic.traffic.population import Density, drawn_drivers, driven_path, placed
+from drivax.synthetic.traffic.roles import Cast, EgoPlan, Override, Scripted, Staging, Walker
+from drivax.synthetic.traffic.simulation import Traffic
 
 from . import traffic_scenes
 from .oracles import box_corners, shared_area

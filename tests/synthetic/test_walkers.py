@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.cast import Walker
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.drafting import Draft
-from drivax.synthetic.obstacles import Boxes
-from drivax.synthetic.roads import Control, Crossing, RoadNetwork
-from drivax.synthetic.signals import Colour, LightGroup, SignalPlan
-from drivax.synthetic.walkers import Walkers, placed_walkers
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
+from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
+from drivax.synthetic.traffic.obstacles import Boxes
+from drivax.synthetic.traffic.pedestrians import Walkers, placed_walkers
+from drivax.synthetic.traffic.roles import Walker
 
 TIMES = (np.arange(151) - 60) * 0.1
 CAR = np.array([[4.6, 1.9, 1.6]])

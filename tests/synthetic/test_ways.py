@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.synthetic.curves import Pose, joined, resampled, straight, turn
-from drivax.synthetic.ways import SPACING_M, Shift, shifted_way, way_boxes, way_corners
+from drivax.synthetic.expert.trajectories import SPACING_M, Shift, shifted_way, way_boxes, way_corners
+from drivax.synthetic.roads.curves import Pose, joined, resampled, straight, turn
 
 from .oracles import distance_to_polyline
 from .staged_scenes import CAR, road, scene

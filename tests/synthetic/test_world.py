@@ -12,11 +12,11 @@ import pytest
 from drivax.errors import UsageError
 from drivax.scenario.schema import CURRENT_STEP, EDGE_KINDS, STEPS, AgentKind, Flag, LightState
 from drivax.synthetic import world
-from drivax.synthetic.critical import critical_steps
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import SEVERITY_MPS2, EventKind
+from drivax.synthetic.events.conflict_start import critical_steps
+from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig
-from drivax.synthetic.signals import Colour
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one, generate_recording
 
 from .oracles import box_corners, shared_area, winding_number

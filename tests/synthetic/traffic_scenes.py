@@ -8,13 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivax.synthetic.cast import Cast
-from drivax.synthetic.curves import Pose, straight
-from drivax.synthetic.drafting import Draft
-from drivax.synthetic.paths import Sway, lane_path
-from drivax.synthetic.population import Density, drawn_drivers
-from drivax.synthetic.roads import RoadNetwork
-from drivax.synthetic.traffic import Traffic
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.population import Density, drawn_drivers
+from drivax.synthetic.traffic.roles import Cast
+from drivax.synthetic.traffic.simulation import Traffic
 
 CARS = Density(van_share=0.0, truck_share=0.0, bus_share=0.0, cyclist_share=0.0)
 

@@ -12,7 +12,7 @@ import pytest
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.scenario.queries import LaneHits, RouteHit
+from drivax.scenario.bank.queries import LaneHits, RouteHit
 from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Surroundings
 from drivax.tasks.rewards import (
     AGGRESSIVE,

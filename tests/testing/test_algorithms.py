@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import own_terms
-from drivax.learning.ppo import PpoConfig
+from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.simple import ConstantVelocity, RandomActions

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 import own_terms
-from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.testing import BrokenContract, check_traffic
 
 count = itertools.count()

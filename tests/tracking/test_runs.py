@@ -15,8 +15,8 @@ import pytest
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
-from drivax.tracking import runs
-from drivax.tracking.runs import RunFolder
+from drivax.tracking import run_folder as runs
+from drivax.tracking.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

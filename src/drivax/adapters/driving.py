@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float
 from drivax.errors import DrivaxError
 from drivax.metrics.episode import episode_metrics
 from drivax.metrics.scores import Value
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator

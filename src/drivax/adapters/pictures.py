@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
+from drivax.report.pictures.still import draw_scenario
 from drivax.scenario.schema import Scenario
-from drivax.show.scene import draw_scenario
 from drivax.simulator.types import Scene
 
 

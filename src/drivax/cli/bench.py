@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from drivax import settings
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
 from drivax.studies.bench_encoders import EncoderBench, bench_encoders

@@ -14,7 +14,7 @@ from drivax.datasets.convert import Conversion, Converted, Plan, convert
 from drivax.datasets.estimate import counted
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.scenario.partial import begun
+from drivax.files import begun
 from drivax.tracking.progress import Progress
 
 _SHOWN = 20

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from drivax.api import find_planner, load
-from drivax.evaluation.runs import (
+from drivax.evaluation.run_evaluation import (
     EvaluationConfig,
     format_crashes,
     format_metrics,

@@ -13,7 +13,7 @@ import tyro
 
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.scenario.splits import parse_shares, write_splits
+from drivax.scenario.select.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import load
 from drivax.synthetic.benchmark import BENCHMARK_VERSION, generate_benchmark

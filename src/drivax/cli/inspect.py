@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from drivax.evaluation.observation_statistics import ObservationStatistics
-    from drivax.show.inspection import Inspection
+    from drivax.report.inspection import Inspection
 
 _COLUMNS = 100
 #: Scenarios that --observations drives, evenly spread over those that are selected.
@@ -59,8 +59,8 @@ class Inspect:
 def run(args: Inspect) -> int:
     """Test the sets, then print them as tables or as JSON, or write a page."""
     from drivax.errors import UsageError
-    from drivax.scenario.selection import Selection
-    from drivax.show.inspection import Inspection, described
+    from drivax.report.inspection import Inspection, described
+    from drivax.scenario.select.filters import Selection
 
     if not args.sets:
         raise UsageError("no scenario set is named", cure="write drivax inspect SET")
@@ -77,7 +77,7 @@ def run(args: Inspect) -> int:
         json.dump(found[0] if len(found) == 1 else named, sys.stdout, indent=1)
         print()
     elif args.html is not None:
-        from drivax.show.histograms import write_histograms
+        from drivax.report.pages.inspection import write_histograms
 
         print(write_histograms(opened, args.html, args.overwrite))
     else:
@@ -87,7 +87,7 @@ def run(args: Inspect) -> int:
 
 def _print(opened: list[Inspection]) -> None:
     """One set in full, or several side by side."""
-    from drivax.show import inspection_tables as tables
+    from drivax.report import inspection_tables as tables
 
     console = _console()
     if len(opened) > 1:
@@ -137,8 +137,8 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.learning.config import TrainConfig
     from drivax.learning.policy_traffic import find_traffic
     from drivax.planners.simple import Expert
-    from drivax.scenario.bank import ScenarioBank
-    from drivax.show.observation_view import draw_moment
+    from drivax.report.pictures.observation import draw_moment
+    from drivax.scenario.bank.scenario_bank import ScenarioBank
 
     scenarios = list(inspection.sample(_OBSERVED))
     bank = ScenarioBank.from_scenarios(scenarios)
@@ -161,7 +161,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
 
 
 def _print_observations(found: ObservationStatistics) -> None:
-    from drivax.show import observation_tables as tables
+    from drivax.report import observation_tables as tables
 
     console = _console()
     console.print(tables.observation_overview(found))

@@ -13,7 +13,7 @@ import tyro
 
 from drivax import settings
 from drivax.cli.curate import scored
-from drivax.curation.agents import AGENTS, Agent, weighted
+from drivax.curation.arms import AGENTS, Agent, weighted
 from drivax.curation.methods import Wanted, refuse_stale
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, weights_of

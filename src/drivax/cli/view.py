@@ -38,9 +38,9 @@ def run(args: View) -> int:
     """Write the page and say where it is and what it leaves out."""
     from drivax.curation.scores import read_scores
     from drivax.curation.subset import top_rows
+    from drivax.report.pages.criticality import criticality_html
+    from drivax.report.pages.viewer import select, write_player
     from drivax.scenario.store import ScenarioSet
-    from drivax.show.criticality import criticality_html
-    from drivax.viewer.player import select, write_player
 
     data = ScenarioSet.open(args.set)
     folder = args.set.resolve()

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.errors import UsageError
-from drivax.named import nearest
+from drivax.plugins import nearest
 
 Steps = Float[np.ndarray[Any, Any], "N T"]
 Valid = Bool[np.ndarray[Any, Any], "N T"]

@@ -33,8 +33,8 @@ from drivax.errors import UsageError
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
 from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, filter_operator
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
+from drivax.scenario.bank.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
 from drivax.simulator.types import Frame

@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import norm
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank import AGENT_VALID, AGENT_Z, ScenarioBank
-from drivax.scenario.queries import project_on_route
+from drivax.scenario.bank.queries import project_on_route
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.contact import overlaps
-from drivax.simulator.traffic import alone, frame_of
+from drivax.simulator.traffic.log import alone, frame_of
 from drivax.simulator.types import HISTORY, Frame, Scene
 
 #: Row of ``bank.routes`` that holds the log's own way.

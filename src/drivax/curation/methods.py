@@ -14,18 +14,18 @@ import numpy as np
 
 from drivax.curation.combining import Combination
 from drivax.curation.controls import event_steps, matched
+from drivax.curation.ensemble import Scouts, ScoutsConfig, train_scouts
 from drivax.curation.kinematic import KinematicConfig
 from drivax.curation.published import PublishedConfig
-from drivax.curation.ranking import rank_correlation
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.scoring import Progress, score_steps, valid_steps
-from drivax.curation.scouts import Scouts, ScoutsConfig, train_scouts
 from drivax.errors import DataError, UsageError
-from drivax.named import nearest
 from drivax.networks.distributions import Actions
+from drivax.plugins import nearest
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
+from drivax.stats.ranking import rank_correlation
 
 #: The kinematic heuristic. A scenario is as critical as its most critical second. Weights and the second were chosen on
 #: the validation set of the built-in world's benchmark (docs/results/curation.md).

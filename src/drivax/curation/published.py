@@ -20,8 +20,8 @@ from drivax.curation.kinematic import check_positive, crowding
 from drivax.curation.logged import Logged
 from drivax.geometry.angles import wrap
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import vertex_distances
+from drivax.scenario.bank.queries import vertex_distances
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S
 from drivax.simulator.types import Frame
 

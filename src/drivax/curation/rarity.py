@@ -19,7 +19,7 @@ from drivax.curation.kinematic import check_positive
 from drivax.curation.logged import Logged
 from drivax.errors import DataError, UsageError
 from drivax.planners.simple import expert_action
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.tasks.actions import Physical
 
 Actions = Float[np.ndarray[Any, Any], "n 2"]

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from drivax.curation.combining import Combination, aggregate
 from drivax.errors import DataError, UsageError
-from drivax.scenario.partial import sync_folder
+from drivax.files import sync_folder
 from drivax.scenario.store import ScenarioSet
 
 SCORES_VERSION = 3

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from drivax.curation.scores import OWN_SCORES, ScoreTable, write_scores
-from drivax.datasets.export import Exported, refuse_part, write_part
+from drivax.datasets.export.subset import Exported, refuse_part, write_part
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import recordings_of
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.stats.clusters import recordings_of
 
 
 def check_top(
@@ -57,7 +57,7 @@ def part_of_table(table: ScoreTable, rows: Sequence[int], part: ScenarioSet) -> 
     Args:
         table: Scores of the whole set.
         rows: Which of them, in the order of the part.
-        part: The part, as :func:`~drivax.datasets.export.write_part` writes it.
+        part: The part, as :func:`~drivax.datasets.export.subset.write_part` writes it.
     """
     chosen = list(rows)
     told = part.manifest["source"]["part_of"]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from drivax.curation.scores import ScoreTable
 from drivax.errors import UsageError
-from drivax.evaluation.statistics import effective_size
+from drivax.stats.intervals import effective_size
 
 Scale = Literal["step", "scenario"]
 Array = np.ndarray[Any, Any]

@@ -25,7 +25,7 @@ from drivax.datasets.spool import converted_ahead
 from drivax.errors import DataError
 from drivax.scenario.manifest import manifest_entry
 from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Scenario
-from drivax.scenario.selection import Selection
+from drivax.scenario.select.filters import Selection
 from drivax.scenario.store import ScenarioWriter
 
 __all__ = ["Conversion", "Converted", "Plan", "convert", "convert_file"]

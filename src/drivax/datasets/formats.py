@@ -11,16 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivax.datasets import unsupported
-from drivax.datasets.argoverse_motion import ArgoverseMotion
-from drivax.datasets.argoverse_sensor import ArgoverseSensor
+from drivax.datasets.argoverse.motion import ArgoverseMotion
+from drivax.datasets.argoverse.sensor import ArgoverseSensor
 from drivax.datasets.gpudrive import GpuDrive
-from drivax.datasets.nuplan import NuPlan
-from drivax.datasets.nuscenes import NuScenes
+from drivax.datasets.nuplan.reader import NuPlan
+from drivax.datasets.nuscenes.reader import NuScenes
 from drivax.datasets.reader import Reader
 from drivax.datasets.scenariomax import ScenarioMax
-from drivax.datasets.scenarionet import ScenarioNet
-from drivax.datasets.womd_example import WomdExample
-from drivax.datasets.womd_scenario import WomdScenario
+from drivax.datasets.scenarionet.reader import ScenarioNet
+from drivax.datasets.womd.example_reader import WomdExample
+from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
 
 #: Every reader; a new format is one module and one entry here. Files are shown to them in this order, so those that

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.geometry.polylines import Polylines, cut_counts
-from drivax.scenario.agents import DEFAULT_SIZES
+from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import MapFeature, Tracks
 from drivax.scenario.schema import AgentKind
 

@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets import readings, tf_example, womd
+from drivax.datasets import readings
 from drivax.datasets.reader import BadRecord, Description
-from drivax.datasets.tfrecord import count_records
+from drivax.datasets.womd import records as womd
+from drivax.datasets.womd import tf_example
+from drivax.datasets.womd.tfrecord import count_records
 from drivax.scenario.recording import Light, Recording, Tracks
 from drivax.scenario.schema import Flag, LightState
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from drivax.datasets.tfrecord import read_records
+from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
 from drivax.scenario.manifest import MANIFEST
 

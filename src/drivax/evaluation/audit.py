@@ -1,6 +1,6 @@
 """The audit: a log replayed through the metrics. Whatever the expert does wrong is a defect of map or converter.
 
-Steps at which the log does not know the ego are judged by nobody; :data:`~drivax.scenario.selection.FINDINGS` says
+Steps at which the log does not know the ego are judged by nobody; :data:`~drivax.scenario.select.filters.FINDINGS` says
 what each finding means.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from drivax.planners.simple import expert_action, logged_motion
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import Facts, Frame, Scene, SimState, Situation, Surroundings

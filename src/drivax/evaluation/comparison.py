@@ -17,10 +17,14 @@ from jaxtyping import Bool, Float64
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import defined, design_effect
-from drivax.evaluation.crossed import Crossed, agents_interval, difference_interval
 from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, judged
-from drivax.evaluation.effects import (
+from drivax.evaluation.plan import ComparisonPlan
+from drivax.evaluation.results import RATES, SHARES, interval_of
+from drivax.evaluation.split import Split, assign, strata_of
+from drivax.evaluation.stored import EpisodeTable, Pairs
+from drivax.evaluation.unmatched import refuse_metric, refuse_misfits, refuse_undefined
+from drivax.stats.clusters import defined, design_effect
+from drivax.stats.effects import (
     ROUNDING,
     cohens_d,
     cohens_d_paired,
@@ -29,7 +33,9 @@ from drivax.evaluation.effects import (
     power,
     scenarios_needed,
 )
-from drivax.evaluation.hypotheses import (
+from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
+from drivax.stats.seeds import Crossed, agents_interval, difference_interval
+from drivax.stats.significance import (
     Evidence,
     holm,
     mcnemar,
@@ -37,17 +43,6 @@ from drivax.evaluation.hypotheses import (
     paired_permutation,
     split_permutation,
 )
-from drivax.evaluation.misfits import refuse_metric, refuse_misfits, refuse_undefined
-from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.results import RATES, SHARES, interval_of
-from drivax.evaluation.split import Split, assign, strata_of
-from drivax.evaluation.statistics import (
-    Interval,
-    interquartile_bootstrap,
-    paired_bootstrap,
-    split_bootstrap,
-)
-from drivax.evaluation.stored import EpisodeTable, Pairs
 
 #: Without a smallest difference of its own, a plan takes this share of the standard deviation.
 SMALL_EFFECT = 0.1

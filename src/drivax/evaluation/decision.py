@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from drivax.evaluation.hypotheses import Evidence
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.statistics import Interval
+from drivax.stats.intervals import Interval
+from drivax.stats.significance import Evidence
 
 Arm = Literal["A", "B"]
 

@@ -20,12 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.errors import UsageError
 from drivax.evaluation.rollout import advanced, episode_keys, judging
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.simulator.catalogue import prepared
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task

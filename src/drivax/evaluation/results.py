@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.evaluation.clusters import recordings
-from drivax.evaluation.statistics import Interval, bootstrap_mean, rate
 from drivax.metrics.catalogue import EVENTS, METRICS, Metric
+from drivax.stats.clusters import recordings
+from drivax.stats.intervals import Interval, bootstrap_mean, rate
 
 #: Columns of ``episodes.csv`` before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
@@ -80,7 +80,8 @@ class Results:
         events: First step of each kind of failure, -1 for none.
         motion: x, y, heading, speed per step from ``start`` on.
         actions: What was carried out from ``start`` on, NaN from a crash on.
-        others: Where everyone was from ``start`` on (``evaluation.others``); None where the log was replayed.
+        others: Where everyone was from ``start`` on (``evaluation.traffic_trajectories``); None where the log was
+            replayed.
         start: Step of the log at which the episodes began.
         offroad_steps: Steps off the road.
         own: Those of the metrics that are the user's own: unit, direction and text.

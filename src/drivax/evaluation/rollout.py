@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int16
 
-from drivax.evaluation.others import packed
 from drivax.evaluation.results import FAILED
+from drivax.evaluation.traffic_trajectories import packed
 from drivax.metrics.episode import episode_metrics, first_steps
 from drivax.metrics.scores import Value
 from drivax.planners.planner import Planner
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState
 from drivax.tasks.task import Task
 
@@ -37,7 +37,8 @@ class Episodes:
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
         actions: What was carried out in each step: within bounds, and as the actuators let it be.
-        others: Where everyone was at each step (``evaluation.others``), if traffic does not replay the log.
+        others: Where everyone was at each step (``evaluation.traffic_trajectories``), if traffic does not replay the
+            log.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was no number, -1 for none. Nothing is measured from there on; motion stays.
     """

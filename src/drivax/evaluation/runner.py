@@ -27,14 +27,14 @@ from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import catalogue
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
-from drivax.scenario.identity import identities
+from drivax.scenario.bank.identity import identities
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
-from drivax.scenario.sizes import Sizes
-from drivax.simulator.catalogue import prepared
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart
-from drivax.simulator.traffic import LogTraffic
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import dense, stratum_of_clusters
-from drivax.named import nearest
+from drivax.plugins import nearest
+from drivax.stats.clusters import dense, stratum_of_clusters
 
 #: Strata of fewer recordings than this are taken together.
 LEAST = 10

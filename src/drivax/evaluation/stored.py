@@ -17,11 +17,11 @@ from jaxtyping import Float, Float64
 
 from drivax import settings
 from drivax.errors import DataError
-from drivax.evaluation.clusters import recordings
 from drivax.evaluation.results import ADDED, KEYS, About, Results
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.runs import CONFIG_FILE
+from drivax.stats.clusters import recordings
+from drivax.tracking.run_folder import CONFIG_FILE
 
 #: The cure for a run folder that is damaged.
 AGAIN = "run drivax evaluate again"

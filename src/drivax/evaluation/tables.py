@@ -12,10 +12,10 @@ import numpy as np
 
 from drivax.errors import UsageError
 from drivax.evaluation.results import Results, interval_of
-from drivax.evaluation.statistics import NOTHING, Interval, paired_bootstrap, rate
 from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, comparable
-from drivax.scenario.tags import TAGS
+from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
+from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
 
 CONFIDENCE = 0.95
 SEED = 0

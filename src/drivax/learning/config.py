@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 
 from drivax.errors import UsageError
 from drivax.learning.algorithm import AlgorithmConfig
-from drivax.learning.cql import CqlConfig
+from drivax.learning.algorithms.behaviour_cloning import BcConfig
+from drivax.learning.algorithms.cql import CqlConfig
+from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.offline import OfflineConfig
+from drivax.learning.algorithms.ppo import PpoConfig
+from drivax.learning.algorithms.sac import SacConfig
+from drivax.learning.algorithms.td3_bc import Td3BcConfig
+from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig
 from drivax.learning.driving import Driving
-from drivax.learning.imitation import BcConfig
-from drivax.learning.iql import IqlConfig
-from drivax.learning.offline import OfflineConfig
-from drivax.learning.ppo import PpoConfig
-from drivax.learning.sac import SacConfig
-from drivax.learning.td3_bc import Td3BcConfig
 from drivax.learning.validation import Rule
-from drivax.learning.warm_start import BcPpoConfig, BcSacConfig
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart

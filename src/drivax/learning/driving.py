@@ -18,7 +18,7 @@ from drivax.learning.sampler import Places
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where

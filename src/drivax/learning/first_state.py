@@ -14,7 +14,7 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.policies import PACKED, open_policy
 from drivax.learning.program import Program
 from drivax.tracking.checkpoints import Checkpoints, is_part
-from drivax.tracking.runs import run_and_step, trained_on
+from drivax.tracking.run_folder import run_and_step, trained_on
 
 _PARAMETERS = ".parameters"
 

@@ -14,7 +14,7 @@ from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.first_state import Origin
 from drivax.scenario.store import ScenarioSet
-from drivax.tracking.runs import RunFolder, seed_folders
+from drivax.tracking.run_folder import RunFolder, seed_folders
 
 
 def facts(config: TrainConfig, validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, Any]:

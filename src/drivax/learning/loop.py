@@ -13,22 +13,22 @@ import jax
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.learning.agents import Agents
 from drivax.learning.algorithm import Judges, LearnerState, training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.first_state import first_state, inherited, with_step
 from drivax.learning.folders import create_folders, facts, resumed_folders
-from drivax.learning.journal import Journal
+from drivax.learning.members import Agents
 from drivax.learning.policy_traffic import find_traffic
 from drivax.learning.program import Program
 from drivax.learning.stopping import Preempted, StopSignal
+from drivax.learning.training_log import Journal
 from drivax.learning.validation import Validation, validate
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.catalogue import prepared
+from drivax.simulator.traffic.catalogue import prepared
 from drivax.tracking.progress import Progress
-from drivax.tracking.runs import RunFolder, refuse_existing
+from drivax.tracking.run_folder import RunFolder, refuse_existing
 
 
 def train(

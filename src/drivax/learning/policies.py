@@ -12,10 +12,10 @@ import jax
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
-from drivax.tracking.runs import RunFolder, seed_folders, trained_on
+from drivax.tracking.run_folder import RunFolder, seed_folders, trained_on
 from drivax.tracking.zoo import policy_folder
 
 #: What a packed policy has in the place of checkpoints.

@@ -7,18 +7,18 @@ from pathlib import Path
 
 from drivax.errors import UsageError
 from drivax.learning.policies import load_policy, open_policy
-from drivax.named import is_dotted
-from drivax.planners.driven import PlannerTraffic, with_driver
-from drivax.scenario.bank import ScenarioBank
-from drivax.simulator.catalogue import TRAFFIC, make_traffic
-from drivax.simulator.traffic import LogTraffic
+from drivax.planners.planner_traffic import PlannerTraffic, with_driver
+from drivax.plugins import is_dotted
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.traffic.catalogue import TRAFFIC, make_traffic
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tracking.zoo import is_policy, zoo
 
 
 @dataclass(frozen=True)
 class PolicyTraffic(PlannerTraffic):
-    """The policy of a run drives the vehicles nearest to ego (``planners.driven``); :func:`policy_traffic` makes one.
+    """Traffic in which the policy of a run drives the vehicles nearest to ego; :func:`policy_traffic` makes one.
 
     Attributes:
         run: The folder of the policy.
@@ -67,7 +67,8 @@ def find_traffic(name: str) -> Traffic:
     """The traffic of a name, as a command line or a configuration says it.
 
     Args:
-        name: One of ``simulator.catalogue.TRAFFIC``; ``package.module:name``; or the folder of a trained policy or
+        name: One of ``simulator.traffic.catalogue.TRAFFIC``; ``package.module:name``; or the folder of a trained
+            policy or
             ``zoo:NAME``, which then drives the vehicles nearest to ego, while the others replay the log, or behave as
             in a kind of traffic that is named behind it, ``zoo:NAME+idm``.
 

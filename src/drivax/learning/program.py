@@ -8,8 +8,8 @@ from typing import Any
 
 import jax
 
-from drivax.learning.agents import Agents
 from drivax.learning.devices import chosen_devices, everywhere, layout, mesh_of
+from drivax.learning.members import Agents
 from drivax.learning.memory import MemoryAccount, account
 
 

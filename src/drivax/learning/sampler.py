@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.statistics import effective_size
 from drivax.scenario.record import record, static
+from drivax.stats.intervals import effective_size
 
 _LAST = 2**32 - 1
 
@@ -27,7 +27,7 @@ class Sampler:
 
     Attributes:
         cumulative: Share of all weight up to each step, scenario by scenario, in units of ``1 / (2^32 - 1)``.
-        effective: Effective sample size, see :func:`~drivax.evaluation.statistics.effective_size`.
+        effective: Effective sample size, see :func:`~drivax.stats.intervals.effective_size`.
         steps: Steps of a scenario.
     """
 

@@ -13,7 +13,7 @@ from drivax.errors import DrivaxError
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task

@@ -16,7 +16,7 @@ from drivax.metrics.outcomes import Ending
 from drivax.metrics.scores import Value
 from drivax.metrics.selection import Selection, Wanted, selected
 from drivax.metrics.steps import STEP_VALUES, Moment, StepValue
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import Flag
 from drivax.simulator.types import SimState, Situation

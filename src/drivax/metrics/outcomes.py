@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from drivax.metrics.scores import Value, nuplan_score, vmax_score
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import is_mapped
+from drivax.scenario.bank.queries import is_mapped
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.contact import TTC_HORIZON_S
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from drivax.errors import UsageError
 from drivax.metrics.catalogue import EVENTS, METRICS, SETS, Metric, Operator
 from drivax.metrics.steps import StepValue
-from drivax.named import find_named, is_dotted, nearest
+from drivax.plugins import find_named, is_dotted, nearest
 from drivax.simulator.types import FACTS
 
 #: What a configuration says: the name of a set, or names of sets, metrics and metrics of the user's own.

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from drivax.errors import UsageError
-from drivax.named import find_named, is_dotted, refuse_arguments
 from drivax.planners.idm import IdmPlanner
-from drivax.planners.pdm import PdmPlanner
+from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.search import SearchPlanner
 from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
+from drivax.plugins import find_named, is_dotted, refuse_arguments
 
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "expert": Expert,

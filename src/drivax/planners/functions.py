@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.types import SimState, Situation
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import route_ahead
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters

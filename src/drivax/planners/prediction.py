@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
-from drivax.scenario.queries import LEVEL_M, lane_course
+from drivax.scenario.bank.queries import LEVEL_M, lane_course
+from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.ahead import project

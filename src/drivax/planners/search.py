@@ -20,8 +20,8 @@ from drivax.planners.prediction import (
     at,
     prediction_times,
 )
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
+from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.ahead import STOP_SHORT_M, desired_speed, project, stop_line_m
 from drivax.simulator.dynamics import GRIP_MPS2

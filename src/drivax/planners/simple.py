@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless
-from drivax.scenario.bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.types import Scene, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical

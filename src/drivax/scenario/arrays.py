@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.errors import UsageError
-from drivax.scenario.agents import DEFAULT_SIZES
+from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind
 

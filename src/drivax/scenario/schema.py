@@ -2,7 +2,7 @@
 
 Two steps lead from a public log to the simulator. A reader (or the built-in world) fills a
 :class:`~drivax.scenario.recording.Recording`: ragged, float64, in the source's own map frame, nothing invented.
-``scenario.assemble`` turns it into a :class:`Scenario`: local frame, float32, fixed shapes named by
+``scenario.build.assemble`` turns it into a :class:`Scenario`: local frame, float32, fixed shapes named by
 :class:`Capacity`, with segments, grid and routes.
 
 This module needs numpy only, so that worker processes that convert data never import JAX.
@@ -320,14 +320,14 @@ class Scenario:
         """A scenario from plain arrays of at most 91 steps, the current one being number 10.
 
         The arguments are those of :func:`drivax.scenario.arrays.recording_from_arrays`; cut what it makes of longer
-        data with :func:`drivax.scenario.assemble.windows` (docs/data/own-data.md).
+        data with :func:`drivax.scenario.build.assemble.windows` (docs/data/own-data.md).
 
         Raises:
             UsageError: An argument is missing, misspelt, or has another shape.
             DataError: The data make no scenario (the ego is not valid at the current step, a number is not finite).
         """
         from drivax.scenario.arrays import recording_from_arrays
-        from drivax.scenario.assemble import assemble
+        from drivax.scenario.build.assemble import assemble
 
         return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
 

@@ -5,7 +5,7 @@ A set is a folder::
     manifest.json        schema version, capacity, field table, shards, one entry per scenario
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
-    splits/              lists for training, validation and test, if asked for (``scenario.splits``)
+    splits/              lists for training, validation and test, if asked for (``scenario.select.splits``)
     scores.npz           criticality of its scenarios, if they were chosen by it (``curation.subset``)
 
 Any tool reads a shard with ``numpy.load(path, mmap_mode="r")``; record ``i`` lies at a fixed offset, so one
@@ -28,6 +28,7 @@ from typing import IO, Any, Self
 import numpy as np
 
 from drivax.errors import DataError, UsageError
+from drivax.files import PartialFolder, sync_and_close, write_json
 from drivax.scenario.manifest import (
     AGAIN,
     MANIFEST,
@@ -40,9 +41,8 @@ from drivax.scenario.manifest import (
     shard_name,
     write_header,
 )
-from drivax.scenario.partial import PartialFolder, sync_and_close, write_json
 from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
-from drivax.scenario.splits import Shares, write_splits
+from drivax.scenario.select.splits import Shares, write_splits
 
 
 class ScenarioWriter:

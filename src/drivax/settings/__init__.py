@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drivax.errors import UsageError
-from drivax.named import nearest
+from drivax.plugins import nearest
 from drivax.settings.structure import Flag, kind_of, plain, structure
 from drivax.settings.text import parse_yaml, write_yaml
 

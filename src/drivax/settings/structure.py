@@ -16,14 +16,7 @@ from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError, Iterabl
 from cattrs.gen import make_dict_structure_fn
 
 from drivax.errors import DrivaxError, UsageError
-from drivax.named import (
-    dotted_name,
-    find_named,
-    is_dotted,
-    nearest,
-    refuse_arguments,
-    refuse_missing,
-)
+from drivax.plugins import dotted_name, find_named, is_dotted, nearest, refuse_arguments, refuse_missing
 from drivax.settings.text import parse_yaml
 
 _UNIONS = (Union, types.UnionType)

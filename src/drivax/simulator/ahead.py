@@ -5,13 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.scenario.bank import LIGHT_ARC, ScenarioBank
-from drivax.scenario.queries import LEVEL_M, route_ahead
+from drivax.scenario.bank.queries import LEVEL_M, route_ahead
+from drivax.scenario.bank.scenario_bank import LIGHT_ARC, ScenarioBank
+from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
 from drivax.scenario.schema import LightState
-from drivax.scenario.smallest import first_smallest
-from drivax.simulator.corridor import FREE_M, LEAST_GAP_M, closest, reaching
 from drivax.simulator.idm import IdmParameters, idm_acceleration
+from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
 from drivax.simulator.types import Frame, Scene
 
 #: Look-ahead along the route and its spacing, m.

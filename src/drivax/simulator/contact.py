@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, gap, overlap, time_to_overlap
-from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 

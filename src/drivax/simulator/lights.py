@@ -5,8 +5,15 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.scenario.bank import LIGHT_ARC, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, NEVER_M, ScenarioBank
-from drivax.scenario.queries import light_crossing
+from drivax.scenario.bank.queries import light_crossing
+from drivax.scenario.bank.scenario_bank import (
+    LIGHT_ARC,
+    LIGHT_EXIT_COS,
+    LIGHT_EXIT_SIN,
+    LIGHT_RIGHT,
+    NEVER_M,
+    ScenarioBank,
+)
 from drivax.scenario.schema import LightState
 from drivax.simulator.types import HISTORY, MOTION_SPEED, LightMemory, Scene
 

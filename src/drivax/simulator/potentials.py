@@ -14,14 +14,14 @@ from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, corners
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import (
+from drivax.scenario.bank.queries import (
     LEVEL_M,
     OFFROAD_TOLERANCE_M,
     around_lanes,
     is_mapped,
     offroad_distance,
 )
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.types import Frame, Scene
 
 #: Width of the transition where two faces of a box, or two signs of an angle, take over from each other (m, 1).

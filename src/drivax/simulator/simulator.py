@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.scenario.bank import AGENT_Z, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_Z, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import nothing_crossed, remember_lights
 from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.together import is_driven
-from drivax.simulator.traffic import LogTraffic, alone, frame_of
+from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import Beginning, Frame, Scene, SimState, Situation, Task, Traffic, Transition
 
 

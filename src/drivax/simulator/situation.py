@@ -12,9 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
-from drivax.scenario.passages import lane_passage
-from drivax.scenario.queries import (
+from drivax.scenario.bank.passages import lane_passage
+from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
     LaneHits,
     around_lanes,
@@ -23,6 +22,7 @@ from drivax.scenario.queries import (
     offroad_distance,
     project_on_route,
 )
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import (
     STOPPED_MPS,

@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.scenario.bank import AGENT_VALID, AGENT_Z, ScenarioBank
-from drivax.scenario.queries import (
+from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
     around_lanes,
     is_mapped,
@@ -24,9 +23,10 @@ from drivax.scenario.queries import (
     offroad_distance,
     project_on_route,
 )
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
-from drivax.simulator.traffic import alone, frame_of, logged_history
+from drivax.simulator.traffic.log import alone, frame_of, logged_history
 from drivax.simulator.types import HISTORY, MOTION_SPEED, Scene
 
 #: What 1 means for acceleration (m/s2) and curvature (1/m) in the published description, which is in action units.

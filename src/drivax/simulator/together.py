@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.types import SimState
 

@@ -8,8 +8,8 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.queries import LaneHits, RouteHit
+from drivax.scenario.bank.queries import LaneHits, RouteHit
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 
 #: Rows of recent motion that a scene carries: the 15-sample comfort window needs one more speed than accelerations.
@@ -74,7 +74,8 @@ class Facts:
 
     The last five are measured for who names them only (``ON_REQUEST``): ``gap_m`` to the nearest other, at most 50 m;
     ``lag_m``, how far ahead the log has the agent, along the agent's heading (negative: behind);
-    ``strand`` of lanes that the agent is on (``scenario.passages``), and whether it changed lanes or merged just now.
+    ``strand`` of lanes that the agent is on (``scenario.bank.passages``), and whether it changed lanes or merged
+    just now.
     """
 
     collision: Bool[Array, "*batch"]

@@ -26,18 +26,18 @@ from drivax.learning.policy_traffic import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import Wanted
 from drivax.planners.idm import IdmPlanner
-from drivax.scenario.bank import ScenarioBank
-from drivax.scenario.exhaustive import without_grid
-from drivax.scenario.queries import around_lanes, left_of_edges, project_on_route
-from drivax.simulator.catalogue import prepared
+from drivax.scenario.bank.exhaustive import without_grid
+from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 #: Sets of metrics and batch sizes of :func:`bench_metrics`, as in the published table; the
 #: larger ones only where they are the best.

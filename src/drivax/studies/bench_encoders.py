@@ -16,17 +16,17 @@ from jaxtyping import Array
 
 from drivax.errors import UsageError
 from drivax.learning.driving import Driving
-from drivax.named import nearest
 from drivax.networks.encoders import EncoderConfig, GroupSpec, MlpConfig
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import ScenarioBank
+from drivax.plugins import nearest
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import PRESETS, ObservationConfig
 from drivax.tasks.task import Task
-from drivax.tracking.runs import versions
+from drivax.tracking.run_folder import versions
 
 _Ours = MlpConfig | EntityConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig
 #: What is compared, by name: an encoder and its size. All but the MLP also in bfloat16, unless it is a mere variant.

@@ -12,20 +12,20 @@ from typing import Any
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.evaluation.runs import EvaluationConfig, format_summary, run_evaluation
+from drivax.evaluation.run_evaluation import EvaluationConfig, format_summary, run_evaluation
 from drivax.evaluation.tables import paired_differences
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.report.pages.report import write_report
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.show.report import write_report
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
-from drivax.tracking.runs import describe_run, write_text
+from drivax.tracking.run_folder import describe_run, write_text
 
 #: Planners that the trained policy is compared with.
 REFERENCES = ("expert", "constant_velocity", "idm")

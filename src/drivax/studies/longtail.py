@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from drivax.curation.agents import AGENTS, weighted
+from drivax.curation.arms import AGENTS, weighted
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate, refuse_stale
 from drivax.curation.rarity import ExpertActions
@@ -28,8 +28,9 @@ from drivax.learning.experience import WeightedSet
 from drivax.learning.folders import hashes
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.validation import rank
+from drivax.report.pages.criticality import criticality_html
+from drivax.report.pages.viewer import write_player
 from drivax.scenario.store import ScenarioSet
-from drivax.show.criticality import criticality_html
 from drivax.studies.longtail_drives import (
     MEAN_Q,
     Say,
@@ -71,10 +72,9 @@ from drivax.studies.longtail_results import (
     summary,
 )
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.runs import RunFolder, write_text
+from drivax.tracking.run_folder import RunFolder, write_text
 from drivax.tracking.sinks import read_rows
 from drivax.tracking.workers import one_core_each
-from drivax.viewer.player import write_player
 
 _PROGRESS = "validation/progress_ratio"
 #: Methods whose most critical scenarios can be watched, and how many of each.

@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Wanted, curate
 from drivax.errors import UsageError
-from drivax.evaluation.clusters import recordings_of
-from drivax.evaluation.runs import EvaluationConfig, run_evaluation
+from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
 from drivax.evaluation.stored import read_evaluation
 from drivax.learning.policies import load_policy
 from drivax.planners.catalogue import make_planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.stats.clusters import recordings_of
 from drivax.studies.longtail_plan import (
     BY_MEAN_Q,
     DRIVES,
@@ -29,7 +29,7 @@ from drivax.studies.longtail_plan import (
     drive_of,
     run_of,
 )
-from drivax.tracking.runs import RunFolder
+from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.sinks import read_rows
 
 #: What critics expect of the policy on held-out steps: by it the published study advises to choose checkpoints.

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.curation.scores import ScoreTable
-from drivax.show.histograms import histogram
-from drivax.show.page import page, publish
+from drivax.report.pages.inspection import histogram
+from drivax.report.pages.page import page, publish
 from drivax.studies.longtail_plan import FIRST
 from drivax.studies.longtail_rankings import RELATED, UNRELATED
 from drivax.studies.longtail_results import METRICS

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax import settings
-from drivax.curation.agents import AGENTS
-from drivax.curation.scouts import ScoutsConfig
+from drivax.curation.arms import AGENTS
+from drivax.curation.ensemble import ScoutsConfig
 from drivax.curation.weights import WeightConfig
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.named import nearest
+from drivax.plugins import nearest
 
 #: Which recorded steps are learned from.
 Usable = Bool[np.ndarray, "N T"]
@@ -35,7 +35,7 @@ class LongtailConfig:
     """What is compared, and under which budget.
 
     Attributes:
-        agents: Names of :data:`~drivax.curation.agents.AGENTS`; ``baseline`` and ``bc`` among them.
+        agents: Names of :data:`~drivax.curation.arms.AGENTS`; ``baseline`` and ``bc`` among them.
         seeds: Trainings of each.
         total_steps: Recorded steps that each learns from; null: as its preset says.
         training: More settings of every training, as on a command line: ``[--algorithm.batch, "128"]``.

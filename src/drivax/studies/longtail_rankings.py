@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
-from drivax.curation.ranking import correlation_interval, rank_correlation
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
+from drivax.stats.ranking import correlation_interval, rank_correlation
 
 #: Two rankings below this correlation (and above its negative) are called unrelated, above the other one related.
 UNRELATED, RELATED = 0.1, 0.3

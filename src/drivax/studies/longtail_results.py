@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.curation.agents import CURATED, control_of
-from drivax.evaluation.crossed import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
-from drivax.evaluation.hypotheses import holm
+from drivax.curation.arms import CURATED, control_of
+from drivax.stats.seeds import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
+from drivax.stats.significance import holm
 
 Values = Float[np.ndarray, "seed scenario"]
 #: By metric.

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivax.synthetic.families import FAMILIES, RoadFamily
-from drivax.synthetic.population import Density
-from drivax.synthetic.style import GRID, RING, RoadStyle
+from drivax.synthetic.roads.families import FAMILIES, RoadFamily
+from drivax.synthetic.roads.style import GRID, RING, RoadStyle
+from drivax.synthetic.traffic.population import Density
 
 
 @dataclass(frozen=True)

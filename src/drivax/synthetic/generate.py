@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from drivax.errors import DrivaxError, UsageError
-from drivax.scenario.assemble import assemble
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
 from drivax.synthetic.portable import portable_workers

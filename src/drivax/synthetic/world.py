@@ -18,11 +18,6 @@ from drivax.errors import UsageError
 from drivax.geometry.angles import wrap
 from drivax.scenario.recording import Event, Light, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, Flag
-from drivax.synthetic import expert
-from drivax.synthetic.aims import Aim
-from drivax.synthetic.cast import Cast, Motion, Staging
-from drivax.synthetic.casting import SignalTiming, draw_cast
-from drivax.synthetic.critical import critical_steps
 from drivax.synthetic.domains import DOMAINS, Domain
 from drivax.synthetic.events import (
     EventKind,
@@ -34,14 +29,19 @@ from drivax.synthetic.events import (
     stage,
     threatens,
 )
-from drivax.synthetic.families import RoadFamily
-from drivax.synthetic.faults import EGO_SKIN_M
-from drivax.synthetic.meetings import met_on
-from drivax.synthetic.population import LONGEST_M
-from drivax.synthetic.roads import RoadNetwork, feature_id, map_features
+from drivax.synthetic.events.conflict_start import critical_steps
+from drivax.synthetic.events.destinations import Aim
+from drivax.synthetic.expert import driver as expert
+from drivax.synthetic.expert.violations import EGO_SKIN_M
+from drivax.synthetic.roads.families import RoadFamily
+from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
+from drivax.synthetic.roads.signals import light_states
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, sight
-from drivax.synthetic.signals import light_states
-from drivax.synthetic.traffic import Traffic
+from drivax.synthetic.traffic.conflicts import met_on
+from drivax.synthetic.traffic.population import LONGEST_M
+from drivax.synthetic.traffic.role_assignment import SignalTiming, draw_cast
+from drivax.synthetic.traffic.roles import Cast, Motion, Staging
+from drivax.synthetic.traffic.simulation import Traffic
 
 #: Raised whenever the same seed gives another world; part of every scenario id.
 WORLD_VERSION = 2

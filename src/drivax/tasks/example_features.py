@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank import LIGHT_ARC, NEVER_M, ROAD_LANE, ScenarioBank
-from drivax.scenario.queries import route_ahead
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import LIGHT_ARC, NEVER_M, ROAD_LANE, ScenarioBank
+from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import LightState
-from drivax.scenario.smallest import first_smallest
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters
 from drivax.simulator.types import MOTION_SPEED, Scene

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.named import nearest
-from drivax.scenario.bank import ROUTE_COS, ROUTE_SIN, ScenarioBank
-from drivax.scenario.queries import route_ahead
+from drivax.plugins import nearest
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import ROUTE_COS, ROUTE_SIN, ScenarioBank
 from drivax.scenario.schema import Flag
 from drivax.simulator.types import Scene
 from drivax.tasks.view import PIECE_M, POSITION_M

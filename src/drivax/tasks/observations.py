@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.named import nearest
-from drivax.scenario.bank import (
+from drivax.plugins import nearest
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import (
     LIGHT_ARC,
     LIGHT_COS,
     LIGHT_SIN,
@@ -31,7 +32,6 @@ from drivax.scenario.bank import (
     ROUTE_LIMIT,
     ScenarioBank,
 )
-from drivax.scenario.queries import route_ahead
 from drivax.scenario.schema import DT_S, LightState
 from drivax.simulator.types import HISTORY, Scene
 from drivax.tasks.features import (

@@ -23,8 +23,8 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank import LIGHT_X, LIGHT_Y, ScenarioBank
-from drivax.scenario.queries import LEVEL_M
+from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.scenario_bank import LIGHT_X, LIGHT_Y, ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, Frame, Scene
 

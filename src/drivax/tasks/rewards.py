@@ -136,12 +136,12 @@ def goal(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
 
 
 def lane_change(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that passes to a lane beside, the same way (``scenario.passages``)."""
+    """1 at the step that passes to a lane beside, the same way (``scenario.bank.passages``)."""
     return _event(now.lane_changed)
 
 
 def merge(before: Facts, now: Facts, around: Surroundings) -> Float[Array, ""]:
-    """1 at the step that leaves a lane which ends, or joins the next one, within 100 m (``scenario.passages``)."""
+    """1 at the step that leaves a lane which ends, or joins the next one, within 100 m (``scenario.bank.passages``)."""
     return _event(now.merged)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.episode import Episode, episode_add, episode_start
 from drivax.metrics.selection import Wanted, selected
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.types import Facts, Frame, Scene, Situation, Surroundings
 from drivax.tasks.actions import ActionSpace, Physical
 from drivax.tasks.observations import Observation, ObservationConfig, observe

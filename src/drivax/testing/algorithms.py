@@ -10,9 +10,9 @@ import numpy as np
 
 from drivax.learning.algorithm import AlgorithmConfig, Learner, LearnerState, training_data
 from drivax.learning.driving import Driving
-from drivax.named import find_named
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.plugins import find_named
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from drivax.named import find_named
 from drivax.networks.encoders import EncoderConfig
+from drivax.plugins import find_named
 from drivax.testing.contract import CLOSE, check_numbers, expect, program, same
 from drivax.testing.worlds import GARBAGE
 

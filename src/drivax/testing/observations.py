@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.named import find_named
-from drivax.scenario.bank import ScenarioBank
+from drivax.plugins import find_named
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, Scene
 from drivax.tasks.observations import Feature, OwnGroup
 from drivax.tasks.task import Task

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from drivax.evaluation.rollout import judging
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
-from drivax.scenario.bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.types import SimState
 from drivax.tasks.task import Task

@@ -13,7 +13,7 @@ from drivax.metrics.catalogue import Metric
 from drivax.metrics.outcomes import Ending
 from drivax.metrics.scores import Value
 from drivax.metrics.steps import Moment
-from drivax.named import find_named
+from drivax.plugins import find_named
 from drivax.simulator.types import FACTS, ON_REQUEST
 from drivax.tasks.own import own_name
 from drivax.tasks.rewards import Term

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
 from drivax.scenario.record import record
-from drivax.simulator.catalogue import make_traffic, prepared
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic import alone, logged_history
+from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.log import alone, logged_history
 from drivax.simulator.types import Scene, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array
 
 from drivax.geometry.angles import wrap
-from drivax.scenario.assemble import assemble
-from drivax.scenario.bank import AGENT_VALID, ScenarioBank, as_words
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank, as_words
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.recording import Recording
 from drivax.scenario.schema import CAPACITIES
@@ -26,7 +26,7 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
-from drivax.simulator.traffic import alone
+from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import FACTS, ON_REQUEST, Facts, Frame, Situation, Surroundings
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task

@@ -4,10 +4,10 @@ A script looks at how the scenario goes without it (``scene``), and proposes wha
 ego that keeps its speed would meet it; ``threat`` tells what that asks of ego, and ``choosing`` takes what is sound.
 """
 
+from drivax.synthetic.events.adversary import threatens
 from drivax.synthetic.events.choosing import SCRIPTS, aims, drawn_severity, possible, stage
+from drivax.synthetic.events.ego_view import Scene
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, EventScript, Proposal, Staged
-from drivax.synthetic.events.scene import Scene
-from drivax.synthetic.events.threat import threatens
 
 __all__ = [
     "SCRIPTS",

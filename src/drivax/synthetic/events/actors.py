@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.cast import Motion, Scripted
-from drivax.synthetic.curves import Curve
-from drivax.synthetic.events.scene import Track
+from drivax.synthetic.events.ego_view import Track
+from drivax.synthetic.roads.curves import Curve
+from drivax.synthetic.traffic.roles import Motion, Scripted
 
 CAR_M = (4.6, 1.85, 1.55)
 

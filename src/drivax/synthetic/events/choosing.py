@@ -6,16 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivax.synthetic.aims import Aim, open_road
-from drivax.synthetic.cast import Staging
+from drivax.synthetic.events.adversary import (
+    comes_close,
+    first_blocked,
+    in_its_cross_way,
+    severity,
+    with_room,
+)
 from drivax.synthetic.events.crossing import CrossTraffic
+from drivax.synthetic.events.destinations import Aim, open_road
+from drivax.synthetic.events.ego_view import FULL_SWING, NOTICED, Scene
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, AimedScript, EventKind, EventScript, Proposal, Staged
 from drivax.synthetic.events.leading import LeadBrakes, StalledVehicle
 from drivax.synthetic.events.merging import CutIn
 from drivax.synthetic.events.roadside import Jaywalker, LaneBlocked, ReversingCar, WrongWayCyclist
-from drivax.synthetic.events.scene import FULL_SWING, NOTICED, Scene
-from drivax.synthetic.events.threat import comes_close, first_blocked, in_its_cross_way, severity, with_room
-from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.roles import Staging
 
 #: All scripts; a new event is a script here and a number in :class:`EventKind`.
 SCRIPTS: dict[EventKind, EventScript] = {

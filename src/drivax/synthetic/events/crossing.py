@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.aims import Aim
-from drivax.synthetic.cast import Scripted, Staging
-from drivax.synthetic.curves import Curve, joined
 from drivax.synthetic.events.actors import CAR_M, along_curve
+from drivax.synthetic.events.adversary import comes_close, first_blocked, in_its_lane, required_by_samples
+from drivax.synthetic.events.destinations import Aim
+from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, Scene
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
-from drivax.synthetic.events.scene import EARLIEST, FULL_SWING, LATEST, NOTICED, Scene
-from drivax.synthetic.events.threat import comes_close, first_blocked, in_its_lane, required_by_samples
-from drivax.synthetic.roads import Control, Lane, RoadNetwork
-from drivax.synthetic.signals import Colour
+from drivax.synthetic.roads.curves import Curve, joined
+from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
+from drivax.synthetic.roads.signals import Colour
+from drivax.synthetic.traffic.roles import Scripted, Staging
 
 #: Actors come from so far, and are followed so far beyond the junction, m.
 _FROM_M, _BEYOND_M = 180.0, 60.0

@@ -8,10 +8,10 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.aims import Aim
-from drivax.synthetic.cast import Scripted, Staging
-from drivax.synthetic.events.scene import Scene
-from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.events.destinations import Aim
+from drivax.synthetic.events.ego_view import Scene
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.roles import Scripted, Staging
 
 #: Required decelerations of staged events, m/s2: from mild to the limit of what braking can avoid.
 SEVERITY_MPS2 = (1.5, 6.0)

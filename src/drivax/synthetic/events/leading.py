@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.aims import Aim, open_road
-from drivax.synthetic.cast import Override, Staging, Tailgate
 from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, slowed
+from drivax.synthetic.events.adversary import severity
+from drivax.synthetic.events.destinations import Aim, open_road
+from drivax.synthetic.events.ego_view import NOTICED, Scene
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
-from drivax.synthetic.events.scene import NOTICED, Scene
-from drivax.synthetic.events.threat import severity
-from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
 #: Where everybody drives this slowly who brakes requires little of who follows, m/s.
 _LEAST_MPS = 10.0

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.aims import Aim, open_road
-from drivax.synthetic.cast import Staging
-from drivax.synthetic.curves import STEP_M
 from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, smooth_step
+from drivax.synthetic.events.destinations import Aim, open_road
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, Scene
 from drivax.synthetic.events.kinds import EventKind, Proposal
-from drivax.synthetic.events.scene import EARLIEST, LATEST, NOTICED_S, Scene
-from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.roads.curves import STEP_M
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.roles import Staging
 
 #: The lane beside ego's is looked for at stations so far apart, m.
 _EVERY_M = 8.0

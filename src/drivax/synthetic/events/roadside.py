@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.cast import Scripted, Staging
 from drivax.synthetic.events.actors import CAR_M, along_track, moving, smooth_step, travel_s, walked
+from drivax.synthetic.events.adversary import waiting_room
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, Scene
 from drivax.synthetic.events.kinds import EventKind, Proposal
-from drivax.synthetic.events.scene import EARLIEST, LATEST, NOTICED_S, Scene
-from drivax.synthetic.events.threat import waiting_room
-from drivax.synthetic.roads import RoadNetwork
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.roles import Scripted, Staging
 
 _PERSON_M, _BICYCLE_M, _THING_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
 #: Streets from whose sides things come: no faster than this, m/s.

@@ -1,0 +1,201 @@
+"""Argoverse 2 maps: lane segments, drivable areas and crossings of one log, as JSON beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.datasets import readings
+from drivax.datasets.areas import Area, road_edges
+from drivax.datasets.argoverse.vehicle import FARTHEST_M
+from drivax.errors import DataError
+from drivax.geometry.polylines import arc_lengths
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import RoadKind
+
+Array = np.ndarray[Any, Any]
+
+#: Name of a map beside a log.
+MAP_PATTERN = "log_map_archive_*.json"
+_AGAIN = "download the map again"
+#: A local map spans some hundred metres; a point this far from the others is damaged.
+_SPREAD_M = 20_000.0
+#: Centre lines and widths are sampled at least this densely.
+_SPACING_M = 2.0
+_LANES = {"VEHICLE": RoadKind.LANE_SURFACE, "BUS": RoadKind.LANE_SURFACE, "BIKE": RoadKind.LANE_BIKE}
+#: Where one side is dashed and the other solid, WOMD has a code for yellow only; white ones forbid crossing from one
+#: side and become double solid.
+_MARKS = {
+    "DASHED_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
+    "DOUBLE_DASH_WHITE": RoadKind.LINE_BROKEN_SINGLE_WHITE,
+    "SOLID_WHITE": RoadKind.LINE_SOLID_SINGLE_WHITE,
+    "DOUBLE_SOLID_WHITE": RoadKind.LINE_SOLID_DOUBLE_WHITE,
+    "DASH_SOLID_WHITE": RoadKind.LINE_SOLID_DOUBLE_WHITE,
+    "SOLID_DASH_WHITE": RoadKind.LINE_SOLID_DOUBLE_WHITE,
+    "DASHED_YELLOW": RoadKind.LINE_BROKEN_SINGLE_YELLOW,
+    "DOUBLE_DASH_YELLOW": RoadKind.LINE_BROKEN_DOUBLE_YELLOW,
+    "SOLID_YELLOW": RoadKind.LINE_SOLID_SINGLE_YELLOW,
+    "DOUBLE_SOLID_YELLOW": RoadKind.LINE_SOLID_DOUBLE_YELLOW,
+    "DASH_SOLID_YELLOW": RoadKind.LINE_PASSING_DOUBLE_YELLOW,
+    "SOLID_DASH_YELLOW": RoadKind.LINE_PASSING_DOUBLE_YELLOW,
+}
+
+
+@dataclass(frozen=True)
+class ArgoverseMap:
+    """A map's features, and what was left out, by name."""
+
+    features: tuple[MapFeature, ...]
+    lost: dict[str, int]
+
+
+def read_map(path: Path) -> ArgoverseMap:
+    """Reads a local map: lanes, painted lines (once each), road edges and crossings, in the city's frame, metres.
+
+    Lanes keep their ids, their links (some lead outside the local map) and all neighbours, oncoming ones included.
+
+    Raises:
+        DataError: The file is missing or no such map.
+        UsageError: shapely is not installed.
+    """
+    try:
+        return _decode(readings.load_json(path))
+    except DataError as error:
+        raise DataError(error.problem, file=path, record=error.record, cure=error.cure or _AGAIN) from error
+
+
+def _decode(content: Any) -> ArgoverseMap:
+    groups = ("lane_segments", "drivable_areas", "pedestrian_crossings")
+    if not isinstance(content, dict) or not all(isinstance(content.get(group), dict) for group in groups):
+        raise DataError(f"is no Argoverse 2 map with {', '.join(groups)}", cure=_AGAIN)
+    segments, areas, crossings = ([*content[group].values()] for group in groups)
+    lanes = [lane for segment in segments if (lane := _lane(segment)) is not None]
+    lines = _lines(segments)
+    rings: list[Area] = [(_points(area, "area_boundary"), ()) for area in areas]
+    walks = [np.concatenate((_points(walk, "edge1"), _points(walk, "edge2")[::-1])) for walk in crossings]
+    walks = [walk for walk in walks if len(walk) >= 3]
+    _check_extent([lane.points for lane in lanes], [line for _, line in lines], [r for r, _ in rings], walks)
+    free = 1 + max((lane.feature_id for lane in lanes), default=0)
+    edges = road_edges(rings, free)
+    free += len(edges)
+    drawn = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
+    rest = [MapFeature(free + number, kind, points) for number, (kind, points) in enumerate(drawn)]
+    lost = readings.counted(lanes_without_length=len(segments) - len(lanes))
+    return ArgoverseMap((*lanes, *edges, *rest), lost)
+
+
+def _lane(segment: Any) -> MapFeature | None:
+    """A lane, or None where its boundaries have no length."""
+    left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
+    if min(arc_lengths(left).max(initial=0.0), arc_lengths(right).max(initial=0.0)) < 1e-3:
+        return None
+    left, right = _beside(left, right)
+    return MapFeature(
+        feature_id=_id(segment.get("id")),
+        kind=_LANES.get(str(segment.get("lane_type")), RoadKind.LANE_UNDEFINED),
+        points=_centre(segment, (left + right) / 2),
+        width_m=float(np.median(np.hypot(*(left - right)[:, :2].T))),
+        successors=_ids(segment, "successors"),
+        predecessors=_ids(segment, "predecessors"),
+        left_neighbours=_neighbour(segment, "left_neighbor_id"),
+        right_neighbours=_neighbour(segment, "right_neighbor_id"),
+        interpolating=segment.get("is_intersection") is True,
+    )
+
+
+def _beside(
+    left: Float[Array, "left 3"], right: Float[Array, "right 3"]
+) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
+    """Both boundaries at the same fractions of their lengths, so that points of the same row face each other."""
+    longest = max(arc_lengths(left)[-1], arc_lengths(right)[-1])
+    count = int(min(longest, 2 * _SPREAD_M) / _SPACING_M) + 2
+    fraction = np.linspace(0.0, 1.0, max(len(left), len(right), count))
+    return _at(left, fraction), _at(right, fraction)
+
+
+def _at(line: Float[Array, "point 3"], fraction: Float[Array, " sample"]) -> Float[Array, "sample 3"]:
+    """Points at fractions of a line's length."""
+    arc = arc_lengths(line)
+    return np.column_stack([np.interp(fraction * arc[-1], arc, line[:, axis]) for axis in range(3)])
+
+
+def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "centre 3"]:
+    """The centre line: the given one where there is one, else the middle between the boundaries.
+
+    Forecasting maps give centre lines on z = 0; heights are those between the boundaries.
+    """
+    if segment.get("centerline") is None:
+        return middle
+    given = _points(segment, "centerline")
+    arc = arc_lengths(given)
+    if arc.max(initial=0.0) < 1e-3:
+        return middle
+    given[:, 2] = _at(middle, arc / arc[-1])[:, 2]
+    return given
+
+
+def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]]:
+    """Painted boundaries, each once: lanes beside each other both name the line between them."""
+    lines: dict[bytes, tuple[RoadKind, Array]] = {}
+    for segment in segments:
+        for side in ("left", "right"):
+            mark = str(segment.get(f"{side}_lane_mark_type"))
+            points = _points(segment, f"{side}_lane_boundary")
+            if mark == "NONE" or len(points) < 2:
+                continue
+            centimetres = np.round(points * 100) + 0.0  # no negative zeros
+            ends = centimetres[0].tolist(), centimetres[-1].tolist()
+            key = (centimetres if ends[0] <= ends[1] else centimetres[::-1]).tobytes()
+            lines.setdefault(key, (_MARKS.get(mark, RoadKind.LINE_UNKNOWN), points))
+    return list(lines.values())
+
+
+def _points(record: Any, name: str) -> Float[Array, "point 3"]:
+    """A list of points of the map.
+
+    Raises:
+        DataError: It is missing, no list of points, or nowhere.
+    """
+    try:
+        rows = [(point["x"], point["y"], point["z"]) for point in record[name]]
+        points = np.array(rows, np.float64).reshape(-1, 3)
+        readings.check_within(FARTHEST_M, points)
+    except (TypeError, KeyError, ValueError, OverflowError, IndexError) as error:
+        raise DataError(f"{name} is no list of points", record=_name(record), cure=_AGAIN) from error
+    return points
+
+
+def _name(record: Any) -> str | None:
+    return str(record.get("id"))[:40] if isinstance(record, dict) else None
+
+
+def _ids(record: Any, name: str) -> tuple[int, ...]:
+    links = record.get(name)
+    if not isinstance(links, list):
+        raise DataError(f"{name} is no list of ids", record=_name(record), cure=_AGAIN)
+    return tuple(_id(link) for link in links)
+
+
+def _neighbour(record: Any, name: str) -> tuple[int, ...]:
+    return () if record.get(name) is None else (_id(record[name]),)
+
+
+def _id(value: Any) -> int:
+    if not isinstance(value, int) or not 0 <= value < 2**62:
+        raise DataError(f"{str(value)[:40]!r} is no id of a map element", cure=_AGAIN)
+    return value
+
+
+def _check_extent(*groups: Sequence[Float[Array, "_ 3"]]) -> None:
+    """Refuse maps with points far away from the others: lines of that length would be cut into millions of segments."""
+    lines = [line for group in groups for line in group if len(line)]
+    if not lines:
+        return
+    points = np.concatenate(lines)
+    if not (np.abs(points - np.median(points, axis=0)) <= _SPREAD_M).all():
+        raise DataError("a point of the map is nowhere near the others", cure=_AGAIN)

@@ -1,0 +1,223 @@
+"""Reader of Argoverse 2 motion forecasting: one parquet file per scenario, its map as JSON beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from drivax.datasets import readings
+from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
+from drivax.datasets.argoverse.tables import PARQUET_MAGIC, Kind, Table, Words, has_magic, read_table
+from drivax.datasets.argoverse.vehicle import (
+    CENTRE_AHEAD_M,
+    DATASET,
+    EGO_SIZE,
+    FARTHEST_M,
+    FASTEST_MPS,
+    MOST_STATES,
+)
+from drivax.datasets.ground import lift
+from drivax.datasets.places import place_tags
+from drivax.datasets.reader import BadRecord, Description
+from drivax.errors import DataError
+from drivax.geometry.angles import wrap
+from drivax.scenario.recording import Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag
+
+Array = np.ndarray[Any, Any]
+
+EGO = "AV"
+#: Values of ``object_category``.
+_SCORED = 2
+_COLUMNS: dict[str, Kind] = {
+    "track_id": "text",
+    "object_type": "text",
+    "object_category": "whole",
+    "timestep": "whole",
+    "position_x": "number",
+    "position_y": "number",
+    "heading": "number",
+    "velocity_x": "number",
+    "velocity_y": "number",
+    "scenario_id": "text",
+    "start_timestamp": "number",
+    "end_timestamp": "number",
+    "num_timestamps": "whole",
+    "focal_track_id": "text",
+    "city": "text",
+    "slice_id": "text",
+}
+#: Kind and size (length, width, height in metres) of each ``object_type``: the files hold no sizes. Medians of the
+#: boxes of sensor logs; cyclists with the length of their vehicle and the height of a person.
+_TYPES: dict[str, tuple[AgentKind, tuple[float, float, float]]] = {
+    "vehicle": (AgentKind.VEHICLE, (4.1, 1.9, 1.6)),
+    "bus": (AgentKind.VEHICLE, (11.6, 2.9, 3.0)),
+    "pedestrian": (AgentKind.PEDESTRIAN, (0.7, 0.7, 1.8)),
+    "motorcyclist": (AgentKind.CYCLIST, (1.8, 0.6, 1.7)),
+    "cyclist": (AgentKind.CYCLIST, (1.8, 0.6, 1.7)),
+    "riderless_bicycle": (AgentKind.OTHER, (1.6, 0.5, 1.2)),
+    "static": (AgentKind.STATIC, (0.5, 0.5, 1.0)),
+    "background": (AgentKind.STATIC, (0.5, 0.5, 1.0)),
+    "construction": (AgentKind.STATIC, (0.4, 0.4, 0.9)),
+    "unknown": (AgentKind.OTHER, (0.5, 0.5, 1.0)),
+}
+_MOST_STEPS = 1000
+_SKIP = "skip this scenario, or download it again"
+
+
+@dataclass(frozen=True)
+class ArgoverseMotion:
+    """Reads motion forecasting scenarios: 110 steps at 10 Hz (50 in the test split), lane graph, no box sizes."""
+
+    name: str = "av2-motion"
+    patterns: tuple[str, ...] = ("scenario_*.parquet",)
+    companions: tuple[str, ...] = (MAP_PATTERN,)
+
+    def recognise(self, path: Path) -> bool:
+        """Whether a parquet file is called as the scenarios are."""
+        return path.match(self.patterns[0]) and has_magic(path, PARQUET_MAGIC)
+
+    def describe(self, path: Path) -> Description:
+        """Tracks, steps, city and split of one scenario.
+
+        Raises:
+            DataError: It is damaged.
+        """
+        table = read_table(path, _COLUMNS)
+        steps = 1 + int(table.numbers["timestep"].max())
+        beside = _map_path(path)
+        return Description(
+            dataset="Argoverse 2 Motion Forecasting",
+            flavour=f"one scenario of {steps} steps in {table.texts['city'].text(0)}",
+            recordings=1,
+            notes=(
+                f"{len(table.texts['track_id'].words)} tracks",
+                "box sizes are those of the class; there are no speed limits, lights or stop signs",
+            ),
+            missing=() if beside.is_file() else (beside.name,),
+        )
+
+    def count(self, path: Path) -> int:
+        """One: every scenario gives one window."""
+        return int(has_magic(path, PARQUET_MAGIC))
+
+    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
+        """The recording in a file, or why it cannot be read."""
+        try:
+            yield decode(path)
+        except DataError as error:
+            yield BadRecord.of(error, path)
+
+
+def _map_path(path: Path) -> Path:
+    """Where the map of a scenario lies."""
+    return path.with_name(f"log_map_archive_{path.stem.removeprefix('scenario_')}.json")
+
+
+def decode(path: Path) -> Recording:
+    """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` beside it.
+
+    The city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
+    those of the map; sizes those of the class; velocities as given, smoothed by the source.
+
+    Raises:
+        DataError: One of them is missing, damaged, or contradicts itself.
+        UsageError: pyarrow or shapely is not installed.
+    """
+    table = read_table(path, _COLUMNS)
+    local_map = read_map(_map_path(path))
+    try:
+        tracks, ego = _tracks(table)
+    except DataError as error:
+        raise DataError(error.problem, file=path, cure=_SKIP) from error
+    steps = tracks.valid.shape[1]
+    scenario_id, names = table.texts["scenario_id"].text(0), table.texts["track_id"]
+    focal = table.texts["focal_track_id"].text(0)
+    category = _of_track(table.numbers["object_category"], names)
+    return Recording(
+        scenario_id=scenario_id,
+        dataset=DATASET,
+        segment=table.texts["slice_id"].text(0) or scenario_id,
+        timestamps_s=_timestamps(table, steps),
+        current_step=min(CURRENT_STEP, steps - 1),
+        ego=ego,
+        tracks=lift(tracks, local_map.features),
+        features=local_map.features,
+        to_predict=tuple(row for row, word in enumerate(names.words) if word == focal),
+        of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
+        tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
+        lost=local_map.lost | readings.counted(repeated_rows=table.rows - int(tracks.valid.sum())),
+        flags=Flag.DEFAULT_SIZES,
+    )
+
+
+def _of_track(values: Array, names: Words) -> Array:
+    """The value of the first row of each track."""
+    _, first = np.unique(names.of_row, return_index=True)
+    return values[first]
+
+
+def _tracks(table: Table) -> tuple[Tracks, int]:
+    """All tracks in order of appearance, in the plane, and the row of the ego."""
+    names, step = table.texts["track_id"], table.numbers["timestep"]
+    if EGO not in names.words:
+        raise DataError(f"has no track {EGO}")
+    if not 0 <= step.min() <= step.max() < _MOST_STEPS:
+        raise DataError(f"timesteps run from {step.min()} to {step.max()}")
+    if len(names.words) * (int(step.max()) + 1) > MOST_STATES:
+        raise DataError(f"{len(names.words)} tracks of {step.max() + 1} steps are too many")
+    ego, row = names.words.index(EGO), names.of_row
+    columns = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
+    states = np.zeros((len(names.words), int(step.max()) + 1, len(columns)))
+    valid = np.zeros(states.shape[:2], bool)
+    states[row, step], valid[row, step] = table.stacked(columns), True
+    readings.check_within(FARTHEST_M, states[..., :3])
+    readings.check_within(FASTEST_MPS, states[..., 3:])
+    heading = np.where(valid, wrap(states[..., 2]), 0.0)
+    xy = states[..., :2].copy()
+    there = valid[ego]
+    xy[ego, there] = readings.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
+    kinds, sizes = _classes(table.texts["object_type"], names, ego)
+    return Tracks(
+        xy=xy,
+        z=np.zeros(valid.shape),
+        heading=heading,
+        velocity=states[..., 3:].copy(),
+        size=np.where(valid[..., None], sizes[:, None], 0.0),
+        valid=valid,
+        kind=kinds,
+        track_id=_track_ids(names.words),
+    ), ego
+
+
+def _classes(types: Words, names: Words, ego: int) -> tuple[Array, Float64[Array, "track 3"]]:
+    """Kinds and sizes of all tracks."""
+    known = [_TYPES.get(types.words[code], _TYPES["unknown"]) for code in _of_track(types.of_row, names)]
+    sizes = np.array([size for _, size in known], np.float64)
+    sizes[ego] = EGO_SIZE
+    return np.array([kind for kind, _ in known], np.int8), sizes
+
+
+def _track_ids(words: tuple[str, ...]) -> Int[Array, " track"]:
+    """The ids as numbers, the ego's as 0; row numbers where some are no numbers of their own."""
+    given = [
+        0 if word == EGO else int(word) if word.isascii() and word.isdecimal() and len(word) < 10 else -1
+        for word in words
+    ]
+    if min(given) < 0 or len(set(given)) < len(given):
+        return np.arange(len(words), dtype=np.int64)
+    return np.array(given, np.int64)
+
+
+def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
+    """Seconds of every step: the file gives the first, the last and their number."""
+    start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
+    intervals = int(table.numbers["num_timestamps"][0]) - 1
+    between = (end - start) / intervals if intervals > 0 else DT_S
+    readings.check_within(1e12, np.array([start, between]))
+    return start + between * np.arange(steps)

@@ -1,0 +1,247 @@
+"""Reader of Argoverse 2 sensor logs: cuboids around the car, its poses and the local map; no images, no lidar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from drivax.datasets import readings
+from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
+from drivax.datasets.argoverse.tables import FEATHER_MAGIC, Kind, Table, has_magic, read_table
+from drivax.datasets.argoverse.vehicle import (
+    AXLE_HEIGHT_M,
+    CENTRE_AHEAD_M,
+    DATASET,
+    EGO_SIZE,
+    FARTHEST_M,
+    LARGEST_M,
+    MOST_STATES,
+)
+from drivax.datasets.places import place_tags
+from drivax.datasets.reader import BadRecord, Description
+from drivax.errors import DataError
+from drivax.scenario.recording import Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag
+
+Array = np.ndarray[Any, Any]
+
+EGO = "EGO_VEHICLE"
+POSES = "city_SE3_egovehicle.feather"
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_SIZE = ("length_m", "width_m", "height_m")
+_POSE_COLUMNS: dict[str, Kind] = {"timestamp_ns": "whole", **dict.fromkeys(_POSE, "number")}
+_BOX_COLUMNS: dict[str, Kind] = {
+    **_POSE_COLUMNS, **dict.fromkeys(_SIZE, "number"), "track_uuid": "text", "category": "text"
+}  # fmt: skip
+_VEHICLES = (
+    EGO, "REGULAR_VEHICLE", "LARGE_VEHICLE", "BUS", "SCHOOL_BUS", "ARTICULATED_BUS", "BOX_TRUCK", "TRUCK",
+    "TRUCK_CAB", "VEHICULAR_TRAILER", "RAILED_VEHICLE",
+)  # fmt: skip
+_PEOPLE = ("PEDESTRIAN", "OFFICIAL_SIGNALER", "STROLLER", "WHEELCHAIR")
+_CYCLES = ("BICYCLE", "BICYCLIST", "MOTORCYCLE", "MOTORCYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER")
+_THINGS = (
+    "BOLLARD", "CONSTRUCTION_BARREL", "CONSTRUCTION_CONE", "SIGN", "STOP_SIGN", "MESSAGE_BOARD_TRAILER",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN", "TRAFFIC_LIGHT_TRAILER",
+)  # fmt: skip
+#: Animals and categories of later versions are OTHER.
+_KINDS = {
+    **dict.fromkeys(_VEHICLES, AgentKind.VEHICLE),
+    **dict.fromkeys(_PEOPLE, AgentKind.PEDESTRIAN),
+    **dict.fromkeys(_CYCLES, AgentKind.CYCLIST),
+    **dict.fromkeys(_THINGS, AgentKind.STATIC),
+}
+_SKIP = "skip this log, or download it again"
+
+
+@dataclass(frozen=True)
+class ArgoverseSensor:
+    """Reads sensor logs: about 156 frames at 10 Hz with measured boxes, heights, and the local map."""
+
+    name: str = "av2-sensor"
+    patterns: tuple[str, ...] = ("annotations.feather", "annotations_with_ego.feather")
+    companions: tuple[str, ...] = (
+        POSES,
+        MAP_PATTERN,
+        "*___img_Sim2_city.json",
+        "*_ground_height_surface_*.npy",
+    )
+
+    def recognise(self, path: Path) -> bool:
+        """Whether a feather file is called as the annotations of a log are."""
+        return path.name in self.patterns and has_magic(path, FEATHER_MAGIC)
+
+    def describe(self, path: Path) -> Description:
+        """Frames, tracks and city of a log.
+
+        Raises:
+            DataError: It is damaged.
+        """
+        table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
+        frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
+        map_path = _map_path(path)
+        poses = path.with_name(POSES)
+        return Description(
+            dataset="Argoverse 2 Sensor",
+            flavour=f"one log of {frames} frames in {_places(map_path).get('place', 'an unknown city')}",
+            recordings=1,
+            notes=(f"{tracks} tracks", "there are no speed limits, lights or stop signs"),
+            missing=(
+                *(() if poses.is_file() else (POSES,)),
+                *(() if map_path is not None else (f"map/{MAP_PATTERN}",)),
+            ),
+        )
+
+    def count(self, path: Path) -> int:
+        """How many windows the frames of a log give."""
+        try:
+            times = read_table(path, {"timestamp_ns": "whole"}).numbers["timestamp_ns"]
+        except DataError:
+            return 0
+        return readings.windows_of(len(np.unique(times)))
+
+    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
+        """The recording in a log, or why it cannot be read."""
+        try:
+            yield decode(path)
+        except DataError as error:
+            yield BadRecord.of(error, path)
+
+
+def _map_path(path: Path) -> Path | None:
+    """Where the map of a log lies, if it is there."""
+    return next(iter(sorted((path.parent / "map").glob(MAP_PATTERN))), None)
+
+
+def _places(map_path: Path | None) -> dict[str, str]:
+    """Tags of the place in a map's name: ``log_map_archive_<log>____MIA_city_<number>.json``."""
+    _, _, ending = ("" if map_path is None else map_path.stem).partition("____")
+    return place_tags(ending.split("_")[0])
+
+
+def decode(path: Path) -> Recording:
+    """The recording of a log: its annotations, ``city_SE3_egovehicle.feather`` and ``map/log_map_archive_*.json``.
+
+    The city's frame, metres. Boxes are given in the car's frame and moved with its pose of the same time stamp; the
+    ego is moved from its rear axle to the middle of its box; velocities are differences of positions.
+
+    Raises:
+        DataError: One of them is missing, damaged, or contradicts another.
+        UsageError: pyarrow or shapely is not installed.
+    """
+    boxes = read_table(path, _BOX_COLUMNS)
+    poses = read_table(path.with_name(POSES), _POSE_COLUMNS)
+    map_path = _map_path(path)
+    if map_path is None:
+        raise DataError(
+            f"has no map/{MAP_PATTERN} beside it", file=path, cure="download the folder map of the log"
+        )
+    local_map = read_map(map_path)
+    log_id = path.resolve().parent.name
+    try:
+        clock, lost_frames = _clock(boxes, poses)
+        tracks = _tracks(boxes, poses, clock)
+    except DataError as error:
+        raise DataError(error.problem, file=path, cure=error.cure or _SKIP) from error
+    return Recording(
+        scenario_id=log_id,
+        dataset=DATASET,
+        segment=log_id,
+        timestamps_s=clock * 1e-9,
+        current_step=min(CURRENT_STEP, len(clock) - 1),
+        ego=0,
+        tracks=tracks,
+        features=local_map.features,
+        tags={"source_format": "av2-sensor"} | _places(map_path),
+        lost=local_map.lost | readings.counted(frames_without_pose=lost_frames),
+        flags=Flag.DIFFERENTIATED_VELOCITY,
+    )
+
+
+def _clock(boxes: Table, poses: Table) -> tuple[Int[Array, " step"], int]:
+    """Time stamps of the frames with a pose, nanoseconds, and how many have none."""
+    frames = np.unique(boxes.numbers["timestamp_ns"])
+    posed = np.isin(frames, poses.numbers["timestamp_ns"])
+    if not posed.any():
+        raise DataError(f"no frame has a pose in {POSES}")
+    return frames[posed], int((~posed).sum())
+
+
+def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
+    """All tracks in the city's frame; the ego is row 0 and there at every step."""
+    pose = _poses(poses, clock)
+    stamp, code = boxes.numbers["timestamp_ns"], boxes.texts["track_uuid"].of_row
+    category = boxes.texts["category"]
+    is_ego = np.array([word == EGO for word in category.words])[category.of_row]
+    rows = np.flatnonzero(np.isin(stamp, clock) & ~is_ego)
+    codes, first, row = np.unique(code[rows], return_index=True, return_inverse=True)
+    if (1 + len(codes)) * len(clock) > MOST_STATES:
+        raise DataError(f"{len(codes)} tracks of {len(clock)} frames are too many")
+    step = np.searchsorted(clock, stamp[rows])
+    table = _boxes(boxes, rows, pose[step])
+    states = np.zeros((1 + len(codes), len(clock), table.shape[1]))
+    valid = np.zeros(states.shape[:2], bool)
+    states[1 + row, step], valid[1 + row, step] = table, True
+    states[0], valid[0] = _ego(boxes, np.flatnonzero(is_ego), pose), True
+    kinds = [_KINDS.get(category.text(int(rows[number])), AgentKind.OTHER) for number in first]
+    return Tracks(
+        xy=states[..., :2].copy(),
+        z=states[..., 2].copy(),
+        heading=states[..., 3].copy(),
+        velocity=readings.differentiate(states[..., :2], valid, clock * 1e-9),
+        size=states[..., 4:].copy(),
+        valid=valid,
+        kind=np.array([AgentKind.VEHICLE, *kinds], np.int8),
+        track_id=np.concatenate(([0], 1 + codes)),
+    )
+
+
+def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
+    """The pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
+    known, first = np.unique(poses.numbers["timestamp_ns"], return_index=True)
+    pose = poses.stacked(_POSE)[first[np.searchsorted(known, clock)]]
+    readings.check_within(FARTHEST_M, pose[:, 4:])
+    pose[:, :4] = _unit(pose[:, :4])
+    return pose
+
+
+def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
+    """Boxes in the city's frame: x, y, z, heading, length, width, height."""
+    table = boxes.stacked((*_POSE, *_SIZE))[rows]
+    readings.check_within(FARTHEST_M, table[:, 4:7])
+    readings.check_within(LARGEST_M, table[:, 7:])
+    forward = rotate(pose[:, :4], rotate(_unit(table[:, :4]), np.array([1.0, 0.0, 0.0])))
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    return np.column_stack((rotate(pose[:, :4], table[:, 4:7]) + pose[:, 4:], heading, table[:, 7:]))
+
+
+def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -> Float[Array, "step 7"]:
+    """The ego's boxes like those of :func:`_boxes`.
+
+    Some logs hold boxes of the car itself; their sizes are right, their centres are the rear axle again.
+    """
+    size = np.median(boxes.stacked(_SIZE)[rows], axis=0) if len(rows) else np.array(EGO_SIZE)
+    readings.check_within(LARGEST_M, size)
+    centre = rotate(pose[:, :4], np.array([CENTRE_AHEAD_M, 0.0, size[2] / 2 - AXLE_HEIGHT_M])) + pose[:, 4:]
+    forward = rotate(pose[:, :4], np.array([1.0, 0.0, 0.0]))
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    return np.column_stack((centre, heading, np.broadcast_to(size, (len(pose), 3))))
+
+
+def rotate(quaternion: Float[Array, "row 4"], vector: Float[Array, "*rows 3"]) -> Float[Array, "row 3"]:
+    """Vectors turned by unit quaternions (w, x, y, z): v + 2 w (u x v) + 2 u x (u x v)."""
+    axis = quaternion[:, 1:]
+    across = 2.0 * np.cross(axis, np.broadcast_to(vector, axis.shape))
+    return vector + quaternion[:, :1] * across + np.cross(axis, across)
+
+
+def _unit(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:
+    readings.check_within(2.0, quaternion)
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    if not (length > 0.5).all():
+        raise DataError("a rotation is no quaternion")
+    return quaternion / length

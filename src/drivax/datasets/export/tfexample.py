@@ -1,0 +1,311 @@
+"""Scenarios as tf.Examples of the Waymo Open Motion Dataset: what Waymax and V-Max read.
+
+Names, types, shapes and the value -1 for what is missing are those of the motion dataset (waymo.com/open/data/motion/
+tfexample); ``path_samples`` and ``roadgraph_samples/speed_limit`` are those of ScenarioMax, which V-Max trains on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from drivax.datasets.export.restore import restore
+from drivax.datasets.readings import MPS_PER_MPH
+from drivax.geometry.polylines import project, resample
+from drivax.scenario.recording import MapFeature, Recording, Tracks
+from drivax.scenario.schema import (
+    CURRENT_STEP,
+    EDGE_KINDS,
+    LANE_KINDS,
+    LINE_KINDS,
+    POLYGON_KINDS,
+    STEPS,
+    AgentKind,
+    RoadKind,
+    Scenario,
+)
+
+_Array = np.ndarray[Any, Any]
+
+AGENTS, LIGHTS, POINTS = 128, 16, 30_000
+_SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
+#: At most so many tracks to predict come before all others.
+_FIRST = 8
+#: Just under 1 m, so that rounding never makes a gap of more: readers cut polylines there.
+_SPACING_M = 0.998
+#: Absolute coordinates are written up to here, where float32 is exact to half a millimetre.
+_ABSOLUTE_M = 16_384.0
+#: float32 holds whole numbers up to here.
+_FLOAT_ID_END, _INT_ID_END = 2**24, 2**31
+#: Order of the official writer; what is later is cut off first by readers that take fewer points.
+_ORDER = (
+    *LANE_KINDS, *LINE_KINDS, RoadKind.STOP_SIGN, RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, *EDGE_KINDS,
+    RoadKind.DRIVEWAY,
+)  # fmt: skip
+#: A path is on the route where the log keeps this near to it for most of its steps.
+_ON_ROUTE_M, _ON_ROUTE_SHARE = 1.5, 0.95
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Form of ``path_samples``: so many paths of so many points, so far apart."""
+
+    count: int
+    points: int
+    spacing_m: float
+
+
+PATHS = {"vmax": Paths(10, 300, 1.0), "published": Paths(10, 500, 0.5)}
+
+
+def tf_example(
+    scenario: Scenario, paths: Paths = PATHS["vmax"]
+) -> tuple[dict[str, bytes | _Array], Counter[str]]:
+    """The features of one scenario by name, and what did not fit by name.
+
+    Coordinates are the source's own (float32, as in the data set) where all are below 16,384 m, else relative to the
+    ego at the current step: UTM coordinates would be rounded to half a metre. Ids that their type cannot hold exactly
+    (agents: float32, map: int32) are replaced by running numbers.
+
+    Args:
+        scenario: Any stored scenario.
+        paths: Form of ``path_samples``.
+    """
+    recording = restore(scenario)
+    tracks, lost = _over_time(recording)
+    origin = _origin(recording, scenario.origin)
+    order = _order(tracks, recording)
+    lost["agents"] += max(len(order) - AGENTS, 0)
+    micros = np.round(np.arange(STEPS) * float(scenario.dt_s) * 1e6).astype(np.int64)
+    numbers = _numbers([feature.feature_id for feature in recording.features], recording)
+    features = {"scenario/id": recording.scenario_id.encode()}
+    features |= _states(tracks, order[:AGENTS], micros, origin) | _marks(tracks, recording, order[:AGENTS])
+    features |= _lights(recording, numbers, micros, origin, lost)
+    features |= _map(recording.features, numbers, origin)
+    features |= _paths(scenario, numbers, scenario.origin - origin, paths)
+    return features, +lost
+
+
+def _origin(recording: Recording, local: _Array) -> _Array:
+    """What is subtracted from the source's coordinates."""
+    points = [recording.tracks.xy[recording.tracks.valid]] + [f.points[:, :2] for f in recording.features]
+    largest = max(float(np.abs(part).max(initial=0.0)) for part in points)
+    return np.zeros(3) if largest < _ABSOLUTE_M else np.asarray(local, np.float64)
+
+
+def _over_time(recording: Recording) -> tuple[Tracks, Counter[str]]:
+    """Tracks over the 91 steps around the current one; steps that the recording lacks are not valid."""
+    tracks = recording.tracks
+    steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
+    known = (steps >= 0) & (steps < tracks.valid.shape[1])
+    index = np.clip(steps, 0, tracks.valid.shape[1] - 1)
+    timed = {name: getattr(tracks, name)[:, index] for name in ("xy", "z", "heading", "velocity", "size")}
+    valid = tracks.valid[:, index] & known
+    cut = Tracks(**timed, valid=valid, kind=tracks.kind, track_id=tracks.track_id)
+    return cut, Counter(steps=int(tracks.valid.shape[1] - known.sum()))
+
+
+def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
+    """Rows in the order of the file: the ego, then the data set's order.
+
+    There: up to 8 tracks to predict by id, then those that are valid now by their distance from the ego, then all
+    others, those with most valid steps first. The ego stands in front of them all because V-Max takes row 0 for it.
+    """
+    now = tracks.valid[:, CURRENT_STEP]
+    wanted = [row for row in recording.to_predict if now[row] and row != recording.ego]
+    first = sorted(wanted, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
+    at = tracks.xy[:, CURRENT_STEP]
+    away = np.hypot(*(at - at[recording.ego]).T)
+    rank = np.where(now, away, 1e9 - tracks.valid.sum(axis=1))
+    rank[first] = -2.0 + np.arange(len(first)) / _FIRST
+    rank[recording.ego] = -np.inf
+    order = np.argsort(rank, kind="stable")
+    return order[tracks.valid[order].any(axis=1)]
+
+
+def _padded(values: _Array, rows: int) -> _Array:
+    """The array with rows of -1 appended."""
+    out = np.full((rows, *values.shape[1:]), -1, values.dtype)
+    out[: len(values)] = values
+    return out
+
+
+def _states(tracks: Tracks, order: _Array, micros: _Array, origin: _Array) -> dict[str, _Array]:
+    valid = tracks.valid[order]
+    vx, vy = np.moveaxis(tracks.velocity[order], -1, 0)
+    columns = {
+        "x": tracks.xy[order, :, 0] - origin[0],
+        "y": tracks.xy[order, :, 1] - origin[1],
+        "z": tracks.z[order] - origin[2],
+        "bbox_yaw": tracks.heading[order],
+        "length": tracks.size[order, :, 0],
+        "width": tracks.size[order, :, 1],
+        "height": tracks.size[order, :, 2],
+        "velocity_x": vx,
+        "velocity_y": vy,
+        "speed": np.hypot(vx, vy),
+        "vel_yaw": np.arctan2(vy, vx),
+        "timestamp_micros": np.broadcast_to(micros, valid.shape),
+    }
+    table = {name: _padded(np.where(valid, column, -1), AGENTS) for name, column in columns.items()}
+    table["valid"] = np.maximum(_padded(valid.astype(np.int64), AGENTS), 0)
+    return {
+        f"state/{span}/{name}": column[:, part]
+        for span, part in _SPANS.items()
+        for name, column in table.items()
+    }
+
+
+def _marks(tracks: Tracks, recording: Recording, order: _Array) -> dict[str, _Array]:
+    """What is said about each row once; -1 in rows without an agent."""
+    ids = tracks.track_id[order]
+    if ids.max(initial=0) >= _FLOAT_ID_END:
+        ids = np.arange(len(order))
+    # The data set has no class for cones and barriers.
+    kinds = np.where(tracks.kind[order] == AgentKind.STATIC, AgentKind.OTHER, tracks.kind[order])
+
+    def marked(rows: tuple[int, ...]) -> _Array:
+        return np.isin(order, rows).astype(np.int64)
+
+    columns = {
+        "id": ids.astype(np.float32),
+        "type": kinds.astype(np.float32),
+        "is_sdc": marked((recording.ego,)),
+        "tracks_to_predict": marked(recording.to_predict),
+        "objects_of_interest": marked(recording.of_interest),
+        "difficulty_level": np.zeros(len(order), np.int64),
+    }
+    return {f"state/{name}": _padded(column, AGENTS) for name, column in columns.items()}
+
+
+def _numbers(ids: list[int], recording: Recording) -> dict[int, int]:
+    """Ids of map features as they are written."""
+    used = dict.fromkeys((*ids, *(light.lane_id for light in recording.lights)))
+    fit = all(0 <= number < _INT_ID_END for number in used)
+    return {number: number if fit else row for row, number in enumerate(used)}
+
+
+def _lights(
+    recording: Recording, numbers: Mapping[int, int], micros: _Array, origin: _Array, lost: Counter[str]
+) -> dict[str, _Array]:
+    """Lights in slots, time-major; up to 16 keep their slot, of more the nearest that are observed at a step."""
+    lights = recording.lights
+    steps = recording.current_step - CURRENT_STEP + np.arange(STEPS)
+    states = np.full((STEPS, max(len(lights), LIGHTS)), -1, np.int64)
+    known = (steps >= 0) & (steps < len(recording.timestamps_s))
+    for column, light in enumerate(lights):
+        states[known, column] = light.states[steps[known]]
+    slot = np.broadcast_to(np.arange(LIGHTS), (STEPS, LIGHTS))
+    if len(lights) > LIGHTS:
+        slot = np.argsort(states < 0, axis=1, kind="stable")[:, :LIGHTS]
+        lost["light_states"] += int((states >= 0).sum() - (np.take_along_axis(states, slot, 1) >= 0).sum())
+    seen = np.take_along_axis(states, slot, 1) >= 0
+    lane = np.full(states.shape[1], -1, np.int64)
+    point = np.full((states.shape[1], 3), -1.0)
+    lane[: len(lights)] = [numbers[light.lane_id] for light in lights]
+    point[: len(lights)] = np.array([light.stop_point for light in lights]).reshape(-1, 3) - origin
+    table = {
+        "state": np.take_along_axis(states, slot, 1),
+        "id": np.where(seen, lane[slot], -1),
+        "valid": seen.astype(np.int64),
+        **{axis: np.where(seen, point[slot, i], -1.0) for i, axis in enumerate("xyz")},
+        "timestamp_micros": micros,
+    }
+    return {
+        f"traffic_light_state/{span}/{name}": column[part]
+        for span, part in _SPANS.items()
+        for name, column in table.items()
+    }
+
+
+def _map(features: tuple[MapFeature, ...], numbers: Mapping[int, int], origin: _Array) -> dict[str, _Array]:
+    """Points along every feature, at most 1 m apart; further where 30,000 would not be enough."""
+    rank = {kind: number for number, kind in enumerate(_ORDER)}
+    ordered = sorted(features, key=lambda feature: rank[feature.kind])
+    spacing = _SPACING_M
+    lines = [_dense(feature, spacing) for feature in ordered]
+    while sum(map(len, lines)) > POINTS:
+        spacing *= 1.1
+        lines = [_dense(feature, spacing) for feature in ordered]
+    counts = [len(line) for line in lines]
+    limits = [-1.0 if f.limit_mps is None else f.limit_mps / MPS_PER_MPH for f in ordered]
+    columns = {
+        "xyz": np.concatenate([*lines, np.zeros((0, 3))]) - origin,
+        "dir": np.concatenate([*map(_directions, lines), np.zeros((0, 3))]),
+        "id": np.repeat([numbers[f.feature_id] for f in ordered], counts).astype(np.int64)[:, None],
+        "type": np.repeat([int(f.kind) for f in ordered], counts).astype(np.int64)[:, None],
+        "speed_limit": np.repeat(limits, counts).astype(np.float64),
+        "valid": np.ones((sum(counts), 1), np.int64),
+    }
+    table = {f"roadgraph_samples/{name}": _padded(column, POINTS) for name, column in columns.items()}
+    table["roadgraph_samples/valid"] = np.maximum(table["roadgraph_samples/valid"], 0)
+    return table
+
+
+def _dense(feature: MapFeature, spacing_m: float) -> _Array:
+    """A feature's points with others between them, so that none is further from the next; polygons closed."""
+    points = feature.points
+    if feature.kind in POLYGON_KINDS:
+        points = np.concatenate((points, points[:1]))
+    step = np.diff(points, axis=0)
+    parts = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / spacing_m), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(step)), parts)
+    fraction = (np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[row]
+    return np.concatenate((points[row] + fraction[:, None] * step[row], points[-1:]))
+
+
+def _directions(line: _Array) -> _Array:
+    """Unit vectors to the next point; zero at the last one, as in the data set."""
+    step = np.diff(line, axis=0, append=line[-1:])
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return step / np.where(length > 0, length, 1.0)
+
+
+def _paths(scenario: Scenario, numbers: Mapping[int, int], shift: _Array, form: Paths) -> dict[str, _Array]:
+    """Routes from where the logged ego was first seen; the route to the goal first and on the route.
+
+    The log's own route (stored row 1) knows the future and is left out, unless no lane leads to the goal: then it is
+    row 0.
+    """
+    shape = (form.count, form.points)
+    xyz, lane = np.full((*shape, 3), -1.0), np.full(shape, -1, np.int64)
+    arc, valid, on_route = np.zeros(shape), np.zeros(shape, np.int64), np.zeros((form.count, 1), np.int64)
+    seen = scenario.agent_valid[:, 0]
+    log = np.column_stack((scenario.agent_xy[seen, 0], scenario.agent_z[seen, 0])).astype(np.float64)
+    used = [row for row in np.flatnonzero(scenario.route_points > 1) if row != 1][: form.count]
+    for number, row in enumerate(used):
+        count = int(scenario.route_points[row])
+        line = np.column_stack((scenario.route_xy[row, :count], scenario.route_z[row, :count])).astype(
+            np.float64
+        )
+        begin = min(int(np.hypot(*(line[:, :2] - log[0, :2]).T).argmin()), count - 2)
+        points, index = resample(line[begin:], form.spacing_m, form.points)
+        lanes = scenario.route_lane[row, begin:count][index]
+        size = len(points)
+        xyz[number, :size] = points + shift
+        lane[number, :size] = [_lane_number(scenario, int(i), numbers) for i in lanes]
+        arc[number, :size] = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+        valid[number, :size] = 1
+        on_route[number] = number == 0 or _follows(log[:, :2], points[:, :2])
+    return {
+        "path_samples/xyz": xyz,
+        "path_samples/id": lane,
+        "path_samples/arc_length": arc,
+        "path_samples/valid": valid,
+        "path_samples/on_route": on_route,
+    }
+
+
+def _lane_number(scenario: Scenario, lane: int, numbers: Mapping[int, int]) -> int:
+    return numbers.get(int(scenario.lane_id[lane]), -1) if lane >= 0 else -1
+
+
+def _follows(log: Float[_Array, "step 2"], path: Float[_Array, "point 2"]) -> bool:
+    """Whether the log keeps to the path."""
+    _, distance = project(path, log)
+    return bool((distance <= _ON_ROUTE_M).mean() >= _ON_ROUTE_SHARE)

@@ -1,0 +1,1 @@
+"""Reader of nuPlan logs and maps."""

@@ -1,0 +1,297 @@
+"""The nuScenes map expansion (one JSON file per city) as map features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.datasets.areas import Area, road_edges
+from drivax.datasets.nuscenes.cropping import Box
+from drivax.datasets.readings import load_json
+from drivax.errors import DataError
+from drivax.geometry.angles import wrap
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import EDGE_KINDS, LINE_KINDS, RoadKind
+
+Array = np.ndarray[Any, Any]
+
+_AGAIN = "unpack the map expansion again"
+#: Points of centre lines.
+SPACING_M = 0.5
+#: No lane is longer.
+_LONGEST_M = 5_000.0
+_TURNS = {"L": 1.0, "S": 0.0, "R": -1.0}
+#: Lanes beside each other: spacing of their centres, angle between them.
+_BESIDE_M, _PARALLEL_RAD = (2.2, 5.5), np.deg2rad(20.0)
+_WIDTHS_M = (2.0, 6.0)
+
+
+@dataclass(frozen=True)
+class City:
+    """The map of one city.
+
+    Attributes:
+        features: Everything, in the frame of the city (metres from its south-west corner), z = 0.
+        version: Version that the file names.
+        lost: Elements that could not be used, or name others that do not exist, by kind; of the whole city.
+    """
+
+    features: tuple[MapFeature, ...]
+    version: str
+    lost: Mapping[str, int]
+
+    def around(self, xy: Float[Array, "point 2"], margin_m: float) -> tuple[MapFeature, ...]:
+        """What reaches into the box around some points; lines are cut there, lanes and polygons stay whole."""
+        box = Box.around(xy, margin_m)
+        number = len(self.features)
+        kept: list[MapFeature] = []
+        for feature in self.features:
+            pieces = list(box.pieces(feature.points))
+            if not pieces and not (
+                len(feature.points) == 1 and box.touches(*([feature.points[:, :2]] * 2)).any()
+            ):
+                continue
+            if feature.kind not in (*EDGE_KINDS, *LINE_KINDS):
+                kept.append(feature)
+                continue
+            kept.append(replace(feature, points=pieces[0]))
+            for piece in pieces[1:]:
+                number += 1
+                kept.append(replace(feature, feature_id=number, points=piece))
+        return tuple(kept)
+
+
+@lru_cache(maxsize=4)
+def city(path: Path) -> City:
+    """The map in a file of the map expansion (v1.0 to v1.3).
+
+    Raises:
+        DataError: The file is missing or damaged.
+    """
+    content = load_json(path)
+    try:
+        return _Layers(content).city()
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        raise DataError(f"the map is damaged ({error!r})", file=path, cure=_AGAIN) from error
+
+
+class _Layers:
+    """The layers of one file, looked up by token."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self._content = content
+        self._nodes = {node["token"]: (float(node["x"]), float(node["y"])) for node in content["node"]}
+        if not np.isfinite(np.array(list(self._nodes.values()))).all():
+            raise ValueError("a node is nowhere")
+        self._lines = {line["token"]: line["node_tokens"] for line in content["line"]}
+        self._polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
+        self._lost: dict[str, int] = {}
+
+    def city(self) -> City:
+        """All features, lanes first, numbered in this order."""
+        lanes = self._lanes()
+        lines = [*self._dividers(), *self._crossings()]
+        numbered = [replace(line, feature_id=len(lanes) + i) for i, line in enumerate(lines)]
+        stops = self._stops(lanes, len(lanes) + len(numbered))
+        areas = [area for row in self._layer("drivable_area") for area in self._areas(row["polygon_tokens"])]
+        edges = road_edges(areas, len(lanes) + len(numbered) + len(stops))
+        version = str(self._content.get("version", "unknown"))
+        return City((*lanes, *numbered, *stops, *edges), version, self._lost)
+
+    def _layer(self, name: str) -> Sequence[Mapping[str, Any]]:
+        return self._content.get(name, ())
+
+    def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
+        """Nodes by token; those that do not exist are left out and counted."""
+        found = [self._nodes[token] for token in tokens if token in self._nodes]
+        self._count("nodes", len(tokens) - len(found))
+        return np.column_stack((np.array(found, np.float64).reshape(-1, 2), np.zeros(len(found))))
+
+    def _count(self, name: str, number: int) -> None:
+        if number:
+            self._lost[name] = self._lost.get(name, 0) + number
+
+    def _areas(self, tokens: Sequence[str]) -> Iterator[Area]:
+        for token in tokens:
+            polygon = self._polygons.get(token)
+            if polygon is None:
+                self._count("polygons", 1)
+                continue
+            holes = [self._points(hole["node_tokens"]) for hole in polygon.get("holes", ())]
+            yield self._points(polygon["exterior_node_tokens"]), holes
+
+    def _lanes(self) -> list[MapFeature]:
+        """Lanes and lane connectors along their arc lines, with links and neighbours."""
+        paths, links = self._content["arcline_path_3"], self._content["connectivity"]
+        rows = [(row, name) for name in ("lane", "lane_connector") for row in self._layer(name)]
+        lines = {row["token"]: arc_line(paths[row["token"]]) for row, _ in rows if row["token"] in paths}
+        drawn = [(row, name) for row, name in rows if len(lines.get(row["token"], ())) > 1]
+        self._count("lanes_without_path", len(rows) - len(drawn))
+        index = {row["token"]: i for i, (row, _) in enumerate(drawn)}
+        lanes: list[MapFeature] = []
+        for i, (row, name) in enumerate(drawn):
+            connects, line = name == "lane_connector", lines[row["token"]]
+            link = links.get(row["token"], {})
+            after, before = ([*link.get(way, ())] for way in ("outgoing", "incoming"))
+            self._count("dangling_links", sum(token not in index for token in (*after, *before)))
+            lanes.append(
+                MapFeature(
+                    i,
+                    RoadKind.LANE_SURFACE,
+                    np.column_stack((line, np.zeros(len(line)))),
+                    width_m=None if connects else self._width(row, line),
+                    successors=tuple(index[token] for token in after if token in index),
+                    predecessors=tuple(index[token] for token in before if token in index),
+                    interpolating=connects,
+                )
+            )
+        return beside(lanes)
+
+    def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
+        """Area of the lane's polygon over the length of its centre line; None where that is no lane's width."""
+        length = float(np.hypot(*np.diff(line, axis=0).T).sum())
+        for exterior, _ in self._areas([row["polygon_token"]]):
+            x, y = exterior[:, 0], exterior[:, 1]
+            area = abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+            if length > 0.0 and _WIDTHS_M[0] <= area / length <= _WIDTHS_M[1]:
+                return area / length
+        return None
+
+    def _dividers(self) -> Iterator[MapFeature]:
+        """Painted lane dividers in runs of one kind, and road dividers, of which the map does not tell the paint."""
+        for row in self._layer("lane_divider"):
+            segments = row["lane_divider_segments"]
+            for name, run in groupby(enumerate(segments), key=lambda item: str(item[1]["segment_type"])):
+                numbers = [number for number, _ in run]
+                # A segment's type holds up to the node of the next one.
+                nodes = [segment["node_token"] for segment in segments[numbers[0] : numbers[-1] + 2]]
+                kind, points = marking(name), self._points(nodes)
+                if kind is not None and len(points) > 1:
+                    yield MapFeature(0, kind, points)
+        for row in self._layer("road_divider"):
+            points = self._points(self._lines.get(row["line_token"], ()))
+            if len(points) > 1:
+                yield MapFeature(0, RoadKind.LINE_UNKNOWN, points)
+
+    def _crossings(self) -> Iterator[MapFeature]:
+        for row in self._layer("ped_crossing"):
+            for exterior, _ in self._areas([row["polygon_token"]]):
+                if len(exterior) > 2:
+                    yield MapFeature(0, RoadKind.CROSSWALK, exterior)
+
+    def _stops(self, lanes: Sequence[MapFeature], first_id: int) -> list[MapFeature]:
+        """Stop lines of stop signs: one point each, with the lanes that end in them."""
+        import shapely
+
+        stops: list[MapFeature] = []
+        rows = [row for row in self._layer("stop_line") if row.get("stop_line_type") == "STOP_SIGN"]
+        areas = [
+            exterior
+            for row in rows
+            for exterior, _ in self._areas([row["polygon_token"]])
+            if len(exterior) > 2
+        ]
+        ends = shapely.points(np.array([lane.points[-1, :2] for lane in lanes]).reshape(-1, 2))
+        for exterior in areas:
+            polygon = shapely.make_valid(shapely.Polygon(exterior[:, :2]))
+            near = np.flatnonzero(shapely.dwithin(ends, polygon, 1.0)).tolist()
+            ending = tuple(i for i in near if not lanes[i].interpolating)
+            centre = np.array([[polygon.centroid.x, polygon.centroid.y, 0.0]])
+            stops.append(MapFeature(first_id + len(stops), RoadKind.STOP_SIGN, centre, lanes=ending))
+        return stops
+
+
+def arc_line(path: Sequence[Mapping[str, Any]]) -> Float[Array, "point 2"]:
+    """Points about 0.5 m apart along a lane's arc lines.
+
+    Each arc line starts at ``start_pose`` (x, y, heading) and has three parts of lengths ``segment_length``, bent left
+    (L), straight (S) or right (R) by ``shape``, with ``radius`` (Dubins' curves; nuScenes map expansion).
+
+    Raises:
+        ValueError: A number is not finite, the radius is not positive, or the lane is longer than 5 km.
+    """
+    parts = [np.zeros((0, 2))]
+    for arc in path:
+        x, y, heading = (float(value) for value in arc["start_pose"])
+        lengths = [float(value) for value in arc["segment_length"]]
+        radius = float(arc["radius"])
+        if not np.isfinite([x, y, heading, *lengths]).all() or not radius > 0.0 or min(lengths) < 0.0:
+            raise ValueError(f"an arc line of radius {radius} and lengths {lengths}")
+        if sum(lengths) > _LONGEST_M:
+            raise ValueError(f"an arc line of {sum(lengths):.0f} m")
+        for turn, length in zip(arc["shape"], lengths, strict=True):
+            bend = _TURNS[turn] / radius
+            s = np.linspace(0.0, length, int(np.ceil(length / SPACING_M)) + 1)
+            along = heading + bend * s
+            if bend == 0.0:
+                points = np.stack((x + s * np.cos(heading), y + s * np.sin(heading)), axis=-1)
+            else:
+                points = np.stack(
+                    (
+                        x + (np.sin(along) - np.sin(heading)) / bend,
+                        y - (np.cos(along) - np.cos(heading)) / bend,
+                    ),
+                    axis=-1,
+                )
+            parts.append(points)
+            (x, y), heading = points[-1], float(along[-1])
+    line = np.concatenate(parts)
+    return line[np.append(True, np.hypot(*np.diff(line, axis=0).T) > 1e-6)] if len(line) else line
+
+
+def marking(name: str) -> RoadKind | None:
+    """The kind of a painted divider by its nuScenes name; None where nothing is painted (NIL)."""
+    if name == "NIL":
+        return None
+    double, broken, yellow = "DOUBLE" in name, "DASHED" in name, "YELLOW" in name
+    if yellow and broken:
+        return RoadKind.LINE_BROKEN_DOUBLE_YELLOW if double else RoadKind.LINE_BROKEN_SINGLE_YELLOW
+    if yellow:
+        return RoadKind.LINE_SOLID_DOUBLE_YELLOW if double else RoadKind.LINE_SOLID_SINGLE_YELLOW
+    if broken:
+        return RoadKind.LINE_BROKEN_SINGLE_WHITE
+    return RoadKind.LINE_SOLID_DOUBLE_WHITE if double else RoadKind.LINE_SOLID_SINGLE_WHITE
+
+
+def beside(lanes: Sequence[MapFeature]) -> list[MapFeature]:
+    """Lanes with their neighbours, which the map does not name: lanes that run parallel 2.2 to 5.5 m beside.
+
+    Looked up at the middle of each lane; lane connectors have none.
+    """
+    from scipy.spatial import KDTree
+
+    rows = [i for i, lane in enumerate(lanes) if not lane.interpolating and len(lane.points) > 2]
+    if not rows:
+        return list(lanes)
+    owner = np.concatenate([np.full(len(lanes[i].points), i) for i in rows])
+    points = np.concatenate([lanes[i].points[:, :2] for i in rows])
+    heading = np.concatenate([_headings(lanes[i].points[:, :2]) for i in rows])
+    tree = KDTree(points)
+    result = list(lanes)
+    for i in rows:
+        middle = len(lanes[i].points) // 2
+        at, course = lanes[i].points[middle, :2], _headings(lanes[i].points[:, :2])[middle]
+        near = np.array(tree.query_ball_point(at, _BESIDE_M[1] + 0.5), dtype=np.int64)
+        near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
+        offset = points[near] - at
+        ahead = offset @ np.array([np.cos(course), np.sin(course)])
+        left = offset @ np.array([-np.sin(course), np.cos(course)])
+        good = (np.abs(ahead) < 1.0) & (np.abs(left) >= _BESIDE_M[0]) & (np.abs(left) <= _BESIDE_M[1])
+        sides = {
+            side: tuple(int(lane) for lane in owner[near[good & (sign * left > 0)]][:1])
+            for side, sign in (("left_neighbours", 1), ("right_neighbours", -1))
+        }
+        result[i] = replace(result[i], **sides)
+    return result
+
+
+def _headings(xy: Float[Array, "point 2"]) -> Float[Array, " point"]:
+    step = np.gradient(xy, axis=0)
+    return np.arctan2(step[:, 1], step[:, 0])

@@ -1,0 +1,309 @@
+"""Reader of ScenarioNet pickles: one recording per file, made from WOMD, nuScenes, nuPlan, Argoverse or MetaDrive.
+
+The dictionaries are those of MetaDrive's ``ScenarioDescription``. What their converters do to each data set is undone
+here as far as the file allows (docs/data/scenarionet.md).
+"""
+
+from __future__ import annotations
+
+import pickletools
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.datasets import readings
+from drivax.datasets.ground import flatten, lift
+from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
+from drivax.datasets.places import place_tags
+from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.scenarionet import pickles
+from drivax.datasets.scenarionet.map import RoadMap, road_map
+from drivax.datasets.scenarionet.tracks import read_tracks, velocity_is_missing
+from drivax.datasets.scenarionet.values import SKIP, Names, floats, items, mapping, text, whole
+from drivax.errors import DataError
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import CURRENT_STEP, DT_S, LANE_KINDS, Flag, LightState
+
+Array = np.ndarray[Any, Any]
+
+_NAME = "scenarionet"
+_DATASETS = {"waymo": "womd", "argoverse": "av2", "argoverse2": "av2", "pg": "metadrive"}
+_TITLES = {
+    "womd": "Waymo Open Motion Dataset",
+    "nuscenes": "nuScenes",
+    "nuplan": "nuPlan",
+    "av2": "Argoverse 2",
+    "lyft": "Lyft Level 5",
+    "metadrive": "MetaDrive (generated)",
+}
+#: WOMD's polylines have points 0.5 m apart; twice that is a jump where the map was clipped.
+_WOMD_GAP_M = 1.0
+_STATES = {
+    **{f"LANE_STATE_{state.name}": state for state in LightState if state >= 0},
+    "TRAFFIC_LIGHT_RED": LightState.STOP,
+    "TRAFFIC_LIGHT_YELLOW": LightState.CAUTION,
+    "TRAFFIC_LIGHT_GREEN": LightState.GO,
+    "TRAFFIC_LIGHT_UNKNOWN": LightState.UNKNOWN,
+}
+_MOST_STATES = 2_000_000
+#: A scenario file names its dictionaries within this many bytes.
+_HEAD_BYTES = 4096
+_SIGNS = (b"version", b"length")
+_PARTS = (b"tracks", b"metadata", b"map_features", b"dynamic_map_states")
+
+
+@dataclass(frozen=True)
+class ScenarioNet:
+    """Reads ScenarioNet pickles without running them: a pickle that names anything but data is refused."""
+
+    name: str = _NAME
+    patterns: tuple[str, ...] = ("sd_*.pkl", "[0-9]*.pkl")
+    companions: tuple[str, ...] = ("dataset_summary.pkl", "dataset_mapping.pkl")
+
+    def recognise(self, path: Path) -> bool:
+        """Whether it is a pickle that begins with the keys of a scenario."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError:
+            return False
+        return (
+            head[:1] in (b"\x80", b"(", b"}")
+            and all(sign in head for sign in _SIGNS)
+            and any(part in head for part in _PARTS)
+        )
+
+    def describe(self, path: Path) -> Description:
+        """Data set, version and length of the scenario, and what its map lacks.
+
+        Raises:
+            DataError: The file is damaged, or no scenario.
+        """
+        tree = _load(path)
+        recording = decode(tree)
+        lanes = [f for f in recording.features if f.kind in LANE_KINDS]
+        facts = (
+            (not any(f.successors for f in lanes), "no lane graph: lanes are joined where they touch"),
+            (not recording.lights, "no traffic lights"),
+            (Flag.DIFFERENTIATED_VELOCITY in recording.flags, "velocities are taken from the positions"),
+        )
+        return Description(
+            dataset=f"{_TITLES.get(recording.dataset, recording.dataset)}, by ScenarioNet",
+            flavour="ScenarioNet pickle",
+            version=text(tree.get("version")),
+            recordings=1,
+            notes=tuple(note for holds, note in facts if holds),
+        )
+
+    def count(self, path: Path) -> int:
+        """The number of windows, by the length that the file names at its beginning."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError:
+            return 0
+        steps = _named_length(head)
+        return 0 if steps is None else readings.windows_of(steps)
+
+    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
+        """The recording of one file, or why it cannot be read."""
+        try:
+            yield decode(_load(path))
+        except DataError as error:
+            yield BadRecord.of(error, path)
+
+
+def _load(path: Path) -> Any:
+    try:
+        if path.stat().st_size > pickles.MOST_BYTES:
+            raise DataError(f"larger than {pickles.MOST_BYTES >> 20} MB", file=path, cure="it is no scenario")
+        return pickles.load(path.read_bytes())
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror})", file=path, cure="check the path") from error
+
+
+def _named_length(head: bytes) -> int | None:
+    """The value of the key ``length`` in the beginning of a pickle."""
+    last = None
+    try:
+        for operation, argument, _ in pickletools.genops(head):
+            if operation.name in ("MEMOIZE", "BINPUT", "LONG_BINPUT", "PUT"):
+                continue
+            if last == "length":
+                return argument if type(argument) is int and 0 < argument < 1_000_000 else None
+            last = argument
+    except ValueError:  # the beginning ends somewhere
+        return None
+    return None
+
+
+def decode(tree: Any) -> Recording:
+    """The recording in a ScenarioNet dictionary, in the file's map frame, metres, float64.
+
+    Raises:
+        DataError: It is none, or contradicts itself.
+    """
+    metadata = mapping(tree, "metadata")
+    table = {name: body for key, body in mapping(tree, "tracks").items() if (name := text(key)) is not None}
+    rows = {name: row for row, name in enumerate(table)}
+    dataset, identity, ego = _dataset(tree, metadata), _identity(tree, metadata), _ego(metadata, rows)
+    tracks, flags = _motion(read_tracks(table, Names(list(table), bits=31), ego), metadata, dataset, ego)
+    around = tracks.xy[ego, int(np.argmax(tracks.valid[ego]))]
+    roads = road_map(mapping(tree, "map_features"), dataset, around)
+    steps = tracks.valid.shape[1]
+    lost = Counter({**roads.lost, "one_point_features": readings.one_point_features(roads.features)})
+    lights = _lights(mapping(tree, "dynamic_map_states"), steps, dataset, roads, lost)
+    tracks, features = _with_heights(tracks, roads)
+    return Recording(
+        scenario_id=identity,
+        dataset=dataset,
+        segment=text(metadata.get("log_name")) or identity,
+        timestamps_s=_timestamps(metadata, steps),
+        current_step=_current_step(metadata, steps),
+        ego=ego,
+        tracks=tracks,
+        features=features,
+        lights=lights,
+        to_predict=_named_rows(metadata.get("tracks_to_predict"), rows),
+        of_interest=_named_rows(metadata.get("objects_of_interest"), rows),
+        tags=_tags(metadata),
+        lost=readings.counted(**lost),
+        flags=flags,
+        split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
+    )
+
+
+def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
+    for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
+        if found := text(value):
+            return found
+    raise DataError("the scenario has no id", cure=SKIP)
+
+
+def _dataset(tree: Any, metadata: Mapping[Any, Any]) -> str:
+    """The origin of the data in drivax' words."""
+    given = text(metadata.get("dataset")) or text(metadata.get("coordinate")) or ""
+    version = text(tree.get("version")) or ""
+    # Early files name the data set in their version only.
+    word = next((word for word in ("nuscenes", "nuplan") if version.startswith(word)), given.lower())
+    word = _DATASETS.get(word, word)
+    return word if word.isascii() and 0 < len(word) <= 16 and "\0" not in word else _NAME
+
+
+def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
+    named = text(metadata.get("sdc_id"))
+    row = rows.get("ego" if named is None else named)
+    if row is not None:
+        return row
+    raise DataError(f"the ego {(named or 'is not named')[:40]!r} is none of {len(rows)} tracks", cure=SKIP)
+
+
+def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int) -> tuple[Tracks, Flag]:
+    """Tracks with positions of box centres and velocities that belong to them, and what had to be made up."""
+    flags = Flag.DEFAULT_SIZES if dataset == "av2" else Flag.NONE
+    if dataset == "nuscenes":
+        tracks = _centred(tracks, ego)
+    if velocity_is_missing(tracks):
+        times = _timestamps(metadata, tracks.valid.shape[1])
+        tracks = replace(tracks, velocity=readings.differentiate(tracks.xy, tracks.valid, times))
+        flags |= Flag.DIFFERENTIATED_VELOCITY
+    return tracks, flags
+
+
+def _centred(tracks: Tracks, ego: int) -> Tracks:
+    """The ego at its box centre: nuScenes' poses are of the rear axle."""
+    heading, valid = tracks.heading[ego], tracks.valid[ego]
+    xy = tracks.xy.copy()
+    xy[ego] = np.where(valid[:, None], readings.box_centre(xy[ego], heading, CENTRE_AHEAD_M), 0.0)
+    return replace(tracks, xy=xy)
+
+
+def _with_heights(tracks: Tracks, roads: RoadMap) -> tuple[Tracks, tuple[MapFeature, ...]]:
+    """Agents on the ground of the map, where one of them has no heights."""
+    if roads.flat:
+        return flatten(tracks, roads.features)
+    if not tracks.z.any():
+        return lift(tracks, roads.features), roads.features
+    return tracks, roads.features
+
+
+def _timestamps(metadata: Mapping[Any, Any], steps: int) -> Array:
+    """Seconds of all steps; 10 Hz, as all converters write, where the file names none."""
+    given = metadata.get("ts")
+    if given is None:
+        return np.arange(steps) * DT_S
+    times = floats(given, "timestamps")
+    if times.shape != (steps,):
+        raise DataError(f"timestamps of shape {times.shape}, {steps} steps", cure=SKIP)
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DataError("timestamps do not increase", cure=SKIP)
+    return times
+
+
+def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
+    """The step at which the future begins; files of long recordings name none, or the first."""
+    named = whole(metadata.get("current_time_index"))
+    if named is None:
+        return min(CURRENT_STEP, steps - 1)
+    if named >= steps:
+        raise DataError(f"current_time_index is {named} of {steps} steps", cure=SKIP)
+    return named
+
+
+def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
+    """Rows of the tracks that a list of names, or a dictionary by name, is about; unknown names are left out."""
+    names = list(value) if isinstance(value, dict) else items(value)
+    found = (rows.get(name) for item in names if (name := text(item)) is not None)
+    return tuple(row for row in found if row is not None)
+
+
+def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
+    tags = {"source_format": _NAME} | place_tags(text(metadata.get("map")))
+    if kind := text(metadata.get("scenario_type")):
+        tags["scenario_types"] = kind[:64]
+    return tags
+
+
+def _lights(
+    table: Mapping[Any, Any], steps: int, dataset: str, roads: RoadMap, lost: Counter[str]
+) -> tuple[Light, ...]:
+    """Lights by lane. None in the file is a step at which nobody saw the light."""
+    if len(table) * steps > _MOST_STATES:
+        raise DataError(f"{len(table)} lights of {steps} steps", cure=SKIP)
+    starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}
+    lights = readings.Lights(steps)
+    for key, body in table.items():
+        what = f"light {(text(key) or '')[:40]!r}"
+        light = mapping({"": body}, "", what)
+        lane = roads.names.get(light.get("lane", key))
+        states = items(mapping(light, "state", what).get("object_state"))
+        if len(states) != steps:
+            raise DataError(f"{what} has {len(states)} states, {steps} steps", cure=SKIP)
+        if lane is None or lane not in starts:
+            lost["lights_without_lane"] += 1
+            continue
+        # nuPlan's lights are given a place 8 m behind the line.
+        stop = None if dataset == "nuplan" else _stop_point(light.get("stop_point"), what)
+        place = starts[lane] if stop is None else stop
+        for step, state in enumerate(states):
+            if state is not None:
+                lights.observe(step, lane, _state(state), place.tolist())
+    return lights.collected()
+
+
+def _stop_point(value: Any, what: str) -> Array | None:
+    """A place with a height; None where the file has none."""
+    if value is None:
+        return None
+    point = floats(value, f"{what}: stop_point")
+    return point if point.shape == (3,) and (np.abs(point) < 1e7).all() else None
+
+
+def _state(state: Any) -> LightState:
+    if isinstance(state, str):
+        return _STATES.get(state, LightState.UNKNOWN)
+    return LightState(state) if type(state) is int and state in range(9) else LightState.UNKNOWN

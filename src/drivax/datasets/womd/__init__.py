@@ -1,0 +1,1 @@
+"""Readers of the Waymo Open Motion Dataset."""

@@ -1,0 +1,146 @@
+"""What TFRecords of motion data share: telling the forms apart, reading and counting records, object types."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from drivax.datasets import readings
+from drivax.datasets.reader import BadRecord
+from drivax.datasets.womd.messages import example_class, parse, scenario_class
+from drivax.datasets.womd.tf_example import Features, is_motion
+from drivax.datasets.womd.tfrecord import count_records, looks_framed, read_records
+from drivax.errors import DataError, DrivaxError, UsageError
+from drivax.scenario.recording import Recording
+
+DATASET = "womd"
+FULL_NAME = "Waymo Open Motion Dataset"
+SCENARIO_FORMAT, EXAMPLE_FORMAT, SCENARIOMAX_FORMAT = "womd-scenario", "womd-example", "scenariomax"
+#: Shards are called ``...tfrecord-00000-of-01000``, samples ``....tfrecord``.
+PATTERNS = ("*.tfrecord", "*.tfrecord-*", "*.tfrecords")
+_CONTENTS = {
+    SCENARIO_FORMAT: "WOMD Scenario protos",
+    EXAMPLE_FORMAT: "WOMD tf.Examples",
+    SCENARIOMAX_FORMAT: "ScenarioMax tf.Examples",
+}
+#: Signs of ScenarioMax's writer that an example must show at least; one alone may be damage or another exporter.
+_SIGNS = 2
+
+Decode = Callable[[bytes], Recording]
+
+
+def flavour(payload: bytes) -> str | None:
+    """The format of a record's payload by its content, None where it is no form of motion data that is known."""
+    example = parse(example_class(), payload)
+    if example is not None and is_motion(example):
+        return SCENARIOMAX_FORMAT if scenariomax_signs(Features(example)) >= _SIGNS else EXAMPLE_FORMAT
+    scenario = parse(scenario_class(), payload)
+    if scenario is not None and scenario.scenario_id and scenario.tracks:
+        return SCENARIO_FORMAT
+    return None
+
+
+def scenariomax_signs(features: Features) -> int:
+    """How many of three signs an example shows that tell ScenarioMax's from WOMD's, which shows none.
+
+    ScenarioMax leaves out the prediction difficulty, renumbers tracks 0, 1, 2, ... with the ego first, and knows no
+    times (-1 throughout).
+    """
+    renumbered = untimed = False
+    try:
+        ids, valid = features.numbers("state/id"), features.numbers("state/current/valid") == 1
+        rows = np.flatnonzero(valid) if valid.size == ids.size else np.zeros(0, np.int64)
+        ego = np.flatnonzero(features.numbers("state/is_sdc") == 1)
+        renumbered = rows.size > 0 and bool((ids[rows] == rows).all()) and ego.tolist() == [0]
+        micros = features.numbers("state/current/timestamp_micros")
+        untimed = bool((micros < 0).all())
+    except DataError:
+        pass
+    return int(not features.has("state/difficulty_level")) + int(renumbered) + int(untimed)
+
+
+def recognise(path: Path, name: str) -> bool:
+    """Whether the first readable record of a TFRecord file is of the format ``name``; never raises.
+
+    Where the packages that could look into it are not installed, a TFRecord counts as Scenario protos, so that
+    reading it names what to install.
+    """
+    if not looks_framed(path):
+        return False
+    try:
+        return flavour(_first(path)) == name
+    except UsageError:
+        return name == SCENARIO_FORMAT
+    except DataError:
+        return False
+
+
+def _first(path: Path) -> bytes:
+    """Payload of the first readable record.
+
+    Raises:
+        DataError: There is none; the first damage.
+    """
+    damage = DataError("the file is empty", file=path, cure="download it again")
+    for number, record in read_records(path):
+        if isinstance(record, bytes):
+            return record
+        damage = record if number == 0 else damage
+    raise damage
+
+
+def first_recording(path: Path, name: str, decode: Decode) -> Recording:
+    """The first readable record of a file, decoded: what ``describe`` looks at.
+
+    Raises:
+        DataError: It is damaged, or of another form.
+    """
+    payload = _first(path)
+    try:
+        return decode(payload)
+    except DataError as error:
+        better = explain(error, payload, name)
+        raise DataError(better.problem, file=path, cure=better.cure) from error
+
+
+def count(path: Path, decode: Decode) -> int:
+    """Records of a file times windows of the first one; 0 where it cannot be read."""
+    try:
+        return count_records(path) * readings.windows_of(len(decode(_first(path)).timestamps_s))
+    except DrivaxError:
+        return 0
+
+
+def read(path: Path, name: str, decode: Decode) -> Iterator[Recording | BadRecord]:
+    """The recordings of a TFRecord file whose payloads ``decode`` reads, and bad records in their places."""
+    for number, record in read_records(path):
+        if isinstance(record, DataError):
+            yield BadRecord.of(record, path, number)
+            continue
+        try:
+            yield decode(record)
+        except DataError as error:
+            yield BadRecord.of(explain(error, record, name), path, number)
+
+
+def explain(error: DataError, payload: bytes, name: str) -> DrivaxError:
+    """The error, or a better one where the payload is of another form."""
+    other = flavour(payload)
+    if other is None or other == name:
+        return error
+    return DataError(f"holds {_CONTENTS[other]}, not {_CONTENTS[name]}", cure=f"use --format {other}")
+
+
+def notes_of(recording: Recording) -> tuple[str, ...]:
+    """What a user should know about recordings like this one: length, future, lights."""
+    steps, now = len(recording.timestamps_s), recording.current_step
+    notes = [f"{steps} steps, current step {now}"]
+    if readings.windows_of(steps) > 1:
+        notes.append(f"each recording becomes {readings.windows_of(steps)} windows of 91 steps")
+    elif now == steps - 1:
+        notes.append("no future (test split): stored, but refused for training and evaluation")
+    if not recording.lights:
+        notes.append("no traffic lights in the first record")
+    return tuple(notes)

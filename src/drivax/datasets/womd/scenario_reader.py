@@ -1,0 +1,228 @@
+"""Reader of WOMD ``Scenario`` protos in TFRecord files (motion dataset v1.0 to v1.3.1, 9 s and 20 s files)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.datasets import readings
+from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.womd import records as womd
+from drivax.datasets.womd.message_tables import POINTS, STATES, read_table
+from drivax.datasets.womd.messages import parse, scenario_class
+from drivax.datasets.womd.tf_example import agent_kind
+from drivax.datasets.womd.tfrecord import count_records
+from drivax.errors import DataError
+from drivax.geometry.angles import wrap
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import LANE_KINDS, RoadKind
+
+#: Points are 0.5 m apart; twice that is a jump where the map was clipped, not road.
+_SPLIT_GAP_M = 1.0
+_SKIP = "skip this record, or download the file again"
+_POLYGONS = {
+    "crosswalk": RoadKind.CROSSWALK,
+    "speed_bump": RoadKind.SPEED_BUMP,
+    "driveway": RoadKind.DRIVEWAY,
+}
+_Points = Float64[np.ndarray, "point 3"]
+
+
+@dataclass(frozen=True)
+class WomdScenario:
+    """Reads Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
+
+    name: str = womd.SCENARIO_FORMAT
+    patterns: tuple[str, ...] = womd.PATTERNS
+    companions: tuple[str, ...] = ()
+
+    def recognise(self, path: Path) -> bool:
+        """Whether the first readable record is a Scenario proto."""
+        return womd.recognise(path, self.name)
+
+    def describe(self, path: Path) -> Description:
+        """What the first record shows: version by kinds of features, length, lane graph, lights.
+
+        Raises:
+            DataError: It is damaged or of another form.
+        """
+        recording = womd.first_recording(path, self.name, decode)
+        lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
+        linked = any(lane.successors or lane.predecessors for lane in lanes)
+        notes = list(womd.notes_of(recording))
+        if not linked:
+            notes.append("no lane graph in the first record: lanes are chained by geometry")
+        driveways = any(feature.kind == RoadKind.DRIVEWAY for feature in recording.features)
+        return Description(
+            dataset=womd.FULL_NAME,
+            flavour="Scenario protos in TFRecord",
+            version="1.2 or later" if driveways else "1.1 or later" if linked else None,
+            recordings=count_records(path),
+            notes=tuple(notes),
+        )
+
+    def count(self, path: Path) -> int:
+        """Records times windows of the first; 0 where it cannot be read."""
+        return womd.count(path, decode)
+
+    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
+        """The recordings of one file, and in their place the records that cannot be read."""
+        return womd.read(path, self.name, decode)
+
+
+def decode(payload: bytes) -> Recording:
+    """The recording in a serialised ``Scenario``.
+
+    Positions stay in the proto's map frame, metres, float64. Headings are wrapped (the files hold up to 10 rad),
+    invalid states are zeros (the files keep a z there), speed limits are m/s and None where the file says 0.
+    Links to lanes that the file does not hold are kept.
+
+    Raises:
+        DataError: The payload is no Scenario, or contradicts itself.
+    """
+    message = parse(scenario_class(), payload)
+    if message is None or not message.scenario_id:
+        raise DataError("the payload is not a WOMD Scenario proto", cure=_SKIP)
+    steps = len(message.timestamps_seconds)
+    _check(message, steps)
+    features, lost = _features(message.map_features)
+    rows = {track.id: row for row, track in enumerate(message.tracks)}
+    return Recording(
+        scenario_id=message.scenario_id,
+        dataset=womd.DATASET,
+        segment=message.scenario_id,
+        timestamps_s=np.array(message.timestamps_seconds, np.float64),
+        current_step=message.current_time_index,
+        ego=message.sdc_track_index,
+        tracks=_tracks(message.tracks, steps),
+        features=features,
+        lights=_lights(message.dynamic_map_states, steps),
+        to_predict=readings.rows_within(
+            [wanted.track_index for wanted in message.tracks_to_predict],
+            len(message.tracks),
+            "tracks_to_predict",
+        ),
+        # These are track ids, tracks_to_predict are rows.
+        of_interest=tuple(rows[track] for track in message.objects_of_interest if track in rows),
+        tags={"source_format": womd.SCENARIO_FORMAT},
+        lost=lost,
+        split_gap_m=_SPLIT_GAP_M,
+    )
+
+
+def _check(message: Any, steps: int) -> None:
+    if not isinstance(message.scenario_id, str):  # protobuf gives bytes where a string is no UTF-8
+        raise DataError("scenario_id is no text", cure=_SKIP)
+    if steps == 0 or not message.tracks:
+        raise DataError("the scenario has no steps or no tracks", cure=_SKIP)
+    if not 0 <= message.current_time_index < steps:
+        raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=_SKIP)
+    readings.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
+    if len(message.dynamic_map_states) > steps:
+        raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=_SKIP)
+    seen = set()
+    for track in message.tracks:
+        if len(track.states) != steps:
+            raise DataError(f"track {track.id} has {len(track.states)} states, {steps} steps", cure=_SKIP)
+        if track.id in seen:
+            raise DataError(f"two tracks have the id {track.id}", cure=_SKIP)
+        seen.add(track.id)
+
+
+def _tracks(tracks: Any, steps: int) -> Tracks:
+    blobs = [state for track in tracks for state in track.states]
+    table = read_table(blobs, STATES).reshape(len(tracks), steps, -1)
+    valid = table[..., 9] > 0.5
+    table[~valid] = 0.0
+    readings.check_finite(table)
+    return Tracks(
+        xy=table[..., 0:2].copy(),
+        z=table[..., 2].copy(),
+        size=table[..., 3:6].copy(),
+        heading=np.where(valid, wrap(table[..., 6]), 0.0),
+        velocity=table[..., 7:9].copy(),
+        valid=valid,
+        kind=np.array([agent_kind(track.object_type) for track in tracks], np.int8),
+        track_id=np.array([track.id for track in tracks], np.int64),
+    )
+
+
+def _lights(states: Any, steps: int) -> tuple[Light, ...]:
+    lights = readings.Lights(steps)
+    for step, state in enumerate(states):
+        for lane in state.lane_states:
+            point = lane.stop_point
+            lights.observe(step, lane.lane, lane.state, (point.x, point.y, point.z))
+    return lights.collected()
+
+
+def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
+    """The map's features, and how many were left out for what reason."""
+    ids: set[int] = set()
+    parts: list[tuple[int, str, Any, Sequence[bytes]]] = []
+    unknown = twice = empty = 0
+    for message in messages:
+        kind = message.WhichOneof("kind")
+        if kind is None:  # a kind of feature that later versions may add
+            unknown += 1
+            continue
+        body = getattr(message, kind)
+        blobs = _blobs(kind, body)
+        if not blobs:
+            empty += 1
+        elif message.id in ids:
+            twice += 1
+        else:
+            ids.add(message.id)
+            parts.append((message.id, kind, body, blobs))
+    points = read_table([blob for *_, blobs in parts for blob in blobs], POINTS)
+    ends = np.cumsum([len(blobs) for *_, blobs in parts])[:-1] if parts else []
+    features = tuple(
+        _feature(feature_id, kind, body, line.copy())
+        for (feature_id, kind, body, _), line in zip(parts, np.split(points, ends), strict=False)
+    )
+    lost = readings.counted(
+        unknown_features=unknown,
+        empty_features=empty,
+        duplicate_features=twice,
+        one_point_features=readings.one_point_features(features),
+    )
+    return features, lost
+
+
+def _blobs(kind: str, body: Any) -> Sequence[bytes]:
+    """The serialised points of a feature."""
+    if kind == "stop_sign":
+        return [body.position] if body.HasField("position") else []
+    return body.polygon if kind in _POLYGONS else body.polyline
+
+
+def _feature(feature_id: int, kind: str, body: Any, points: _Points) -> MapFeature:
+    if kind == "lane":
+        return _lane(feature_id, body, points)
+    if kind == "stop_sign":
+        return MapFeature(feature_id, RoadKind.STOP_SIGN, points, lanes=tuple(body.lane))
+    if kind in _POLYGONS:
+        return MapFeature(feature_id, _POLYGONS[kind], points)
+    first, last = (5, 13) if kind == "road_line" else (14, 16)
+    code = first + body.type
+    return MapFeature(feature_id, RoadKind(code if first <= code <= last else first), points)
+
+
+def _lane(feature_id: int, lane: Any, points: _Points) -> MapFeature:
+    return MapFeature(
+        feature_id=feature_id,
+        kind=RoadKind(lane.type) if 0 <= lane.type <= 3 else RoadKind.LANE_UNDEFINED,
+        points=points,
+        limit_mps=lane.speed_limit_mph * readings.MPS_PER_MPH if lane.speed_limit_mph > 0 else None,
+        successors=tuple(lane.exit_lanes),
+        predecessors=tuple(lane.entry_lanes),
+        left_neighbours=tuple(neighbour.feature_id for neighbour in lane.left_neighbors),
+        right_neighbours=tuple(neighbour.feature_id for neighbour in lane.right_neighbors),
+        interpolating=lane.interpolating,
+    )

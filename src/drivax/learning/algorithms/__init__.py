@@ -1,0 +1,1 @@
+"""One module per algorithm: its configuration, state and update."""

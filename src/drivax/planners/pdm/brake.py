@@ -1,0 +1,138 @@
+"""The emergency brake of PDM-Closed, for any planner: stop if ego is about to hit somebody by its own fault.
+
+Source: Dauner, Hallgarten, Geiger and Chitta, "Parting with Misconceptions about Learning-based Vehicle Motion
+Planning" (CoRL 2023) and the numbers of its published implementation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drivax.geometry.boxes import LENGTH, WIDTH
+from drivax.planners.pdm.forecast import Forecast, fault_times, until_overlap
+from drivax.planners.planner import Planner
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.record import record, static
+from drivax.scenario.schema import DT_S
+from drivax.simulator.contact import overlaps
+from drivax.simulator.types import MOTION_SPEED, SimState, Situation
+from drivax.tasks.actions import ActionSpace, Physical
+
+#: Others that are looked at: the nearest to the way, within this radius, m.
+_OTHERS, _RADIUS_M = 24, 50.0
+
+
+@dataclass(frozen=True)
+class BrakeConfig:
+    """When to brake, and how hard; the defaults are the published ones.
+
+    Attributes:
+        within_s: A collision that is at most this far away asks for the brake.
+        up_to_mps: Faster cars are not braked: what is ahead of them is the planner's to solve.
+        least_mps2, most_mps2: Bounds of the acceleration (nuPlan's comfort limits).
+        gains, slow_gains: On the speed (1/s) and on the acceleration; the second pair below ``slow_mps``.
+        slow_mps: Where the gains change.
+    """
+
+    within_s: float = 2.0
+    up_to_mps: float = 5.0
+    least_mps2: float = -4.05
+    most_mps2: float = 2.40
+    gains: tuple[float, float] = (10.0, 0.0)
+    slow_gains: tuple[float, float] = (4.0, 1.0)
+    slow_mps: float = 0.2
+
+
+def is_emergency(
+    fault_s: Float[Array, ""], speed: Float[Array, ""], config: BrakeConfig = BrakeConfig()
+) -> Bool[Array, ""]:
+    """Whether to brake.
+
+    Args:
+        fault_s: Time until ego would hit somebody by its own fault, infinite where it does not.
+        speed: Of ego, m/s.
+        config: When to brake.
+    """
+    # Times are multiples of a step in float32.
+    return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
+
+
+def braking(
+    speed: Float[Array, ""], acceleration: Float[Array, ""], config: BrakeConfig = BrakeConfig()
+) -> Float[Array, ""]:
+    """Acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped.
+
+    Args:
+        speed: m/s.
+        acceleration: The present one, m/s2.
+        config: Gains and bounds.
+    """
+    (p, d), (slow_p, slow_d) = config.gains, config.slow_gains
+    wanted = jnp.where(
+        speed > config.slow_mps, -p * speed - d * acceleration, -slow_p * speed - slow_d * acceleration
+    )
+    return jnp.clip(wanted, config.least_mps2, config.most_mps2)
+
+
+@record
+class EmergencyBrake:
+    """Another planner, braked when its action, kept up, would make ego hit somebody by its own fault.
+
+    The others keep their velocities; what ego touches already does not count.
+
+    Attributes:
+        planner: The driver.
+        actions: Its action space.
+        config: When to brake.
+    """
+
+    planner: Planner
+    actions: ActionSpace = static(default=Physical())
+    config: BrakeConfig = static(default=BrakeConfig())
+    replays: bool = static(default=False)
+
+    @property
+    def name(self) -> str:
+        """That of the planner, and ``+brake``."""
+        return f"{self.planner.name}+brake"
+
+    def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
+        """What the planner carries."""
+        return self.planner.init(bank, state, key)
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, " D"], Any]:
+        """The planner's action, or the brake straight ahead."""
+        action, carry = self.planner.act(carry, bank, state, situation, observation, key)
+        scene, around = situation.scene, situation.surroundings
+        motion, me = scene.history[-1], around.frame.box[scene.slot]
+
+        def on(motion: Array, _: None) -> tuple[Array, Array]:
+            return self.actions.move(motion, action, me[LENGTH]), motion
+
+        steps = round(self.config.within_s / DT_S)
+        last, drive = jax.lax.scan(on, motion, None, steps)
+        drive = jnp.concatenate([drive, last[None]])
+        touched = overlaps(around.frame, scene.slot)
+        others = Forecast.of(around.frame, scene.slot, touched, drive[::5, :2], _OTHERS, _RADIUS_M)
+        size = me[LENGTH : WIDTH + 1]
+        unlawful = jnp.broadcast_to(around.lanes.leaving_lane, drive.shape[:1])
+        soon = until_overlap(drive, size, others, DT_S)
+        fault_s = jnp.min(fault_times(drive, size, others, soon, unlawful))
+        speed = motion[MOTION_SPEED]
+        wanted = braking(speed, (speed - scene.history[-2, MOTION_SPEED]) / DT_S, self.config)
+        brake = self.actions.action(motion, wanted, jnp.zeros(()), me[LENGTH])
+        chosen = jnp.where(is_emergency(fault_s, speed, self.config), brake, action)
+        return self.actions.actuated(motion, chosen, scene.action), carry

@@ -1,0 +1,130 @@
+"""Everyone at constant velocity: where others will be, when ego would meet them, and whose fault that would be."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, time_to_overlap
+from drivax.geometry.vectors import norm
+from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.record import record
+from drivax.scenario.schema import DT_S
+from drivax.simulator.contact import judge_contacts
+from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, MOTION_X, MOTION_Y, Frame
+
+#: Looks into the next five seconds at who comes near.
+_LOOKS, _LOOK_S = 11, 0.5
+#: Who is a metre further away now counts as this much further from the way, m.
+_FURTHER = 0.02
+
+
+@record
+class Forecast:
+    """Others from now on, at the velocity and the heading that they have.
+
+    Attributes:
+        box: Their boxes now.
+        velocity: m/s.
+        kind: ``scenario.schema.AgentKind``.
+        valid: Whether there is somebody.
+    """
+
+    box: Float[Array, "K 6"]
+    velocity: Float[Array, "K 2"]
+    kind: Int[Array, " K"]
+    valid: Bool[Array, " K"]
+
+    @classmethod
+    def of(
+        cls, frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
+        most: int, radius_m: float,
+    ) -> Forecast:  # fmt: skip
+        """Those who come nearest to a way within five seconds.
+
+        Args:
+            frame: Everyone now.
+            slot: Ego.
+            ignored: Who does not count.
+            way: Points that ego may come to.
+            most: How many are looked at.
+            radius_m: Who is further away from ego now does not count.
+        """
+        away = norm(frame.box[:, :2] - frame.box[slot, :2])
+        counts = frame.valid & ~ignored & (jnp.arange(away.shape[0]) != slot) & (away <= radius_m)
+        counts &= jnp.abs(frame.z - frame.z[slot]) <= LEVEL_M
+        times = jnp.arange(_LOOKS)[:, None] * _LOOK_S
+        x = frame.box[:, X] + times * frame.velocity[:, 0]
+        y = frame.box[:, Y] + times * frame.velocity[:, 1]
+        squared = (x - way[:, 0, None, None]) ** 2 + (y - way[:, 1, None, None]) ** 2
+        reach = norm(frame.box[:, LENGTH : WIDTH + 1]) / 2
+        clear = jnp.maximum(jnp.sqrt(jnp.min(squared, axis=(0, 1))) - reach, 0.0)
+        rank = jnp.where(counts, clear + _FURTHER * away, jnp.inf)
+        _, rows = jax.lax.top_k(-rank, min(most, away.shape[0]))
+        return cls(frame.box[rows], frame.velocity[rows], frame.kind[rows], counts[rows])
+
+    def at(self, times_s: Float[Array, " T"]) -> Float[Array, "T K 6"]:
+        """Their boxes at each time."""
+        times = times_s[:, None]
+        moved = (self.box[:, X] + times * self.velocity[:, 0], self.box[:, Y] + times * self.velocity[:, 1])
+        same = (jnp.broadcast_to(self.box[:, part], moved[0].shape) for part in (COS, SIN, LENGTH, WIDTH))
+        return jnp.stack([*moved, *same], axis=-1)
+
+
+def boxes_of(motion: Float[Array, "*T 4"], size: Float[Array, " 2"]) -> Float[Array, "*T 6"]:
+    """Boxes of one size where motions (x, y, heading, speed) have them."""
+    heading = motion[..., MOTION_HEADING]
+    length, width = (jnp.broadcast_to(part, heading.shape) for part in size)
+    parts = (motion[..., MOTION_X], motion[..., MOTION_Y], jnp.cos(heading), jnp.sin(heading), length, width)
+    return jnp.stack(parts, axis=-1)
+
+
+def until_overlap(
+    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, horizon_s: float
+) -> Float[Array, "T K"]:
+    """At every step of a drive: seconds until ego overlaps each of the others if both then keep their velocities.
+
+    0 where they overlap at that step, ``horizon_s`` where they do not within the horizon.
+    """
+    me = boxes_of(motion, size)[:, None]
+    velocity = me[..., COS : SIN + 1] * motion[:, None, MOTION_SPEED, None]
+    then = others.at(jnp.arange(motion.shape[0]) * DT_S)
+    soon = time_to_overlap(me, velocity, then, others.velocity, horizon_s)
+    return jnp.where(others.valid, soon, horizon_s)
+
+
+def fault_times(
+    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
+    unlawful: Bool[Array, " T"],
+) -> Float[Array, " K"]:  # fmt: skip
+    """When each of the others is hit by ego's fault, s; infinite for those who are not.
+
+    Fault is decided at the first overlap, by the rule that judges episodes (``simulator.contact.judge_contacts``).
+
+    Args:
+        motion: The drive.
+        size: Length and width of ego.
+        others: The others.
+        soon_s: What :func:`until_overlap` says of them.
+        unlawful: At every step, whether ego is in several lanes or off the road.
+    """
+    steps = jnp.arange(motion.shape[0])
+    first = jnp.min(jnp.where(soon_s <= 0.0, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
+    hit = jnp.isfinite(first)
+    step = jnp.where(hit, first, 0.0).astype(jnp.int32)
+    me = boxes_of(motion[step], size)
+    moved = others.box.at[:, :2].add(others.velocity * (step * DT_S)[:, None])
+    speeds = norm(others.velocity)
+
+    def at_fault(both: Array, kind: Array, speed: Array, other: Array, several: Array) -> Array:
+        two = jnp.zeros(2)
+        frame = Frame(
+            both, jnp.zeros((2, 2)), two, two == 0.0, jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
+        )
+        fresh = jnp.arange(2) == 1
+        return judge_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
+
+    pairs = jnp.stack([me, moved], axis=1)
+    fault = jax.vmap(at_fault)(pairs, others.kind, motion[step, MOTION_SPEED], speeds, unlawful[step])
+    return jnp.where(hit & fault, first * DT_S, jnp.inf)

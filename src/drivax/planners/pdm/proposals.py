@@ -1,0 +1,231 @@
+"""PDM-Closed's proposals: lines beside the route, and IDM unrolled along each of them against forecast agents."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.boxes import COS, SIN, gap, overlap
+from drivax.geometry.vectors import norm
+from drivax.planners.pdm.forecast import Forecast
+from drivax.planners.pdm.tracking import Reference
+from drivax.scenario.bank.queries import route_ahead
+from drivax.scenario.bank.scenario_bank import (
+    ROUTE_COS,
+    ROUTE_LIMIT,
+    ROUTE_SIN,
+    ROUTE_X,
+    ROUTE_Y,
+    ROUTE_Z,
+    ScenarioBank,
+)
+from drivax.scenario.bank.smallest import first_smallest
+from drivax.scenario.record import record
+from drivax.scenario.schema import DT_S
+from drivax.simulator.ahead import project
+from drivax.simulator.idm import IdmParameters, idm_acceleration
+
+#: Points of a line, 1 m apart: 4 s on a motorway, and what is ahead then.
+POINTS = 160
+#: Pieces of the corridor, m; every second point is measured when others are projected on the route.
+_PIECE_M, _EVERY = 4, 2
+#: Points on either side between which curvature is measured.
+_BEND = 2
+#: Gap of a free road, m.
+_FREE_M = 1e4
+#: Columns of a line.
+LINE_X, LINE_Y, LINE_COS, LINE_SIN, LINE_BEND, LINE_PLACE, LINE_Z = range(7)
+
+
+@record
+class Lines:
+    """P lines beside the route, each at points 1 m apart along itself, from abreast of ego on.
+
+    Attributes:
+        points: x, y, cosine and sine of the heading, curvature (1/m), place along the route from ego on (m), and height
+            above where ego is (m).
+        route: Rows of ``bank.routes`` every 2 m ahead; straight on beyond the end.
+        left_m: How much of the route is left.
+        limit: Speed limit of ego's lane, m/s; not positive where unknown.
+    """
+
+    points: Float[Array, "P M 7"]
+    route: Float[Array, "R 7"]
+    left_m: Float[Array, ""]
+    limit: Float[Array, ""]
+
+    @classmethod
+    def beside_route(
+        cls, bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""],
+        offsets_m: tuple[float, ...], me: Float[Array, " 6"],
+    ) -> Lines:  # fmt: skip
+        """Lines at lateral offsets from the route.
+
+        Parallel lines share their normals, so all of them begin abreast of ego. Where there is no route they lead
+        straight ahead of it.
+
+        Args:
+            bank: The scenarios.
+            index: Row of the bank.
+            along_m: Where ego is along its route.
+            offsets_m: Lateral offsets, positive to the left.
+            me: Ego's box.
+        """
+        left_m = bank.route_points[index, 0] - 1.0 - along_m
+        there = bank.route_points[index, 0] > 1
+        left_m = jnp.where(there, left_m, -1.0)
+
+        def rows(ways: Float[Array, " M"]) -> Float[Array, "M 7"]:
+            inside = jnp.clip(ways, 0.0, jnp.maximum(left_m, 0.0))
+            row, _ = route_ahead(bank, index, along_m, inside)
+            straight = jnp.zeros(7).at[:2].set(me[:2]).at[ROUTE_COS : ROUTE_SIN + 1].set(me[COS : SIN + 1])
+            row = jnp.where(there, row, straight)
+            heading = row[:, ROUTE_COS : ROUTE_SIN + 1]
+            heading = heading / jnp.maximum(norm(heading), 1e-6)[:, None]
+            xy = row[:, : ROUTE_Y + 1] + (ways - inside)[:, None] * heading
+            return row.at[:, : ROUTE_Y + 1].set(xy).at[:, ROUTE_COS : ROUTE_SIN + 1].set(heading)
+
+        ways = jnp.arange(POINTS, dtype=jnp.float32)
+        base = rows(ways)
+        points = jnp.stack([_line(rows, base, ways, offset) for offset in offsets_m])
+        return cls(points, base[::_EVERY], left_m, jnp.where(there, base[0, ROUTE_LIMIT], 0.0))
+
+    def at(self, way: Float[Array, "P *T"]) -> Float[Array, "P *T 7"]:
+        """Rows at ways along each line."""
+        low = jnp.clip(way.astype(jnp.int32), 0, POINTS - 2)
+        part = jnp.clip(way - low, 0.0, 1.0)[..., None]
+        both = jax.vmap(lambda line, row: line[row])
+        return both(self.points, low) * (1.0 - part) + both(self.points, low + 1) * part
+
+    def places(self, xy: Float[Array, "*T 2"]) -> Float[Array, "*T"]:
+        """Places along the route, from ego on, of points beside it."""
+        there = jnp.ones(self.route.shape[0], bool)
+        offsets = jnp.arange(self.route.shape[0], dtype=jnp.float32) * _EVERY
+        flat = xy.reshape(-1, 2)
+        return project(self.route, there, offsets, flat, jnp.ones_like(flat))[0].reshape(xy.shape[:-1])
+
+    def pieces(self, width: Float[Array, ""]) -> Float[Array, "P C 6"]:
+        """The corridors of a width along the lines, as boxes."""
+        first, last = self.points[:, :-1:_PIECE_M], self.points[:, _PIECE_M::_PIECE_M]
+        count = min(first.shape[1], last.shape[1])
+        a, b = first[:, :count, : LINE_Y + 1], last[:, :count, : LINE_Y + 1]
+        length = jnp.maximum(norm(b - a), 1e-6)
+        parts = (
+            (a + b) / 2,
+            (b - a) / length[..., None],
+            length[..., None],
+            jnp.full((*length.shape, 1), width),
+        )
+        return jnp.concatenate(parts, axis=-1)
+
+
+def _line(
+    rows: Any, base: Float[Array, "M 7"], ways: Float[Array, " M"], offset: float
+) -> Float[Array, "M 7"]:
+    """One line, at evenly spaced points along itself."""
+
+    def shifted(row: Float[Array, "M 7"]) -> Float[Array, "M 2"]:
+        normal = jnp.stack([-row[:, ROUTE_SIN], row[:, ROUTE_COS]], axis=-1)
+        return row[:, : ROUTE_Y + 1] + offset * normal
+
+    place = ways
+    if offset:
+        steps = norm(jnp.diff(shifted(base), axis=0))
+        arc = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+        place = jnp.interp(ways, arc, ways) + jnp.maximum(ways - arc[-1], 0.0)
+    row = rows(place) if offset else base
+    cos, sin = row[:, ROUTE_COS], row[:, ROUTE_SIN]
+    c0, s0, c1, s1 = cos[: -2 * _BEND], sin[: -2 * _BEND], cos[2 * _BEND :], sin[2 * _BEND :]
+    bend = jnp.arctan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1) / (2.0 * _BEND)
+    height = row[:, ROUTE_Z] - base[0, ROUTE_Z]
+    xy = shifted(row)
+    return jnp.stack(
+        [xy[:, ROUTE_X], xy[:, ROUTE_Y], cos, sin, jnp.pad(bend, _BEND, mode="edge"), place, height], 1
+    )
+
+
+@record
+class Proposals:
+    """Along P lines, F drivers each, at T steps from now on.
+
+    Attributes:
+        way: Along the line, m.
+        speed: m/s.
+    """
+
+    way: Float[Array, "P F T"]
+    speed: Float[Array, "P F T"]
+
+    def reference(self, lines: Lines) -> Reference:
+        """The proposals one by one, drivers of the same line one behind the other."""
+        rows = lines.at(self.way)
+        flat = rows.reshape(-1, *rows.shape[2:])
+        speed = self.speed.reshape(-1, self.speed.shape[-1])
+        return Reference(flat[..., : LINE_SIN + 1], speed, flat[..., LINE_BEND])
+
+
+def unrolled(
+    lines: Lines, others: Forecast, size: Float[Array, " 2"], speed: Float[Array, ""],
+    wanted: Float[Array, " F"], stop_m: Float[Array, ""], driver: tuple[IdmParameters, int, int],
+) -> Proposals:  # fmt: skip
+    """IDM along every line, Euler steps of 0.1 s.
+
+    The leader is found anew every few steps: of those whose box then reaches into the corridor as wide as ego and whose
+    centre is ahead, the one whose box is nearest to ego's. Its place is held until the next search.
+
+    Args:
+        lines: The lines.
+        others: The others.
+        size: Length and width of ego.
+        speed: Of ego, m/s.
+        wanted: Speeds that the drivers want, m/s.
+        stop_m: From ego's front to the nearest stop line that asks to stop; infinite where there is none.
+        driver: Parameters, number of steps, and steps between searches.
+    """
+    parameters, steps, every = driver
+    count = lines.points.shape[0], wanted.shape[0]
+    boxes = others.at(jnp.arange(0, steps, every) * DT_S)
+    inside = _on_corridor(lines.pieces(size[1]), boxes) & others.valid
+    places = lines.places(boxes[..., :2])
+    stop_place = stop_m + size[0] / 2
+    length, width = (jnp.full(count, part) for part in size)
+
+    def search(now: tuple[Array, Array], then: tuple[Array, ...]) -> Any:
+        way, speed = now
+        box, place, inside = then
+        row = lines.at(way)
+        me = jnp.stack([*jnp.moveaxis(row[..., : LINE_SIN + 1], -1, 0), length, width], axis=-1)
+        leads = inside[:, None] & (place > row[..., LINE_PLACE, None])
+        gaps = jnp.where(leads, gap(me[:, :, None], box), _FREE_M)
+        leader, free = first_smallest(gaps), jnp.min(gaps, axis=-1)
+        velocity = others.velocity[leader]
+        ahead = velocity[..., 0] * row[..., LINE_COS] + velocity[..., 1] * row[..., LINE_SIN]
+        stop = jnp.maximum(stop_place - row[..., LINE_PLACE] - size[0] / 2, 0.0)
+        stop = jnp.where(stop_place > row[..., LINE_PLACE], jnp.minimum(stop, _FREE_M), _FREE_M)
+        ahead, free = jnp.where(stop < free, 0.0, ahead), jnp.minimum(stop, free)
+        states = []
+        for _ in range(every):
+            kept = jnp.maximum(free, parameters.min_gap_m)
+            acceleration = idm_acceleration(speed, wanted, kept, ahead, parameters)
+            way, free = way + DT_S * speed, free - DT_S * speed
+            speed = jnp.maximum(speed + DT_S * acceleration, 0.0)
+            states.append((way, speed))
+        return (way, speed), jax.tree.map(lambda *parts: jnp.stack(parts), *states)
+
+    start = jnp.zeros(count), jnp.full(count, speed)
+    searches = (boxes, places, jnp.moveaxis(inside, 1, 0))
+    _, states = jax.lax.scan(search, start, searches)
+
+    def in_time(first: Array, rest: Array) -> Array:
+        rest = jnp.moveaxis(rest.reshape(-1, *count), 0, -1)
+        return jnp.concatenate([first[..., None], rest], axis=-1)
+
+    return Proposals(*(in_time(first, rest) for first, rest in zip(start, states, strict=True)))
+
+
+def _on_corridor(pieces: Float[Array, "P C 6"], boxes: Float[Array, "U K 6"]) -> Bool[Array, "P U K"]:
+    """Whose box reaches into each corridor, at each time."""
+    return overlap(pieces[:, None, :, None], boxes[None, :, None]).any(axis=2)

@@ -1,0 +1,266 @@
+"""How PDM-Closed judges a proposal: gates that multiply a weighted mean of progress, time to collision and comfort.
+
+Source: Dauner et al. 2023 and the numbers of its published implementation, which follows nuPlan's closed-loop metrics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.angles import wrap
+from drivax.geometry.boxes import LENGTH, corners
+from drivax.geometry.vectors import norm
+from drivax.metrics.comfort import (
+    JERK_MAGNITUDE_MPS3,
+    JERK_MPS3,
+    LATERAL_MPS2,
+    LONGITUDINAL_MPS2,
+    YAW_ACCELERATION_RPS2,
+    YAW_RATE_RPS,
+    filter_operator,
+)
+from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
+from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.record import record
+from drivax.scenario.schema import DT_S, AgentKind, Flag
+from drivax.simulator.contact import REAR_AXLE
+from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
+
+#: Who is seen more than 150 degrees from straight ahead of the rear axle is behind.
+_BEHIND_COS = -(3.0**0.5) / 2.0
+
+
+@dataclass(frozen=True)
+class ScoringConfig:
+    """Weights and limits; the defaults are the published ones. Comfort has nuPlan's limits (``metrics.comfort``).
+
+    Attributes:
+        progress, ttc, comfort: Weights of the mean.
+        static_collision: Gate of an at-fault collision with something that is neither vehicle, pedestrian nor cyclist.
+        ttc_s: How far ahead of each step a collision may be foreseen.
+        standing_mps: Below this speed nothing is foreseen.
+        astray_m: Distance off the route in one go up to which nothing, and up to which half is lost.
+        least_progress_m: Where the best proposal makes less progress, all that are allowed make the most.
+        ground_every: Steps between the poses at which lanes and edges are looked up. The publication looks them up at
+            every step; a car that is 5 m long is at most half a second further.
+    """
+
+    progress: float = 5.0
+    ttc: float = 5.0
+    comfort: float = 2.0
+    static_collision: float = 0.5
+    ttc_s: float = 0.9
+    standing_mps: float = 0.005
+    astray_m: tuple[float, float] = (2.0, 6.0)
+    least_progress_m: float = 0.1
+    ground_every: int = 5
+
+
+@record
+class Ground:
+    """Where a drive lies, at each of its steps.
+
+    Attributes:
+        several: In more than one lane.
+        off: Some corner is off the road.
+        astray: The centre is outside the lanes that go the route's way (nuPlan's oncoming traffic).
+    """
+
+    several: Bool[Array, "*T"]
+    off: Bool[Array, "*T"]
+    astray: Bool[Array, "*T"]
+
+
+@record
+class Judgement:
+    """Of a proposal.
+
+    Attributes:
+        collision, road, direction: Gates: 1 passed, 0 failed.
+        progress_m: Along the route.
+        ttc, comfort: 1 kept, 0 not.
+        fault_s: When ego first hits somebody by its own fault, infinite where it does not.
+    """
+
+    collision: Float[Array, "*batch"]
+    road: Float[Array, "*batch"]
+    direction: Float[Array, "*batch"]
+    progress_m: Float[Array, "*batch"]
+    ttc: Float[Array, "*batch"]
+    comfort: Float[Array, "*batch"]
+    fault_s: Float[Array, "*batch"]
+
+
+def ground_at(
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    box: Float[Array, " 6"],
+    z: Float[Array, ""],
+    on_route: Bool[Array, ""],
+) -> Ground:
+    """Where a box lies.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        box: Ego at a hypothetical pose.
+        z: Height of the ground there.
+        on_route: Whether the route still goes on there; where not, only driving against traffic is astray.
+    """
+    points = corners(box)
+    lanes = around_lanes(bank, index, box[:2], box[2:4], points, z)
+    beyond = offroad_distance(bank, index, box[:2], points, lanes.points_near, z).max()
+    routed = ((bank.flags[index] & jnp.uint32(int(Flag.ROUTE))) != 0) & on_route
+    astray = jnp.where(routed, ~lanes.on_corridor, lanes.wrong_way)
+    return Ground(lanes.leaving_lane, (beyond > OFFROAD_TOLERANCE_M) & is_mapped(bank, index), astray)
+
+
+def grounds(
+    bank: ScenarioBank, index: Int[Array, ""], motion: Float[Array, "N T 4"], size: Float[Array, " 2"],
+    z: Float[Array, "N T"], on_route: Bool[Array, "N T"], every: int,
+) -> Ground:  # fmt: skip
+    """Where N drives from one pose lie; each step counts as the next one that is looked up.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        motion: The drives.
+        size: Length and width of ego.
+        z: Height of the ground at each step.
+        on_route: Whether the route goes on there.
+        every: Steps between look-ups; divides T - 1.
+    """
+    box = boxes_of(motion, size)
+
+    def look(box: Array, z: Array, on_route: Array) -> Ground:
+        return ground_at(bank, index, box, z, on_route)
+
+    now = look(box[0, 0], z[0, 0], on_route[0, 0])
+    few = slice(every, None, every)
+    later = jax.vmap(jax.vmap(look))(box[:, few], z[:, few], on_route[:, few])
+
+    def spread(first: Array, rest: Array) -> Array:
+        first = jnp.broadcast_to(first, (rest.shape[0], 1))
+        return jnp.concatenate([first, jnp.repeat(rest, every, axis=1)], axis=1)
+
+    return jax.tree.map(spread, now, later)
+
+
+def judged(
+    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""], size: Float[Array, " 2"],
+    others: Forecast, ground: Ground, progress_m: Float[Array, ""], config: ScoringConfig,
+) -> Judgement:  # fmt: skip
+    """Judges one drive.
+
+    Args:
+        motion: The drive.
+        acceleration: At each step, m/s2.
+        yaw_rate: Of ego now, rad/s.
+        size: Length and width of ego.
+        others: The others.
+        ground: Where the drive lies.
+        progress_m: Way that it makes along the route.
+        config: Limits.
+    """
+    unlawful = ground.several | ground.off
+    soon = until_overlap(motion, size, others, config.ttc_s + DT_S / 10)
+    faults = fault_times(motion, size, others, soon, unlawful)
+    alive = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
+    alive |= others.kind == AgentKind.CYCLIST
+    passed = jnp.where(jnp.isfinite(faults), jnp.where(alive, 0.0, config.static_collision), 1.0)
+    return Judgement(
+        collision=jnp.min(passed),
+        road=1.0 - ground.off.any().astype(jnp.float32),
+        direction=_direction(motion, ground.astray, config),
+        progress_m=progress_m,
+        ttc=1.0 - _foreseen(motion, size, others, soon, config).astype(jnp.float32),
+        comfort=is_comfortable(motion, acceleration, yaw_rate).astype(jnp.float32),
+        fault_s=jnp.min(faults),
+    )
+
+
+def scores(judgement: Judgement, config: ScoringConfig) -> Float[Array, " N"]:
+    """Scores of N proposals in [0, 1]: the product of the gates times the weighted mean.
+
+    Progress counts relative to the proposal that makes the most of it, gates included.
+    """
+    gates = judgement.collision * judgement.road * judgement.direction
+    gained = judgement.progress_m * gates
+    most = jnp.max(gained)
+    allowed = (gates > 0.0).astype(jnp.float32)
+    progress = jnp.where(most > config.least_progress_m, gained / jnp.maximum(most, 1e-6), allowed)
+    weights = config.progress, config.ttc, config.comfort
+    parts = progress, judgement.ttc, judgement.comfort
+    mean = sum(weight * part for weight, part in zip(weights, parts, strict=True)) / sum(weights)
+    return gates * mean
+
+
+def _direction(
+    motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig
+) -> Float[Array, ""]:
+    """1, 1/2 or 0 by the longest way astray in one go."""
+    steps = norm(jnp.diff(motion[:, :2], axis=0)) * astray[1:]
+    whole = jnp.cumsum(steps)
+    # What had been gone astray when ego last was not.
+    before = jax.lax.cummax(jnp.where(astray[1:], 0.0, whole))
+    longest = jnp.max(whole - before)
+    fine, half = config.astray_m
+    return jnp.where(longest < fine, 1.0, jnp.where(longest < half, 0.5, 0.0))
+
+
+def _foreseen(
+    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
+    config: ScoringConfig,
+) -> Bool[Array, ""]:  # fmt: skip
+    """Whether some step foresees a collision with somebody who is not behind ego at that step.
+
+    The first step that foresees one decides for each of the others. Sources do not say where intersections are, so
+    everywhere counts as one: those beside ego count too.
+    """
+    steps = jnp.arange(motion.shape[0])
+    sees = (soon_s <= config.ttc_s) & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
+    first = jnp.min(jnp.where(sees, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)
+    seen = jnp.isfinite(first)
+    step = jnp.where(seen, first, 0.0).astype(jnp.int32)
+    me = boxes_of(motion[step], size)
+    then = others.box[:, :2] + others.velocity * (step * DT_S)[:, None]
+    dx, dy = jnp.moveaxis(then - me[:, :2], -1, 0)
+    ahead = dx * me[:, 2] + dy * me[:, 3] + REAR_AXLE * me[:, LENGTH]
+    left = dy * me[:, 2] - dx * me[:, 3]
+    behind = ahead < _BEHIND_COS * jnp.sqrt(ahead * ahead + left * left)
+    return (seen & ~behind).any()
+
+
+def is_comfortable(
+    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a drive keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``.
+
+    Args:
+        motion: The drive.
+        acceleration: At each step, m/s2.
+        yaw_rate: Of ego now, rad/s.
+    """
+    steps = motion.shape[0]
+    turned = wrap(jnp.diff(motion[:, MOTION_HEADING]))
+    heading = jnp.concatenate([jnp.zeros(1), jnp.cumsum(turned)])
+    rates = jnp.concatenate([yaw_rate[None], turned / DT_S])
+    lateral = motion[:, MOTION_SPEED] * rates
+    magnitude = jnp.sqrt(acceleration**2 + lateral**2 + 1e-12)
+
+    def within(signal: Array, window: int, order: int, derivative: int, least: float, most: float) -> Array:
+        operator = jnp.asarray(filter_operator(steps, window, order, derivative), jnp.float32)
+        smooth = operator @ signal / DT_S**derivative
+        return ((smooth >= least) & (smooth <= most)).all()
+
+    fine = within(acceleration, 8, 2, 0, *LONGITUDINAL_MPS2)
+    fine &= within(lateral, 8, 2, 0, -LATERAL_MPS2, LATERAL_MPS2)
+    fine &= within(acceleration, 15, 2, 1, -JERK_MPS3, JERK_MPS3)
+    fine &= within(magnitude, 15, 2, 1, -JERK_MAGNITUDE_MPS3, JERK_MAGNITUDE_MPS3)
+    fine &= within(heading, 15, 2, 1, -YAW_RATE_RPS, YAW_RATE_RPS)
+    return fine & within(heading, 15, 3, 2, -YAW_ACCELERATION_RPS2, YAW_ACCELERATION_RPS2)

@@ -1,0 +1,148 @@
+"""Traffic in which a planner drives some of the others: a trained policy against which another one is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from drivax.errors import UsageError
+from drivax.planners.planner import Memoryless, Planner
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.record import record
+from drivax.scenario.schema import AgentKind
+from drivax.simulator.contact import Contact
+from drivax.simulator.lights import remember_lights
+from drivax.simulator.simulator import Simulator
+from drivax.simulator.situation import measure
+from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
+from drivax.simulator.types import HISTORY, Frame, Scene, SimState, Traffic
+from drivax.tasks.task import Task
+
+#: Who travels less than this in the rest of the log is left where it is, m.
+_TRAVELS_M = 2.0
+
+
+@record
+class Driven:
+    """State of the K agents that the planner drives.
+
+    Attributes:
+        begin: Step at which the episode began; until then everyone moved as logged.
+        scenes: A scene each; slots beyond the moving agents are nobody's.
+        base: State of the traffic around them.
+    """
+
+    begin: Int[Array, "*batch"]
+    scenes: Scene
+    base: Any
+
+
+@dataclass(frozen=True)
+class PlannerTraffic:
+    """The vehicles nearest to ego are driven by ``bank.driver``, everyone else behaves as in ``base``.
+
+    Driven are vehicles that the log has when the episode begins and that travel more than 2 m in the rest of it. They
+    see ego, each other and everyone else, drive by the task's dynamics to the end of the episode, and have no route, as
+    agents other than ego have none: a policy that is to drive them well is trained to follow lanes.
+
+    Attributes:
+        task: What the planner was made for: its observation and its action space.
+        count: How many vehicles are driven, at most.
+        base: Traffic of the others.
+        seed: Of what a planner draws, which depends on nothing else but scenario, step and agent.
+    """
+
+    task: Task = field(default_factory=Task)
+    count: int = 4
+    base: Traffic = field(default_factory=LogTraffic)
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """As printed in tables: ``driven``, or ``driven+idm``."""
+        return "driven" if self.base.name == "log" else f"driven+{self.base.name}"
+
+    def prepare(self, bank: ScenarioBank) -> ScenarioBank:
+        """The bank with what ``base`` needs."""
+        return prepared(self.base, bank)
+
+    def start(self, bank: ScenarioBank, index: Any, step: Any) -> Driven:
+        """Everyone where the log has them at ``step``.
+
+        Raises:
+            UsageError: The bank has no driver.
+        """
+        if bank.driver is None:
+            raise UsageError("the bank has no driver", cure="use planners.driven.with_driver first")
+        simulator, slots = Simulator(self.task), self._slots(bank, index, step)
+        scenes = jax.vmap(lambda slot: simulator.scene(bank, index, step, slot))(slots)
+        return Driven(jnp.asarray(step, jnp.int32), scenes, self.base.start(bank, index, step))
+
+    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> Driven:
+        """One step of 0.1 s: everyone looks at the present frame, then all move."""
+        now = scene.traffic
+
+        def frames(back: int) -> Frame:
+            rows = self.agents(bank, scene, back)
+            return frame_of(bank, scene.index, scene.step, rows, alone(scene), back) if back else frame
+
+        def drive(one: Scene) -> Scene:
+            apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
+            lights = remember_lights(bank, one)
+            found, contacts, lights = measure(bank, one, frame, frames(1), apart, lights)
+            state = SimState(found.scene, found.facts, contacts, lights, self.task.episode_start(), now.begin)
+            key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[one.index])
+            key = jax.random.fold_in(key, one.step)
+            seen = self.task.observe(bank, found.scene, frames, frame)
+            asked, _ = bank.driver.act((), bank, state, found, seen, jax.random.fold_in(key, one.slot))
+            motion, length = one.history[-1], bank.agent_box[one.index, one.slot, 0]
+            action = self.task.actuated(motion, asked, one.action)
+            motion = self.task.motion(motion, action, length)
+            history = jnp.concatenate([one.history[1:], motion[None]])
+            return replace(found.scene, step=one.step + 1, history=history, action=action)
+
+        base = self.base.advance(bank, replace(scene, traffic=now.base), frame)
+        return Driven(now.begin, jax.vmap(drive)(now.scenes), base)
+
+    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+        """Rows of ``base``, with those of the driven vehicles since the episode began."""
+        now = scene.traffic
+        rows = self.base.agents(bank, replace(scene, traffic=now.base), back)
+        x, y, heading, speed = jnp.moveaxis(now.scenes.history[:, HISTORY - 1 - back], -1, 0)
+        cos, sin = jnp.cos(heading), jnp.sin(heading)
+        parts = [x, y, now.scenes.z, cos, sin, speed * cos, speed * sin, jnp.ones_like(x)]
+        slot = jnp.where(scene.step - back > now.begin, now.scenes.slot, rows.shape[0])
+        return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
+
+    def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:
+        """Slots of the vehicles that are driven, the nearest to ego first, filled up with nobody's."""
+        rows = bank.agents[index]
+        here = rows[step]
+        moved = ((rows[..., :2] - here[:, :2]) ** 2).sum(axis=-1)
+        later = (rows[..., AGENT_VALID] > 0) & (jnp.arange(bank.steps) > step)[:, None]
+        slots = jnp.arange(here.shape[0])
+        chosen = (here[:, AGENT_VALID] > 0) & (slots > 0) & (later & (moved > _TRAVELS_M**2)).any(axis=0)
+        chosen &= bank.agent_box[index, : here.shape[0], 3] == int(AgentKind.VEHICLE)
+        distance = jnp.where(chosen, ((here[:, :2] - here[0, :2]) ** 2).sum(axis=-1), jnp.inf)
+        order = jnp.argsort(distance)[: self.count]
+        order = jnp.pad(order, (0, self.count - order.shape[0]), constant_values=here.shape[0])
+        far = jnp.isinf(distance.at[order].get(mode="fill", fill_value=jnp.inf))
+        return jnp.where(far, here.shape[0], order).astype(jnp.int32)
+
+
+def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:
+    """The bank with a planner that drives others than ego in :class:`PlannerTraffic`.
+
+    Raises:
+        UsageError: The planner carries something from step to step, or replays the log.
+    """
+    if not isinstance(driver, Memoryless) or driver.replays:
+        raise UsageError(
+            f"planner {driver.name!r} cannot drive others", cure="use a trained policy, or one without memory"
+        )
+    return replace(bank, driver=driver)

@@ -1,0 +1,1 @@
+"""Tables, pictures, videos and HTML pages of runs and scenario sets."""

@@ -1,0 +1,71 @@
+"""The player as HTML: what it is fed with, its controls, its legend and the plots below it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from drivax.report.charts.motion import COMMANDS, SIGNALS
+from drivax.report.pages.page import asset, data_element
+from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
+
+KEYS = (
+    ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
+    ("+ −", "zoom"), ("f", "follow or whole drive"), ("n p", "next and previous episode"),
+)  # fmt: skip
+_CONTROLS = """<div class=controls>
+<button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
+<button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
+<button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
+<div class=track><div class=ticks data-control=ticks></div>
+<input type=range min=0 max=90 value=0 step=1 data-control=scrub aria-label="time"></div>
+<span class=clock data-control=clock></span>
+<select data-control=speed aria-label="speed" title="speed ([ and ])">
+<option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
+<option value=2>2×</option><option value=4>4×</option></select>
+<button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
+<button type=button data-control=fit aria-pressed=false title="show the whole drive (f)">whole</button>
+<button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
+<button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
+</div>"""
+
+
+def player_html() -> str:
+    """Stage, controls, legend, keys and plots."""
+    legend = "".join(_legend_item(name, words) for name, words in LEGEND)
+    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
+    return (
+        f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript>"
+        "<h3>How it drove</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the filters "
+        "of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are what was "
+        "carried out: acceleration (or metres ahead) and steering (or metres to the left), as shares of the most "
+        "that the action space allows.</small></p>"
+    )
+
+
+def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return script elements with palette, signals and packed episodes (``report.pictures.episode``)."""
+    themes = {name: dict(theme) for name, theme in THEMES.items()}
+    signals = [
+        {"words": one.title, "unit": one.unit, "step": one.step, "limits": one.limits}
+        for one in (*SIGNALS, *COMMANDS)
+    ]
+    strokes = [[one.colour, one.dash, one.key] for one in STROKES]
+    head = [
+        data_element(themes, id="palette"),
+        data_element({"signals": signals, "strokes": strokes}, id="signals"),
+    ]
+    return head + [data_element(episode, **{"class": "episode"}) for episode in episodes]
+
+
+def player_scripts() -> list[str]:
+    """The programs of player and plots; the plots listen to the player, so that they come first."""
+    return [asset("plots.js"), asset("player.js")]
+
+
+def _legend_item(name: str, words: str) -> str:
+    sign = "✕" if name == "mark" else ""
+    fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
+    return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'

@@ -1,0 +1,1 @@
+"""Scenarios and episodes drawn as pictures, videos and player data."""

@@ -1,0 +1,1 @@
+"""Scenarios on the device: stacked arrays, and the map queries on them."""

@@ -1,0 +1,375 @@
+"""The only map tests: pure functions of a pose, unbatched, for real and hypothetical poses alike.
+
+Each looks up the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly inside them. What is
+beyond the cut-off of a test (edges 3 m from a point, lanes 4 m) never changes its result, so no result depends on the
+grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more than 3 m above or below are ignored.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.vectors import root
+from drivax.scenario.bank.nearby import edges_around, lanes_around, to_segments
+from drivax.scenario.bank.scenario_bank import (
+    LIGHT_COS,
+    LIGHT_HALF,
+    LIGHT_SIN,
+    LIGHT_X,
+    LIGHT_Y,
+    LIGHT_Z,
+    ROUTE_LIMIT,
+    ScenarioBank,
+)
+from drivax.scenario.bank.smallest import first_smallest
+from drivax.scenario.build.sides import NOT_DRIVABLE, SPLIT
+from drivax.scenario.record import record
+
+EDGE_CUTOFF_M = 3.0
+LANE_CUTOFF_M = 4.0
+LEVEL_M = 3.0
+#: A corner may be this far beyond an edge before it counts as off the road (semantics, ``offroad``).
+OFFROAD_TOLERANCE_M = 0.3
+#: A lane's border is fuzzy by this much (semantics, ``lane_straddle``).
+LANE_MARGIN_M = 0.2
+#: A car follows a lane whose centre is this near, m.
+_FOLLOWED_M = 2.5
+_FAR = 1e9
+
+
+def left_of_edges(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
+    z: Float[Array, ""],
+) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
+    """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
+
+    At a vertex two segments are equally near; the one whose line is further away has the right side (the other one's
+    line passes through the wrong wedge). Points must lie within 5 m of ``centre``, whose cells are read.
+
+    Returns:
+        Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
+    """
+    rows, inside = edges_around(bank, index, centre)
+    squared, side = to_segments(rows, points)
+    squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
+    nearest = squared.min(axis=1)
+    tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
+    left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
+    right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
+    distance = root(nearest)
+    return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
+
+
+@record
+class LaneHits:
+    """What the lanes around a box say about it; booleans and distances of its centre unless said otherwise.
+
+    Attributes:
+        near: A lane centre lies within the cut-off of the box's centre.
+        points_near: The same for each of the points (box corners).
+        on_corridor: Inside a lane of the route's corridor.
+        wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
+        straddling: Some corner is outside every lane that runs ego's way.
+        leaving_lane: Some corner is outside the lane that the centre is in (nuPlan's several lanes, for fault).
+        limit: Speed limit of the lane, m/s; -1 where unknown.
+        lane: Index of the nearest lane that runs ego's way, -1 where none is near.
+        offset: Signed distance to its centre line, positive left of it, m.
+        z: Height of the nearest lane, of the query's own height where none is near.
+    """
+
+    near: Bool[Array, ""]
+    points_near: Bool[Array, " P"]
+    on_corridor: Bool[Array, ""]
+    wrong_way: Bool[Array, ""]
+    straddling: Bool[Array, ""]
+    leaving_lane: Bool[Array, ""]
+    limit: Float[Array, ""]
+    lane: Int[Array, ""]
+    offset: Float[Array, ""]
+    z: Float[Array, ""]
+
+
+def around_lanes(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], heading: Float[Array, " 2"],
+    points: Float[Array, "P 2"], z: Float[Array, ""],
+) -> LaneHits:  # fmt: skip
+    """Where a box lies among the lanes around it.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        centre: Centre of the box, m.
+        heading: Cosine and sine of its heading.
+        points: Its corners.
+        z: Its height.
+    """
+    rows, inside = lanes_around(bank, index, centre)
+    inside = inside & (jnp.abs(rows[4] - z) <= LEVEL_M)
+    squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
+    squared = jnp.where(inside, squared, _FAR)
+    half, limit = rows[5], rows[6]
+    ux, uy = rows[2] - rows[0], rows[3] - rows[1]
+    aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
+    aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
+    own, corner = squared[0], squared[1:]
+    reachable = own <= LANE_CUTOFF_M**2
+    best = first_smallest(jnp.where(aligned, own, _FAR))
+    has_lane = aligned[best] & reachable[best]
+    nearest = first_smallest(own)
+    opposed = jnp.where(against & (own <= half * half), own, _FAR).min()
+    friendly = jnp.where(aligned, own, _FAR).min()
+    if bank.long_ego:
+        points_near, outside = jax.vmap(lambda point: _corner_lanes(bank, index, point, heading, z))(points)
+    else:
+        points_near = corner.min(axis=1) <= LANE_CUTOFF_M**2
+        outside = _outside_lanes(corner, aligned, half)
+    leaving = jnp.abs(side[1:, best]) - (half[best] + LANE_MARGIN_M) > 0.0
+    near = reachable.any()
+    return LaneHits(
+        near=near,
+        points_near=points_near,
+        on_corridor=((rows[7] > jnp.floor(rows[7])) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
+        wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
+        straddling=outside.any(),
+        leaving_lane=has_lane & leaving.any(),
+        limit=jnp.where(has_lane, limit[best], -1.0),
+        lane=jnp.where(has_lane, jnp.floor(rows[7, best]), -1.0).astype(jnp.int32),
+        offset=jnp.where(has_lane, side[0, best], 0.0),
+        z=jnp.where(near, rows[4, nearest], z),
+    )
+
+
+def aligned_lanes(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
+    z: Float[Array, ""],
+) -> tuple[Int[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:  # fmt: skip
+    """Segments of lanes around a point that run its way: lane, squared distance, signed distance to the line (left +).
+
+    Those that do not count have lane -1 and are very far away.
+    """
+    rows, inside = lanes_around(bank, index, xy)
+    squared, side = to_segments(rows, xy[None])
+    aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
+    counts = inside & aligned & (jnp.abs(rows[4] - z) <= LEVEL_M)
+    return jnp.where(counts, rows[7], -1.0).astype(jnp.int32), jnp.where(counts, squared[0], _FAR), side[0]
+
+
+def lane_distance(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], z: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Distance to the nearest lane centre, whichever way it runs, m; infinite where none is within the cut-off."""
+    rows, inside = lanes_around(bank, index, xy)
+    squared = to_segments(rows, xy[None])[0][0]
+    nearest = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR).min()
+    return jnp.where(nearest <= LANE_CUTOFF_M**2, root(nearest), jnp.inf)
+
+
+def vertex_distances(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], spacing_m: float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Distance to the nearest vertex of a road edge and of a lane centre, on any level, m.
+
+    What others measure who keep maps as points. Segments as stored are drawn with a vertex every ``spacing_m`` from
+    their beginning on, and one at their end. Exact within the cut-offs; beyond them it may be too large.
+    """
+    return (
+        _nearest_vertex(*edges_around(bank, index, xy), xy, spacing_m),
+        _nearest_vertex(*lanes_around(bank, index, xy), xy, spacing_m),
+    )
+
+
+def _nearest_vertex(
+    rows: Float[Array, "F K"], inside: Bool[Array, " K"], xy: Float[Array, " 2"], spacing_m: float
+) -> Float[Array, ""]:
+    u, w = rows[2:4] - rows[0:2], xy[:, None] - rows[0:2]
+    length = root(jnp.sum(u * u, axis=0))
+    along = jnp.sum(u * w, axis=0) / jnp.maximum(length, 1e-6)
+    across = (u[0] * w[1] - u[1] * w[0]) / jnp.maximum(length, 1e-6)
+    last = jnp.floor(length / spacing_m) * spacing_m
+    at = jnp.clip(jnp.round(along / spacing_m) * spacing_m, 0.0, last)
+    away = jnp.minimum(jnp.abs(along - at), jnp.abs(along - length))
+    return root(jnp.where(inside, across * across + away * away, _FAR).min())
+
+
+def _outside_lanes(
+    squared: Float[Array, "P K"], aligned: Bool[Array, " K"], half: Float[Array, " K"]
+) -> Bool[Array, " P"]:
+    """Whether each point is outside every lane that runs ego's way."""
+    return ~(aligned & (squared <= (half + LANE_MARGIN_M) ** 2)).any(axis=1)
+
+
+def _corner_lanes(
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    point: Float[Array, " 2"],
+    heading: Float[Array, " 2"],
+    z: Float[Array, ""],
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """For a corner that its box's own cells may not reach: whether a lane is near, and whether it is outside all."""
+    rows, inside = lanes_around(bank, index, point)
+    squared = to_segments(rows, point[None])[0]
+    squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
+    aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
+    return squared.min() <= LANE_CUTOFF_M**2, _outside_lanes(squared, aligned, rows[5])[0]
+
+
+def offroad_distance(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
+    points_near_lane: Bool[Array, " P"], z: Float[Array, ""],
+) -> Float[Array, " P"]:  # fmt: skip
+    """How far each point is beyond the nearest road edge, m: positive off the road, negative on it.
+
+    Without an edge within the cut-off the stored side of the point's side cell decides, and without that the road
+    is where a lane centre is near; such points get plus or minus the cut-off.
+    """
+    if bank.long_ego:
+        look = jax.vmap(lambda p: left_of_edges(bank, index, p, p[None], z))
+        left, known = (part[:, 0] for part in look(points))
+    else:
+        left, known = left_of_edges(bank, index, centre, points, z)
+    stored = _stored_side(bank, index, points)
+    off = jnp.where(stored != 0, stored == NOT_DRIVABLE, ~points_near_lane)
+    return jnp.where(known, -left, jnp.where(off, EDGE_CUTOFF_M, -EDGE_CUTOFF_M))
+
+
+def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array, "P 2"]) -> Int[Array, " P"]:
+    """Code of the side cell of each point (``scenario.build.sides.packed``); 0 outside the grid."""
+    grid = round(bank.grid_side.shape[1] ** 0.5)
+    fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
+    inside = ((fine >= 0) & (fine < grid * SPLIT)).all(axis=1)
+    cell, part = jnp.clip(fine // SPLIT, 0, grid - 1), fine % SPLIT
+    word = bank.grid_side[index, cell[:, 1] * grid + cell[:, 0]]
+    return jnp.where(inside, (word >> (2 * (part[:, 1] * SPLIT + part[:, 0]))) & 3, 0)
+
+
+def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Bool[Array, ""]:
+    """Whether a point lies outside the box around all edges and lanes of the scenario."""
+    box = bank.map_box[index]
+    return ((xy < box[:2]).any() | (xy > box[2:]).any()) & is_mapped(bank, index)
+
+
+def is_mapped(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether the scenario has any edge or lane, without which being off the road means nothing."""
+    return (bank.grid_edge[index, -1] > 0) | (bank.grid_lane[index, -1] > 0)
+
+
+@record
+class RouteHit:
+    """Projection on the route: arc length, signed lateral distance (left positive), m; heading cosine and sine."""
+
+    along_m: Float[Array, ""]
+    lateral_m: Float[Array, ""]
+    distance_m: Float[Array, ""]
+    heading: Float[Array, " 2"]
+
+
+_WINDOW = 40
+_WINDOW_BEHIND = 6
+
+
+def project_on_route(
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    xy: Float[Array, " 2"],
+    near_m: Float[Array, ""],
+    ahead_m: float | Float[Array, ""] = 33.0,
+    route: int = 0,
+) -> RouteHit:
+    """Projects a point on the route within a window from 6 m behind to ``ahead_m`` ahead of ``near_m``.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        xy: The point, m.
+        near_m: Arc length around which to look; the last known position along the route.
+        ahead_m: How far ahead to look; a car that moved little cannot have reached the other leg of a hairpin.
+        route: 0 the route to the goal, 1 the log's own.
+    """
+    count = bank.routes.shape[2]
+    first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
+    size = min(_WINDOW, count)
+    window = jax.lax.dynamic_slice(
+        bank.routes, (index, jnp.int32(route), first, jnp.int32(0)), (1, 1, size, 5)
+    )[0, 0]
+    a, b = window[:-1], window[1:]
+    place = first + jnp.arange(size - 1)
+    real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
+    rows = [a[:, 0], a[:, 1], b[:, 0], b[:, 1]]
+    squared, side = to_segments(rows, xy[None])
+    k = first_smallest(jnp.where(real, squared[0], _FAR))
+    u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
+    part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
+    distance = root(squared[0, k])
+    return RouteHit(
+        along_m=(first + k).astype(jnp.float32) + part,
+        lateral_m=jnp.where(side[0, k] >= 0, distance, -distance),
+        distance_m=distance,
+        heading=window[k, 3:5],
+    )
+
+
+def route_ahead(
+    bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""], offsets_m: Float[Array, " K"],
+    route: int = 0,
+) -> tuple[Float[Array, "K 7"], Bool[Array, " K"]]:  # fmt: skip
+    """Route rows at arc lengths ``along_m + offsets_m`` (linear between points) and which of them exist."""
+    at = jnp.maximum(along_m + offsets_m, 0.0)
+    last = bank.route_points[index, route] - 1
+    low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
+    # Lanes and limits are not numbers to blend.
+    part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < ROUTE_LIMIT)
+    rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
+    return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
+
+
+def light_crossing(
+    bank: ScenarioBank,
+    index: Int[Array, ""],
+    before: Float[Array, " 2"],
+    now: Float[Array, " 2"],
+    z: Float[Array, ""],
+) -> tuple[Bool[Array, " L"], Float[Array, " L"]]:
+    """Which stop lines a point crossed forwards between two steps, and its distance before each line now (m).
+
+    A line is crossed when the signed distance along the lane's heading changes sign and the point passes through the
+    finite segment. The distance is infinite for lines of other lanes (more than 2 m beside the segment) and levels.
+    """
+    line = bank.light_line[index]
+    cos, sin, half = line[LIGHT_COS], line[LIGHT_SIN], line[LIGHT_HALF]
+
+    def split(point: Float[Array, " 2"]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
+        dx, dy = point[0] - line[LIGHT_X], point[1] - line[LIGHT_Y]
+        return dx * cos + dy * sin, dy * cos - dx * sin
+
+    (s0, t0), (s1, t1) = split(before), split(now)
+    share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
+    through = jnp.abs(t0 + (t1 - t0) * share) <= half
+    level = jnp.abs(line[LIGHT_Z] - z) <= LEVEL_M
+    before_m = jnp.where(level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
+    return (s0 < 0.0) & (s1 >= 0.0) & through & level, before_m
+
+
+def lane_course(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
+    z: Float[Array, ""],
+) -> tuple[Float[Array, " 2"], Float[Array, ""], Bool[Array, ""]]:  # fmt: skip
+    """Where the lane leads that a car at a point would follow.
+
+    Of the lanes within 2.5 m and 60 degrees it is the one that fits place and heading best, a metre weighing as
+    much as 15 degrees, so that a car which has begun to turn follows the turn.
+
+    Returns:
+        Direction of that lane, the point's signed distance to it (positive left of it, m), and whether there is one.
+    """
+    rows, inside = lanes_around(bank, index, xy)
+    squared, side = to_segments(rows, xy[None])
+    ux, uy = rows[2] - rows[0], rows[3] - rows[1]
+    length = jnp.sqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
+    cos = (ux * heading[0] + uy * heading[1]) / length
+    sin = (ux * heading[1] - uy * heading[0]) / length
+    fits = inside & (jnp.abs(rows[4] - z) <= LEVEL_M) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
+    best = first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
+    direction = jnp.stack([ux[best], uy[best]]) / length[best]
+    return direction, side[0, best], fits[best]

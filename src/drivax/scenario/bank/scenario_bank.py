@@ -1,0 +1,365 @@
+"""The scenario bank: many scenarios stacked on the device, an argument of everything that simulates.
+
+A bank is built from stored scenarios and trimmed to what the set really uses, so that padding costs nothing. It holds
+what a step reads, in the layout in which a step reads it: agents time-major (a frame is one contiguous read), map
+segments feature-major (a grid query is three contiguous reads per feature).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from drivax.errors import DataError
+from drivax.geometry.angles import wrap
+from drivax.scenario.bank.identity import identities
+from drivax.scenario.bank.sizes import Sizes, last_used
+from drivax.scenario.build.lane_codes import corridor_lanes, lane_codes
+from drivax.scenario.record import record, static
+from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
+
+#: Lane width where the source gives none, m.
+DEFAULT_LANE_WIDTH_M = 3.7
+#: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
+CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
+
+AGENT_X, AGENT_Y, AGENT_Z, AGENT_COS, AGENT_SIN, AGENT_VX, AGENT_VY, AGENT_VALID = range(8)
+ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range(7)
+#: A stop line: middle, direction of its lane there, half length, height, direction of the lane's end, whether that end
+#: is more than 45 deg to the right, arc length along route 0 where a lane of that leads over it (else very large).
+(
+    LIGHT_X, LIGHT_Y, LIGHT_COS, LIGHT_SIN, LIGHT_HALF, LIGHT_Z, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, LIGHT_ARC,
+) = range(10)  # fmt: skip
+NEVER_M = 1e6
+#: Steps in a word of ``parked_when``.
+WORD = 32
+#: Layers of observed pieces of road; rows that hold none are on no layer.
+ROAD_LANE, ROAD_EDGE, ROAD_AREA, ROAD_NONE = range(4)
+
+
+@record
+class ScenarioBank:
+    """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, S slots of a frame, G grid cells a side.
+
+    In a frame the parked agents of a scenario come right behind its own moving ones, so that the slots of a frame are
+    as many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
+
+    Attributes:
+        agents: x, y, z, cos, sin, vx, vy, valid of moving agents; slot 0 is ego.
+        agent_box: Length, width, height, kind of everyone.
+        parked: Rows like those of ``agents``, for the slots of parked ones.
+        parked_when: When each of them is there: bit ``t % 32`` of word ``t // 32``; never for slots of moving agents.
+        light_line: Stop lines, see ``LIGHT_X`` to ``LIGHT_ARC``.
+        edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
+        lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
+            added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
+        lane_codes: Strand, neighbours and end of every lane of the graph (``scenario.build.lane_codes``).
+        grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
+        grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.build.sides.packed``).
+        map_box: Smallest and largest x, y of edges and lanes.
+        routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
+        log_progress: Arc length of the logged ego along route 0.
+        log_ahead: Distance that the logged ego still drives.
+        road: Observation pieces in order of rank: x, y, direction, length, layer (``ROAD_LANE``, ...), limit (-1).
+        road_at: What decides which of them are seen: x, y, layer.
+        road_curvature: Turn of each piece per metre, left positive, 1/m.
+        flags: ``scenario.schema.Flag`` bits.
+        identity: What chance in a scenario follows from, whatever row it has (``scenario.bank.identity``).
+        extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
+        paths: Paths of agents that react (``simulator.traffic.agent_paths.with_paths``), None where nobody does.
+        driver: Planner that drives others than ego (``planners.planner_traffic.with_driver``), None where nobody does.
+        given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
+        cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
+        long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
+        trimmed: Whether padding that no scenario uses was cut (static).
+    """
+
+    agents: Float[Array, "N T A 8"]
+    agent_box: Float[Array, "N S 4"]
+    parked: Float[Array, "N S 8"]
+    parked_when: UInt[Array, "N W S"]
+    light_line: Float[Array, "N 10 L"]
+    light_state: Int[Array, "N T L"]
+    edges: Float[Array, "N 5 E"]
+    lanes: Float[Array, "N 8 C"]
+    lane_codes: Float[Array, "N G 6"]
+    grid_edge: Int[Array, "N cells1"]
+    grid_lane: Int[Array, "N cells1"]
+    grid_side: Int[Array, "N cells"]
+    grid_origin: Float[Array, "N 2"]
+    map_box: Float[Array, "N 4"]
+    routes: Float[Array, "N 2 R 7"]
+    route_points: Int[Array, "N 2"]
+    goal: Float[Array, "N 2"]
+    log_progress: Float[Array, "N T"]
+    log_ahead: Float[Array, "N T"]
+    road: Float[Array, "N O 7"]
+    road_at: Float[Array, "N 3 O"]
+    road_curvature: Float[Array, "N O"]
+    flags: UInt[Array, " N"]
+    identity: UInt[Array, " N"]
+    extension: Float[Array, "N A X 2"]
+    cell_m: float = static()
+    edge_run: int = static()
+    lane_run: int = static()
+    long_ego: bool = static()
+    trimmed: bool = static()
+    paths: Any = None
+    given: Any = None
+    driver: Any = None
+
+    def __len__(self) -> int:
+        return self.agents.shape[0]
+
+    @property
+    def steps(self) -> int:
+        """Steps T of a scenario."""
+        return self.agents.shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the bank takes on the device."""
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+    def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
+        """Some of the scenarios as a bank; the driver is everyone's."""
+        return replace(jax.tree.map(lambda leaf: leaf[rows], replace(self, driver=None)), driver=self.driver)
+
+    @classmethod
+    def from_scenarios(
+        cls, scenarios: Iterable[Scenario], *, trim: bool | Sizes = True, allow_no_future: bool = False
+    ) -> ScenarioBank:
+        """Stacks scenarios of one capacity.
+
+        Args:
+            scenarios: All of one capacity.
+            trim: Cut padding that no scenario of the bank uses; or cut to sizes, as :meth:`Sizes.used` of more
+                scenarios. Banks of the same sizes (those that are not cut are, if of one capacity) share compiled
+                programs; smaller ones are faster.
+            allow_no_future: Accept test splits.
+
+        Raises:
+            DrivaxError: If there are none, or one has no future and ``allow_no_future`` is not set.
+        """
+        kept = list(scenarios)
+        for scenario in kept:
+            if Flag.NO_FUTURE in scenario.has and not allow_no_future:
+                raise DataError(
+                    "has no logged future (a test split)",
+                    record=scenario.id,
+                    cure="leave it out (flag!=NO_FUTURE)",
+                )
+        for scenario in kept:
+            if scenario.capacity != kept[0].capacity:
+                raise DataError(
+                    f"has capacity {scenario.capacity.name!r}, others {kept[0].capacity.name!r}",
+                    record=scenario.id,
+                    cure="convert all sets with one --capacity",
+                )
+        own = Sizes.used(kept)
+        sizes = trim if isinstance(trim, Sizes) else own if trim else Sizes.whole(kept[0].capacity)
+        return cls(
+            **{name: jnp.asarray(value) for name, value in _stack(kept, sizes).items()},
+            cell_m=kept[0].capacity.cell_m,
+            edge_run=sizes.edge_run,
+            lane_run=sizes.lane_run,
+            long_ego=own.long_ego or sizes.long_ego,
+            trimmed=trim is True,
+        )
+
+
+def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
+    return np.stack([scenario.record[name] for scenario in scenarios])
+
+
+def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    arrays = _stack_agents(scenarios, sizes) | _stack_routes(scenarios)
+    return (
+        arrays
+        | _stack_lights(scenarios, sizes)
+        | _stack_road(scenarios, sizes)
+        | _stack_maps(scenarios, sizes)
+    )
+
+
+def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    valid, count = _column(scenarios, "agent_valid"), sizes.agents
+    heading, size = _column(scenarios, "agent_heading"), _column(scenarios, "agent_size")
+    agents = np.concatenate(
+        [
+            _column(scenarios, "agent_xy"),
+            _column(scenarios, "agent_z")[..., None],
+            np.cos(heading)[..., None],
+            np.sin(heading)[..., None],
+            _column(scenarios, "agent_velocity"),
+            valid[..., None],
+        ],
+        -1,
+        dtype=np.float32,
+    )[:, :, :count]
+    box = np.concatenate([size, _column(scenarios, "agent_kind")[..., None]], -1, dtype=np.float32)[:, :count]
+    return {
+        "agents": agents,
+        "extension": _column(scenarios, "agent_extension")[:, :count],
+        "flags": _column(scenarios, "flags"),
+        "identity": identities([(one.text("dataset"), one.id) for one in scenarios]),
+        **_stack_parked(scenarios, sizes.slots, last_used(valid.any(1)), box),
+    }
+
+
+def _stack_parked(
+    scenarios: Sequence[Scenario], slots: int, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
+) -> dict[str, np.ndarray[Any, Any]]:
+    """Parked agents, each scenario's from its slot ``first`` on, and everyone's box."""
+    valid, heading = _column(scenarios, "parked_valid"), _column(scenarios, "parked_heading")
+    count = last_used(valid.any(1))
+    scenario, place = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
+    at = scenario, first[scenario] + place
+    rows = np.zeros((len(scenarios), slots, 8), np.float32)
+    heading, z = heading[scenario, place], _column(scenarios, "parked_z")[scenario, place]
+    xy = _column(scenarios, "parked_xy")[scenario, place]
+    still, there = np.zeros((len(z), 2)), np.ones((len(z), 1))
+    pose = [xy, z[:, None], np.cos(heading)[:, None], np.sin(heading)[:, None]]
+    rows[at] = np.concatenate([*pose, still, there], axis=1)
+    boxes = np.zeros((len(scenarios), slots, 4), np.float32)
+    boxes[:, : box.shape[1]] = box
+    size, kind = _column(scenarios, "parked_size"), _column(scenarios, "parked_kind")
+    boxes[at] = np.concatenate([size, kind[..., None]], -1)[scenario, place]
+    when = np.zeros((len(scenarios), valid.shape[1], slots), bool)
+    when[scenario, :, at[1]] = valid[scenario, :, place]
+    return {"agent_box": boxes, "parked": rows, "parked_when": as_words(when)}
+
+
+def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
+    """Steps as bits of words, see ``ScenarioBank.parked_when``."""
+    steps = when.shape[1]
+    padded = np.pad(when, ((0, 0), (0, -steps % WORD), (0, 0)))
+    bits = padded.reshape(len(when), -1, WORD, when.shape[2]).astype(np.uint32)
+    return (bits << np.arange(WORD, dtype=np.uint32)[:, None]).sum(axis=2, dtype=np.uint32)
+
+
+def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
+    heading = _column(scenarios, "route_heading")[:, :2, :, None]
+    routes = np.concatenate(
+        [
+            _column(scenarios, "route_xy")[:, :2],
+            _column(scenarios, "route_z")[:, :2, :, None],
+            np.cos(heading),
+            np.sin(heading),
+            _column(scenarios, "route_limit")[:, :2, :, None],
+            _column(scenarios, "route_lane")[:, :2, :, None],
+        ],
+        -1,
+        dtype=np.float32,
+    )
+    return {
+        "routes": routes,
+        "route_points": _column(scenarios, "route_points")[:, :2].astype(np.int32),
+        "goal": _column(scenarios, "goal_xy"),
+        "log_progress": _column(scenarios, "log_progress"),
+        "log_ahead": _log_ahead(scenarios),
+    }
+
+
+def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
+    """Distance that each ego log drives from every step to its end; gaps in it count for nothing."""
+    xy, valid = _column(scenarios, "agent_xy")[:, :, 0], _column(scenarios, "agent_valid")[:, :, 0]
+    moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
+    ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
+    return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1).astype(np.float32)
+
+
+def _stack_lights(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
+    z, heading, exits = (_column(scenarios, f"light_{name}") for name in ("z", "heading", "exit_heading"))
+    middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
+    half = np.hypot(*np.moveaxis(along, -1, 0)) / 2
+    x, y = np.moveaxis(middle, -1, 0)
+    right = wrap(exits.astype(np.float64) - heading) < -np.pi / 4
+    arc = np.stack([_stop_arcs(scenario, at) for scenario, at in zip(scenarios, middle, strict=True)])
+    rows = [x, y, np.cos(heading), np.sin(heading), half, z, np.cos(exits), np.sin(exits), right, arc]
+    return {
+        "light_line": np.stack(rows, axis=1, dtype=np.float32)[:, :, : sizes.lights],
+        "light_state": state[:, :, : sizes.lights],
+    }
+
+
+def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Arc length along the route to the goal of the stop lines of its lanes, where it first comes nearest to each."""
+    count = int(scenario.route_points[0])
+    lanes = scenario.light_lane
+    mine = np.flatnonzero((lanes >= 0) & np.isin(lanes, scenario.route_lane[0]))
+    arcs = np.full(len(lanes), NEVER_M)
+    if count and len(mine):
+        x, y = scenario.route_xy[0, :count].T.astype(np.float64)
+        heading = scenario.route_heading[0, :count].astype(np.float64)
+        dx, dy = middle[mine, 0, None] - x, middle[mine, 1, None] - y
+        near = np.argmin(dx * dx + dy * dy, axis=1)
+        row = np.arange(len(mine))
+        arcs[mine] = near + dx[row, near] * np.cos(heading[near]) + dy[row, near] * np.sin(heading[near])
+    return arcs
+
+
+def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    blocks = _column(scenarios, "segment_blocks").astype(np.int64)
+    edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
+    # A run is read whole, so every start must leave room for one behind it.
+    edges = np.full((len(scenarios), 5, sizes.edges + sizes.edge_run), 1e6, np.float32)
+    lanes = np.full((len(scenarios), 8, sizes.lanes + sizes.lane_run), 1e6, np.float32)
+    box = np.zeros((len(scenarios), 4), np.float32)
+    for row, scenario in enumerate(scenarios):
+        e, n = int(edge_count[row]), int(lane_count[row])
+        a, b = scenario.segment_a, scenario.segment_b
+        edges[row, :, :e] = np.stack([a[:e, 0], a[:e, 1], b[:e, 0], b[:e, 1], (a[:e, 2] + b[:e, 2]) / 2])
+        lanes[row, :, :n] = _lane_rows(scenario, slice(e, e + n))
+        points = np.concatenate([a[: e + n, :2], b[: e + n, :2]])
+        if len(points):
+            box[row] = [*points.min(0), *points.max(0)]
+    return {
+        "edges": edges,
+        "lanes": lanes,
+        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, : sizes.graphs],
+        "grid_edge": _column(scenarios, "grid_edge").astype(np.int16),
+        "grid_lane": (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16),
+        "grid_side": _column(scenarios, "grid_side"),
+        "grid_origin": _column(scenarios, "grid_origin"),
+        "map_box": box,
+    }
+
+
+def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+    rows = _column(scenarios, "road_rows").astype(np.int32)
+    used = sizes.road
+    xy, direction, length, kind, limit, curvature = (
+        _column(scenarios, f"road_{name}")[:, :used]
+        for name in ("xy", "direction", "length", "kind", "limit", "curvature")
+    )
+    layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
+    there = np.arange(used) < rows[:, None]
+    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), ROAD_NONE)
+    columns = [xy, direction, length[..., None], layer[..., None], limit[..., None]]
+    return {
+        "road": np.concatenate(columns, -1, dtype=np.float32),
+        "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1, dtype=np.float32),
+        "road_curvature": curvature.astype(np.float32),
+    }
+
+
+def _lane_rows(scenario: Scenario, rows: slice) -> np.ndarray[Any, Any]:
+    a, b = scenario.segment_a[rows], scenario.segment_b[rows]
+    lane = scenario.segment_lane[rows].astype(np.int64)
+    width = scenario.lane_width[lane]
+    half = np.where(width > 0, width, DEFAULT_LANE_WIDTH_M) / 2
+    limit = scenario.lane_limit[lane].astype(np.float32)
+    for kind, fallback in CLASS_LIMIT_MPS.items():
+        limit = np.where((limit <= 0) & (scenario.lane_kind[lane] == kind), fallback, limit)
+    number = lane + 0.5 * corridor_lanes(scenario)[lane]
+    return np.stack(
+        [a[:, 0], a[:, 1], b[:, 0], b[:, 1], (a[:, 2] + b[:, 2]) / 2, half, limit, number]
+    ).astype(np.float32)

@@ -1,0 +1,1 @@
+"""From a recording to a scenario: lanes, routes, the segment grid and the checks on the way."""

@@ -1,0 +1,366 @@
+"""From a recording to a scenario: checked, moved into the local frame, padded, indexed and routed.
+
+``assemble`` is the only way into the scenario format; readers and the built-in world produce recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from drivax.errors import DataError, UsageError
+from drivax.scenario.build.checks import check, step_seconds
+from drivax.scenario.build.filling import EVENT_ACTORS, Parts, fill
+from drivax.scenario.build.grid import GridSegments, arrange
+from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, select
+from drivax.scenario.build.lights import place_lights, place_stops
+from drivax.scenario.build.roads import road_rows
+from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
+from drivax.scenario.build.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
+from drivax.scenario.build.sides import cell_sides
+from drivax.scenario.build.tracks import LocalTracks, extend, local_tracks, place
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import (
+    CAPACITIES,
+    CAR_LANE_KINDS,
+    CURRENT_STEP,
+    EDGE_KINDS,
+    LANE_KINDS,
+    LINE_KINDS,
+    STEPS,
+    AgentKind,
+    Capacity,
+    Flag,
+    RoadKind,
+    Scenario,
+    SourceCounts,
+    among,
+)
+from drivax.scenario.select.tags import scenario_tags
+
+Array = np.ndarray[Any, Any]
+
+#: The map is cropped to the box of the ego's log, widened by this much.
+MARGIN_M = 100.0
+#: All lines of a map together are shorter than this; a whole city is cropped by its reader.
+MAP_M = 500_000.0
+#: Steps may differ from the median step by this much before a recording counts as jittered.
+JITTER_S = 0.002
+STRIDE = 40
+#: Heights that differ by less are one level: the source has no elevation.
+FLAT_M = 0.01
+#: Flags that are decided here, whatever the reader said. That lights are known is not among them: a source may know
+#: that there are none.
+MEASURED = (
+    Flag.LANE_GRAPH
+    | Flag.DEFAULT_LIMITS
+    | Flag.SPEED_LIMITS
+    | Flag.CHAINED_GRAPH
+    | Flag.CLOSED_EDGES
+    | Flag.OVERFLOW
+    | Flag.ROUTE
+    | Flag.ELEVATION
+)
+#: Lanes whose class has a limit (``scenario.bank.scenario_bank.CLASS_LIMIT_MPS``).
+_LIMITED_KINDS = (RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE)
+_COUNTED = {
+    "lane": LANE_KINDS,
+    "road_line": LINE_KINDS,
+    "road_edge": EDGE_KINDS,
+    "crosswalk": (RoadKind.CROSSWALK,),
+    "speed_bump": (RoadKind.SPEED_BUMP,),
+    "stop_sign": (RoadKind.STOP_SIGN,),
+    "driveway": (RoadKind.DRIVEWAY,),
+}
+
+
+def count_source(recording: Recording) -> SourceCounts:
+    """Counts what the source holds: every feature and every point as given, before cropping and capping."""
+    kinds = np.array([feature.kind for feature in recording.features], dtype=np.int64)
+    tracks = recording.tracks
+    return SourceCounts(
+        steps=len(recording.timestamps_s),
+        tracks=len(tracks.track_id),
+        tracks_valid_now=int(tracks.valid[:, recording.current_step].sum()),
+        map_features={name: int(among(kinds, group).sum()) for name, group in _COUNTED.items()},
+        map_points=sum(len(feature.points) for feature in recording.features),
+        lights=len({light.lane_id for light in recording.lights}),
+    )
+
+
+def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
+    """Cuts a long recording into windows of 91 steps that share its segment.
+
+    A recording of at most 91 steps is its own window. Of a longer one, window ``k`` holds the steps from ``k * stride``
+    on, so with the default stride 51 of 91 steps are in the next window too; steps at the end that fill no window are
+    left out (110 steps are one window, 199 are three). Windows in which the ego is not there at the current step are
+    left out and counted in the others' ``lost`` as ``windows_without_ego``.
+
+    Args:
+        recording: Any recording.
+        stride: Steps between the starts of two windows.
+
+    Raises:
+        UsageError: The stride is not positive.
+        DataError: The ego is not there at the current step of any window.
+    """
+    if stride < 1:
+        raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
+    steps = len(recording.timestamps_s)
+    if steps <= STEPS:
+        yield recording
+        return
+    starts = range(0, steps - STEPS + 1, stride)
+    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
+    if not usable:
+        raise DataError(
+            f"the ego is not valid at the current step of any of {len(starts)} windows",
+            record=recording.scenario_id,
+            cure="skip the recording",
+        )
+    lost = dict(recording.lost)
+    if len(usable) < len(starts):
+        lost["windows_without_ego"] = len(starts) - len(usable)
+    for start in usable:
+        yield replace(_window(recording, start), lost=lost)
+
+
+def _window(recording: Recording, start: int) -> Recording:
+    """The 91 steps from ``start`` on, with the current step at its usual place."""
+    part = slice(start, start + STEPS)
+    tracks = recording.tracks
+    time_fields = ("xy", "z", "heading", "velocity", "size", "valid")
+    events = (replace(e, start=e.start - start, end=e.end - start) for e in recording.events)
+    return replace(
+        recording,
+        scenario_id=f"{recording.scenario_id}@{start}",
+        timestamps_s=recording.timestamps_s[part],
+        current_step=CURRENT_STEP,
+        tracks=replace(tracks, **{name: getattr(tracks, name)[:, part] for name in time_fields}),
+        seen=None if recording.seen is None else recording.seen[:, part],
+        lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
+        events=tuple(
+            replace(e, start=max(e.start, 0), end=min(e.end, STEPS - 1))
+            for e in events
+            if e.end >= 0 and e.start < STEPS
+        ),
+    )
+
+
+def with_ego(recording: Recording, row: int) -> Recording:
+    """The same recording with another logged vehicle as the ego.
+
+    What was known of the former ego's route, and of what its sensors saw, is dropped.
+
+    Raises:
+        UsageError: The row is no vehicle that is valid at the current step.
+    """
+    tracks = recording.tracks
+    good = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
+    if not good or not tracks.valid[row, recording.current_step]:
+        raise UsageError(
+            f"track row {row} is no vehicle that is valid at step {recording.current_step}",
+            record=recording.scenario_id,
+            cure="choose the row of a vehicle that is there at the current step",
+        )
+    if row == recording.ego:
+        return recording
+    return replace(
+        recording,
+        scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
+        ego=row,
+        seen=None,
+        route_lanes=(),
+        route_corridor=(),
+    )
+
+
+def assemble(
+    recording: Recording, capacity: Capacity = CAPACITIES["default"], routes: RouteStyle = "graph"
+) -> Scenario:
+    """Turns a recording into a scenario.
+
+    Args:
+        recording: At most ``capacity.steps`` steps; cut longer ones with :func:`windows`.
+        capacity: Padded sizes; what does not fit is counted in ``overflow``, the farthest from the ego's log first.
+        routes: How candidate routes are made (``scenario.build.routes``).
+
+    Raises:
+        DataError: The recording makes no sense; the message names what and its record.
+    """
+    check(recording, capacity)
+    try:
+        return _assemble(recording, capacity, routes)
+    except DataError as error:
+        raise DataError(error.problem, record=recording.scenario_id, cure=error.cure) from error
+
+
+def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Scenario:
+    """``assemble`` of a checked recording."""
+    now, ego = recording.current_step, recording.ego
+    origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
+    tracks = local_tracks(recording.tracks, ego, origin)
+    log = ego_log(tracks, now)
+    path = thin_path(log.seen[:, :2])
+    roads = road_lines(recording.features, origin, recording.split_gap_m)
+    _refuse_endless(roads)
+    segments = cut(roads)
+    whole = lane_graph(recording.features, origin)
+    on = LaneSegments.of(segments, whole)
+    intent, unknown = _intent(recording, whole)
+    routes = find_routes(whole, on, log, intent, style, capacity.routes, capacity.route_points)
+    marked = (*recording.to_predict, *recording.of_interest)
+    placement = place(tracks, marked, capacity.agents, capacity.parked)
+    on_route = _lanes_of(routes)
+    inside = inside_box(segments.middle, path, MARGIN_M)
+    inside |= np.isin(segments.feature, whole.feature[on_route])
+    grid = arrange(segments.take(inside), path, capacity)
+    keep, lost_lanes = _kept_lanes(whole, segments.feature[inside], on_route, path, capacity.lanes)
+    graph = select(whole, keep)
+    polylines, lost_features = _kept_polylines(roads, grid, path, capacity.features)
+    is_lane = among(segments.kind, CAR_LANE_KINDS)
+    is_edge, is_ring = among(segments.kind, EDGE_KINDS), roads.closed[among(roads.kind, EDGE_KINDS)]
+    rings = len(is_ring) > 0 and bool(is_ring.all())
+    stored_on = LaneSegments.of(segments, graph)
+    parts = Parts(
+        tracks=tracks,
+        placement=placement,
+        extension=extend(tracks, placement.moving, whole, on, capacity.extension),
+        graph=graph,
+        routes=_renumber(routes, keep, whole.count),
+        grid=grid,
+        sides=cell_sides(grid.grid, segments.take(is_edge), segments.take(is_lane).middle, rings),
+        roads=roads,
+        polylines=polylines,
+        rows=road_rows(roads, recording.features, path, MARGIN_M, capacity.road_rows),
+        lights=place_lights(recording.lights, graph, stored_on, origin, path, capacity.lights),
+        stops=place_stops(recording.features, graph, origin, path, capacity.stops),
+    )
+    overflow = _overflow(parts, recording, capacity, {"lanes": lost_lanes, "features": lost_features})
+    flags = _flags(recording, parts, rings, capacity)
+    flags |= Flag.OVERFLOW if overflow else Flag.NONE
+    return Scenario(
+        record=fill(parts, recording, capacity, origin, flags),
+        capacity=capacity,
+        source=replace(count_source(recording), lost=_lost(recording, {**whole.lost, **unknown})),
+        overflow=overflow,
+        tags=scenario_tags(recording, parts, flags, style),
+    )
+
+
+def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
+    """What the source says about the intended route in dense indices, and how many of its lanes are missing."""
+    index = graph.index()
+    named = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
+    found = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in named.items()}
+    missing = {f"{name}_missing": len(named[name]) - len(found[name]) for name in named}
+    return Intent(found["route_lanes"], found["route_corridor"]), missing
+
+
+def _lost(recording: Recording, found: Mapping[str, int]) -> dict[str, int]:
+    """What the reader and the assembly left out, by name; only what is not zero."""
+    names = dict.fromkeys((*recording.lost, *found))
+    counts = {name: int(recording.lost.get(name, 0)) + found.get(name, 0) for name in names}
+    return {name: count for name, count in counts.items() if count}
+
+
+def _refuse_endless(roads: RoadLines) -> None:
+    """Raises where the map's lines are so long that they cannot be those of one place."""
+    length = float(roads.lines.length.sum())
+    if length > MAP_M:
+        problem = f"the map's lines are {length / 1000:.0f} km long together, more than {MAP_M / 1000:.0f} km"
+        raise DataError(problem, cure="crop the map in the reader, or repair the points that jump")
+
+
+def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
+    """The ego's own log."""
+    row = tracks.ego
+    speed = np.hypot(*tracks.velocity[row].T)
+    return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
+
+
+def _lanes_of(routes: RouteSet) -> Int[Array, " lane"]:
+    """Dense indices of all lanes under routes."""
+    lanes = np.unique(np.concatenate([route.lane for route in routes.routes]))
+    return lanes[lanes >= 0]
+
+
+def _kept_lanes(
+    graph: LaneGraph,
+    near: Int[Array, " segment"],
+    on_route: Int[Array, " routed"],
+    path: Float[Array, "step 2"],
+    most: int,
+) -> tuple[Int[Array, " kept"], int]:
+    """Lanes to store: those with a segment in the crop; where too many, routes first, bike lanes and far ones last.
+
+    Returns:
+        Dense indices in order of the source, and how many did not fit.
+    """
+    rows = np.flatnonzero(np.isin(graph.feature, near))
+    far = np.full(graph.count, np.inf)
+    np.minimum.at(far, graph.lines.row, path_distance(graph.lines.points[:, :2], path))
+    last = ~among(graph.kind, CAR_LANE_KINDS)
+    first = np.zeros(graph.count, dtype=bool)
+    first[on_route] = True
+    order = rows[np.lexsort((far[rows], last[rows], ~first[rows]))]
+    return np.sort(order[:most]), max(len(rows) - most, 0)
+
+
+def _kept_polylines(
+    roads: RoadLines, grid: GridSegments, path: Float[Array, "step 2"], most: int
+) -> tuple[Int[Array, " polyline"], int]:
+    """Polylines to store as features: those with a stored segment, the nearest where too many."""
+    rows = np.unique(grid.segments.polyline)
+    far = np.full(roads.lines.count, np.inf)
+    np.minimum.at(far, grid.segments.polyline, path_distance(grid.segments.middle, path))
+    return np.sort(rows[np.argsort(far[rows], kind="stable")[:most]]), max(len(rows) - most, 0)
+
+
+def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteSet:
+    """Routes in the dense indices of the stored lanes."""
+    new = np.full(count + 1, -1)
+    new[keep] = np.arange(len(keep))
+    return replace(routes, routes=tuple(replace(r, lane=new[r.lane]) for r in routes.routes))
+
+
+def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict[str, int]) -> dict[str, int]:
+    """All that did not fit, by name; only what is not zero."""
+    actors = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in recording.events)
+    counts = {
+        **parts.placement.overflow,
+        **lost,
+        **parts.grid.overflow,
+        **parts.lights.overflow,
+        **parts.stops.overflow,
+        **parts.rows.overflow,
+        "lane_links": parts.graph.dropped_links,
+        "events": max(len(recording.events) - capacity.events, 0),
+        "event_actors": actors,
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
+def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) -> Flag:
+    """The reader's flags, and those that the data show, which the reader cannot know better."""
+    facts: Sequence[tuple[Flag, Any]] = (
+        (Flag.LIGHTS, len(parts.lights.z) > 0),
+        (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
+        (Flag.DEFAULT_SIZES, parts.tracks.defaulted > 0),
+        (Flag.CLOSED_EDGES, rings),
+        (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
+        (Flag.ROUTE, parts.routes.on_lanes),
+        (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),
+        (
+            Flag.ELEVATION,
+            np.ptp(parts.roads.lines.points[:, 2]) > FLAT_M if len(parts.roads.lines.points) else False,
+        ),
+    )
+    flags = (recording.flags & ~MEASURED) | parts.graph.flags
+    for flag, holds in facts:
+        flags |= flag if holds else Flag.NONE
+    return flags

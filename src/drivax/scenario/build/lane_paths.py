@@ -1,0 +1,227 @@
+"""The line that a sequence of lanes draws: joints closed, lane changes blended, ends continued straight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from drivax.geometry.polylines import project
+from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
+
+Array = np.ndarray[Any, Any]
+
+#: A line and the dense lane index of each of its points (-1 where it runs beside the map).
+Line = tuple[Float[Array, "_ 3"], Int[Array, " _"]]
+
+#: Least stretch over which a route moves to the next lane.
+CHANGE_M = 20.0
+#: Joints with a gap between these are closed by fading the gap out; wider ones are crossed in a straight line.
+GAP_M = (0.05, 2.0)
+FADE_M = 10.0
+
+
+def is_change(graph: LaneGraph, lane: int, following: int) -> bool:
+    """Whether going from one lane to the next means moving sideways."""
+    beside = following in (graph.left[lane], graph.right[lane])
+    return beside and following not in graph.successor[lane]
+
+
+def change_room(graph: LaneGraph, lane: int, following: int, entry_m: float) -> tuple[float, float, float]:
+    """Where a lane's neighbour runs beside it, at or after ``entry_m``.
+
+    Returns:
+        Begin and end of the stretch in arc length of the lane, and what to add for arc length of the neighbour.
+    """
+    on_left = graph.left[lane] == following
+    shift = float(graph.left_shift[lane] if on_left else graph.right_shift[lane])
+    low = max(entry_m, -shift)
+    return low, min(float(graph.lines.length[lane]), float(graph.lines.length[following]) - shift), shift
+
+
+def trace(
+    graph: LaneGraph,
+    lanes: Sequence[int],
+    begin_m: float,
+    ahead_m: float,
+    window_m: tuple[float, float],
+    place: float,
+    change_m: float = CHANGE_M,
+) -> Line:
+    """The line along a sequence of lanes.
+
+    Args:
+        graph: The lane graph.
+        lanes: Dense indices; each follows the one before as successor or as neighbour.
+        begin_m: Arc length on the first lane where the line begins.
+        ahead_m: Where the first lane starts, metres ahead of the ego (negative: behind).
+        window_m: Lane changes begin and end in this range ahead of the ego where there is room for them.
+        place: Where in the possible stretch a change happens: 0 as early as possible, 1 as late as possible.
+        change_m: Length of a change where there is room for it.
+    """
+    parts: list[Line] = []
+    s = begin_m
+    for i, lane in enumerate(lanes):
+        following = lanes[i + 1] if i + 1 < len(lanes) else None
+        if following is None or not is_change(graph, lane, following):
+            parts.append(_close_gap(parts, _stretch(graph, lane, s, float(graph.lines.length[lane]))))
+            s, ahead_m = 0.0, ahead_m + float(graph.lines.length[lane])
+            continue
+        low, high, shift = change_room(graph, lane, following, max(s, window_m[0] - ahead_m))
+        length = min(change_m, max(high - low, 1.0))
+        high = min(high, max(window_m[1] - ahead_m, low + length))
+        leave = min(low + place * max(high - low - length, 0.0), float(graph.lines.length[lane]))
+        parts.append(_close_gap(parts, _stretch(graph, lane, s, leave)))
+        blend, s = _blend(graph, lane, following, leave, length)
+        parts.append(blend)
+        ahead_m -= shift
+    xyz = np.concatenate([part[0] for part in parts])
+    label = np.concatenate([part[1] for part in parts])
+    step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
+    # Of two equal points the later one stays: what lies ahead of it belongs to its lane.
+    keep = np.concatenate((step > 0.01, [True]))
+    return xyz[keep], label[keep]
+
+
+def _stretch(graph: LaneGraph, lane: int, begin: float, end: float) -> Line:
+    """A lane's own points between two arc lengths, ends included."""
+    part = slice(graph.lines.start[lane], graph.lines.start[lane + 1])
+    arc = graph.lines.arc[part]
+    ends = graph.lines.at(np.array([lane, lane]), np.array([begin, end]))
+    inner = graph.lines.points[part][(arc > begin + 0.01) & (arc < end - 0.01)]
+    xyz = np.concatenate((ends[:1], inner, ends[1:]))
+    return xyz, np.full(len(xyz), lane)
+
+
+def _close_gap(parts: Sequence[Line], line: Line) -> Line:
+    """Shifts the beginning of a line onto the end of the one before; the shift fades out along it."""
+    if not parts:
+        return line
+    gap = parts[-1][0][-1] - line[0][0]
+    width = float(np.hypot(gap[0], gap[1]))
+    if not GAP_M[0] < width < GAP_M[1]:
+        return line
+    xyz = line[0]
+    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))))
+    return xyz + np.maximum(1.0 - along / FADE_M, 0.0)[:, None] * gap, line[1]
+
+
+def _blend(graph: LaneGraph, lane: int, following: int, leave: float, length: float) -> tuple[Line, float]:
+    """The way from one lane to its neighbour, and the arc length on the neighbour where it arrives.
+
+    Lateral motion by the quintic 10 t^3 - 15 t^4 + 6 t^5: no jump in heading or curvature at the ends.
+    """
+    part = slice(graph.lines.start[following], graph.lines.start[following + 1])
+    t = np.linspace(0.0, 1.0, int(np.ceil(length)) + 1)
+    one = graph.lines.at(np.full(len(t), lane), leave + t * length)
+    s, _ = project(graph.lines.points[part], one[[0, -1], :2])
+    other = graph.lines.at(np.full(len(t), following), s[0] + t * (s[1] - s[0]))
+    weight = (t**3 * (10.0 - 15.0 * t + 6.0 * t**2))[:, None]
+    return ((1.0 - weight) * one + weight * other, np.where(t < 0.5, lane, following)), float(s[1])
+
+
+def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float) -> tuple[int, ...]:
+    """Continues a sequence of lanes along the straightest successors.
+
+    Args:
+        graph: The lane graph.
+        lanes: Dense indices.
+        ahead_m: Where the last of them ends, metres ahead of the ego.
+        need_m: How far ahead to go; the sequence ends earlier where lanes end or repeat.
+    """
+    result = list(lanes)
+    while ahead_m < need_m:
+        following = int(graph.successor[result[-1], 0])
+        if following < 0 or following in result:
+            break
+        result.append(following)
+        ahead_m += float(graph.lines.length[following])
+    return tuple(result)
+
+
+def walk(
+    graph: LaneGraph, lane: Int[Array, " start"], s: Float[Array, " start"], step_m: float, count: int
+) -> tuple[Float[Array, "start count 2"], Float[Array, "start count"]]:
+    """Points ahead along lanes and their straightest successors; straight on where lanes end.
+
+    Args:
+        graph: The lane graph.
+        lane: Start lanes, all valid.
+        s: Arc lengths on them.
+        step_m: Distance between the points, metres.
+        count: Number of points; the first lies one step ahead of the start.
+
+    Returns:
+        Points, and the lanes' headings there.
+    """
+    distance = step_m * np.arange(1, count + 1)
+    chain, begin = [lane], [-s]
+    for _ in range(4 * count):
+        following = graph.successor[chain[-1], 0]
+        after = np.where(following >= 0, begin[-1] + graph.lines.length[chain[-1]], np.inf)
+        if not (after <= distance[-1]).any():
+            break
+        chain.append(np.maximum(following, 0))
+        begin.append(after)
+    hop = (distance[None, :, None] > np.stack(begin, axis=-1)[:, None, :]).sum(axis=-1) - 1
+    hop = np.maximum(hop, 0)
+    row = np.take_along_axis(np.stack(chain, axis=-1), hop, axis=1)
+    arc = distance - np.take_along_axis(np.stack(begin, axis=-1), hop, axis=1)
+    inside = np.minimum(arc, graph.lines.length[row])
+    heading = graph.lines.heading(row, inside, END_SPAN_M)
+    beyond = (arc - inside)[..., None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+    return graph.lines.at(row, inside)[..., :2] + beyond, heading
+
+
+def precede(
+    graph: LaneGraph, lane: int, need_m: float, driven: Float[Array, "step 2"]
+) -> tuple[tuple[int, ...], float]:
+    """Lanes before a lane, nearest to where the ego came from, and their total length.
+
+    Args:
+        graph: The lane graph.
+        lane: Dense index.
+        need_m: Wanted length; shorter where lanes begin.
+        driven: Positions of the ego up to now.
+    """
+    result: list[int] = []
+    total = 0.0
+    while total < need_m:
+        first = result[0] if result else lane
+        options = [int(p) for p in graph.predecessor[first] if p >= 0 and p != lane and p not in result]
+        if not options:
+            break
+        apart = [_mean_distance(graph, option, driven) for option in options]
+        best = min(range(len(options)), key=lambda i: (round(apart[i]), i))
+        result.insert(0, options[best])
+        total += float(graph.lines.length[options[best]])
+    return tuple(result), total
+
+
+def _mean_distance(graph: LaneGraph, lane: int, driven: Float[Array, "step 2"]) -> float:
+    part = slice(graph.lines.start[lane], graph.lines.start[lane + 1])
+    return float(project(graph.lines.points[part], driven)[1].mean())
+
+
+def continue_straight(line: Line, behind_m: float, ahead_m: float) -> Line:
+    """Lengthens a line at both ends in the direction it has there; the new points have no lane."""
+    xyz, label = line
+    if ahead_m > 0.0:
+        tip = xyz[-1] + _end_direction(xyz) * ahead_m
+        xyz, label = np.concatenate((xyz, tip[None])), np.append(label, -1)
+        label[-2] = -1  # the stretch from the old end on
+    if behind_m > 0.0:
+        tail = xyz[0] + _end_direction(xyz[::-1]) * behind_m
+        xyz, label = np.concatenate((tail[None], xyz)), np.concatenate(([-1], label))
+    return xyz, label
+
+
+def _end_direction(xyz: Float[Array, "point 3"]) -> Float[Array, "3"]:
+    """Unit vector in the plane of the last two metres of a line."""
+    apart = np.hypot(*(xyz[:, :2] - xyz[-1, :2]).T)
+    before = np.flatnonzero(apart >= min(END_SPAN_M, apart.max()))
+    step = xyz[-1] - xyz[before[-1]]
+    size = float(np.hypot(step[0], step[1]))
+    return np.array([step[0] / size, step[1] / size, 0.0]) if size > 0.0 else np.array([1.0, 0.0, 0.0])

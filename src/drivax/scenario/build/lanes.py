@@ -1,0 +1,394 @@
+"""The lane graph: which lanes there are, how they connect, how wide they are, and which one a pose is on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from drivax.errors import DataError
+from drivax.geometry.angles import wrap
+from drivax.geometry.polylines import Polylines, point_to_segment
+from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box
+from drivax.scenario.recording import MapFeature
+from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
+
+Array = np.ndarray[Any, Any]
+
+#: Links stored per lane and direction.
+LINKS = 4
+#: Geometric chaining of lanes whose source has no graph.
+CHAIN_GAP_M = 0.5
+CHAIN_HEADING_RAD = np.deg2rad(20.0)
+#: Neighbours run the same way when their headings differ by less.
+SAME_WAY_RAD = np.deg2rad(45.0)
+#: Lane widths believed when measured from the spacing of neighbours, metres.
+WIDTHS_M = (2.2, 5.5)
+#: Widths and limits that a source gives are believed up to here.
+MOST_WIDTH_M, MOST_LIMIT_MPS = 50.0, 100.0
+LEVEL_M = 3.0
+#: Headings at lane ends are measured over this chord: the last source points lie close together.
+END_SPAN_M = 2.0
+_SAMPLES = 33
+_PROBES = (0.1, 0.3, 0.5, 0.7, 0.9)
+_CHUNK = 512
+
+
+@dataclass(frozen=True)
+class LaneGraph:
+    """Lanes with dense indices and their links; everything in the local frame, float64.
+
+    Attributes:
+        lines: Centre lines, one per lane.
+        feature: Row of the source feature.
+        lane_id: Feature id in the source.
+        kind: Road kind.
+        width: Metres, -1 unknown.
+        limit: Speed limit in m/s, -1 unknown.
+        interpolating: Turn paths inside junctions (WOMD).
+        successor: Dense indices, -1 padded, the straightest first.
+        predecessor: Dense indices, -1 padded, the straightest first.
+        left: Neighbour in the same direction, -1 none.
+        right: Neighbour in the same direction, -1 none.
+        left_shift: Arc length on the left neighbour beside arc length s, minus s, metres.
+        right_shift: The same for the right neighbour.
+        chained: Whether the links were made from geometry.
+        linked: Whether there is any successor.
+        dropped_links: Links beyond the four that are stored.
+        lost: What the source names and does not hold: ``dangling_links`` (successors and predecessors) and
+            ``dangling_neighbours``.
+    """
+
+    lines: Polylines
+    feature: Int[Array, " lane"]
+    lane_id: Int[Array, " lane"]
+    kind: Int[Array, " lane"]
+    width: Float[Array, " lane"]
+    limit: Float[Array, " lane"]
+    interpolating: Bool[Array, " lane"]
+    successor: Int[Array, "lane 4"]
+    predecessor: Int[Array, "lane 4"]
+    left: Int[Array, " lane"]
+    right: Int[Array, " lane"]
+    left_shift: Float[Array, " lane"]
+    right_shift: Float[Array, " lane"]
+    chained: bool
+    dropped_links: int
+    lost: Mapping[str, int]
+
+    @property
+    def count(self) -> int:
+        """Number of lanes."""
+        return len(self.lane_id)
+
+    @property
+    def linked(self) -> bool:
+        """Whether any lane leads to another."""
+        return bool((self.successor >= 0).any())
+
+    @property
+    def flags(self) -> Flag:
+        """Flags that the graph justifies."""
+        flags = Flag.LANE_GRAPH if self.linked else Flag.NONE
+        if self.linked and self.chained:
+            flags |= Flag.CHAINED_GRAPH
+        return flags | (Flag.SPEED_LIMITS if (self.limit > 0).any() else Flag.NONE)
+
+    def index(self) -> dict[int, int]:
+        """Dense index of every source id."""
+        return {int(lane): i for i, lane in enumerate(self.lane_id)}
+
+    def neighbours(self, lane: int) -> list[tuple[int, float]]:
+        """Lanes beside a lane in the same direction, each with its arc-length shift."""
+        sides = ((self.left[lane], self.left_shift[lane]), (self.right[lane], self.right_shift[lane]))
+        return [(int(other), float(shift)) for other, shift in sides if other >= 0]
+
+
+def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> LaneGraph:
+    """Builds the lane graph of all lanes that have a direction (two or more points, some length).
+
+    Args:
+        features: The source's map features. Links to features that are missing or no lanes are dropped and counted.
+        origin: Origin of the local frame in the source's frame.
+
+    Raises:
+        DataError: Two lanes share an id.
+    """
+    rows = [i for i, f in enumerate(features) if f.kind in LANE_KINDS and _has_length(f.points)]
+    lanes = [features[i] for i in rows]
+    ids = [lane.feature_id for lane in lanes]
+    if len(set(ids)) < len(ids):
+        twice = next(i for i in ids if ids.count(i) > 1)
+        raise DataError(f"two lanes have the id {twice}", cure="give every map feature its own id")
+    index = {lane_id: i for i, lane_id in enumerate(ids)}
+    lines = Polylines.of([np.asarray(lane.points, dtype=np.float64) - origin for lane in lanes])
+    begin, end = _end_headings(lines)
+    kind = np.array([lane.kind for lane in lanes], dtype=np.int64)
+    pairs = _linked_pairs(lanes, index)
+    has_links = any(f.successors or f.predecessors for f in lanes)
+    if not has_links:
+        pairs = _chained_pairs(lines, begin, end, kind)
+    successor, lost = _link_table(pairs, end, begin)
+    predecessor, lost_back = _link_table([(b, a) for a, b in pairs], begin, end)
+    samples = _samples(lines)
+    left, left_shift, left_gap = _beside(lanes, index, samples, lines.length, "left_neighbours")
+    right, right_shift, right_gap = _beside(lanes, index, samples, lines.length, "right_neighbours")
+    gap = np.fmin(left_gap, right_gap)
+    measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
+    given = np.array(
+        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes],
+        dtype=np.float64,
+    )
+    return LaneGraph(
+        lines=lines,
+        feature=np.array(rows, dtype=np.int64),
+        lane_id=np.array(ids, dtype=np.int64),
+        kind=kind,
+        width=np.where(np.isnan(given), measured, given),
+        limit=np.array([known_limit(lane) for lane in lanes], dtype=np.float64),
+        interpolating=np.array([lane.interpolating for lane in lanes], dtype=bool),
+        successor=successor,
+        predecessor=predecessor,
+        left=left,
+        right=right,
+        left_shift=left_shift,
+        right_shift=right_shift,
+        chained=not has_links,
+        dropped_links=lost + lost_back,
+        lost={
+            "dangling_links": _dangling(lanes, index, ("successors", "predecessors")),
+            "dangling_neighbours": _dangling(lanes, index, ("left_neighbours", "right_neighbours")),
+        },
+    )
+
+
+def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], names: Sequence[str]) -> int:
+    """How many links of these kinds name a lane that is not there."""
+    return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
+
+
+def known_limit(feature: MapFeature) -> float:
+    """Speed limit of a lane in m/s; -1 where there is none that can be believed, and for what is no lane."""
+    limit = feature.limit_mps if feature.kind in LANE_KINDS else None
+    return limit if limit is not None and _within(limit, MOST_LIMIT_MPS) else -1.0
+
+
+def _within(value: float | None, most: float) -> bool:
+    return value is not None and 0.0 < value <= most
+
+
+def _has_length(points: Array) -> bool:
+    return len(points) >= 2 and bool(np.any(np.abs(points[:, :2] - points[0, :2]) > 1e-3))
+
+
+def _end_headings(lines: Polylines) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
+    """Headings at the first and at the last point of every lane."""
+    row = np.arange(lines.count)
+    return lines.heading(row, np.zeros(lines.count), END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
+
+
+def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list[tuple[int, int]]:
+    """(lane, successor) pairs named by either side; dangling and self links dropped, order kept."""
+    pairs: dict[tuple[int, int], None] = {}
+    for i, lane in enumerate(lanes):
+        for other in lane.successors:
+            if index.get(other, i) != i:
+                pairs[i, index[other]] = None
+        for other in lane.predecessors:
+            if index.get(other, i) != i:
+                pairs[index[other], i] = None
+    return list(pairs)
+
+
+def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> list[tuple[int, int]]:
+    """Pairs of lanes of which one ends where and as the other begins."""
+    if lines.count == 0:
+        return []
+    first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
+    bike = kind == RoadKind.LANE_BIKE
+    pairs: list[tuple[int, int]] = []
+    for row in range(0, lines.count, _CHUNK):  # maps of thousands of lanes would need gigabytes at once
+        part = slice(row, row + _CHUNK)
+        apart = np.hypot(*np.moveaxis((last[part, None] - first[None])[..., :2], -1, 0))
+        level = np.abs(last[part, None, 2] - first[None, :, 2]) < LEVEL_M
+        bend = np.abs(wrap(end[part, None] - begin[None]))
+        fits = (apart <= CHAIN_GAP_M) & level & (bend <= CHAIN_HEADING_RAD) & (bike[part, None] == bike[None])
+        pairs += [(int(i) + row, int(j)) for i, j in np.argwhere(fits) if i + row != j]
+    return pairs
+
+
+def _link_table(
+    pairs: Sequence[tuple[int, int]], out_heading: Array, in_heading: Array
+) -> tuple[Int[Array, "lane 4"], int]:
+    """Up to four links per lane, the straightest first, and how many did not fit."""
+    table = np.full((len(out_heading), LINKS), -1, dtype=np.int64)
+    used = np.zeros(len(out_heading), dtype=np.int64)
+    if not pairs:
+        return table, 0
+    a, b = np.array(pairs).T
+    bend = np.abs(wrap(in_heading[b] - out_heading[a]))
+    for i in np.lexsort((np.arange(len(a)), np.round(bend, 3), a)):
+        if used[a[i]] < LINKS:
+            table[a[i], used[a[i]]] = b[i]
+        used[a[i]] += 1
+    return table, int(np.maximum(used - LINKS, 0).sum())
+
+
+def _samples(lines: Polylines) -> Float[Array, "lane sample 2"]:
+    """Evenly spaced points of every lane: enough to measure neighbours with."""
+    fraction = np.linspace(0.0, 1.0, _SAMPLES)
+    if lines.count == 0:
+        return np.zeros((0, _SAMPLES, 2))
+    return lines.at(np.arange(lines.count)[:, None], lines.length[:, None] * fraction)[..., :2]
+
+
+def _beside(
+    lanes: Sequence[MapFeature], index: Mapping[int, int], samples: Array, length: Array, side: str
+) -> tuple[Int[Array, " lane"], Float[Array, " lane"], Float[Array, " lane"]]:
+    """The neighbour that runs beside a lane the same way, its arc-length shift, and the gap between them.
+
+    Of several the one that lies beside most of the lane, then the nearest. Neighbours that run the other way
+    (oncoming lanes in Argoverse 2) are no neighbours here.
+    """
+    best, shift, gap = np.full(len(lanes), -1), np.zeros(len(lanes)), np.full(len(lanes), np.nan)
+    pairs = list(
+        dict.fromkeys(
+            (i, index[j]) for i, lane in enumerate(lanes) for j in getattr(lane, side) if index.get(j, i) != i
+        )
+    )
+    if not pairs:
+        return best, shift, gap
+    a, b = np.array(pairs).T
+    interior, distance, offset = _measure_beside(samples, length, a, b)
+    ok = interior.any(axis=1)
+    a, b, interior, share = a[ok], b[ok], interior[ok], interior.sum(axis=1)[ok]
+    pick = (np.arange(len(a)), (share - 1) // 2)  # the (lower) median of the interior probes
+    middle = np.sort(np.where(interior, distance[ok], np.inf), axis=1)[pick]
+    middle_offset = np.sort(np.where(interior, offset[ok], np.inf), axis=1)[pick]
+    for i in np.lexsort((-middle, share)):  # the best comes last
+        best[a[i]], shift[a[i]], gap[a[i]] = b[i], middle_offset[i], middle[i]
+    return best, shift, gap
+
+
+def _measure_beside(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """For probes along lanes ``a``: is ``b`` beside and parallel there, how far, and its arc length minus a's."""
+    fraction = np.array(_PROBES)
+    at = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
+    probe = samples[a][:, at]
+    direction = samples[a][:, at + 1] - samples[a][:, at - 1]
+    begin, end = samples[b][:, None, :-1], samples[b][:, None, 1:]
+    distance, along = point_to_segment(probe[:, :, None], begin, end)
+    nearest = distance.argmin(axis=2)
+    pick = np.ix_(np.arange(len(a)), np.arange(len(at)))
+    along, distance = along[(*pick, nearest)], distance[(*pick, nearest)]
+    other = samples[b[:, None], nearest + 1] - samples[b[:, None], nearest]
+    turn = np.arctan2(other[..., 1], other[..., 0]) - np.arctan2(direction[..., 1], direction[..., 0])
+    position = (nearest + along) / (_SAMPLES - 1)
+    interior = (np.abs(wrap(turn)) < SAME_WAY_RAD) & (position > 1e-6) & (position < 1.0 - 1e-6)
+    here = at / (_SAMPLES - 1) * length[a][:, None]
+    return interior, distance, position * length[b][:, None] - here
+
+
+def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
+    """The graph of these lanes only, with new dense indices; links to other lanes are dropped."""
+    new = np.full(graph.count + 1, -1)
+    new[rows] = np.arange(len(rows))
+    lines = [graph.lines.points[graph.lines.start[i] : graph.lines.start[i + 1]] for i in rows]
+    per_lane = ("feature", "lane_id", "kind", "width", "limit", "interpolating", "left_shift", "right_shift")
+    return replace(
+        graph,
+        lines=Polylines.of(lines),
+        successor=_compact(new[graph.successor[rows]]),
+        predecessor=_compact(new[graph.predecessor[rows]]),
+        left=new[graph.left[rows]],
+        right=new[graph.right[rows]],
+        **{name: getattr(graph, name)[rows] for name in per_lane},
+    )
+
+
+def _compact(links: Int[Array, "lane 4"]) -> Int[Array, "lane 4"]:
+    """Moves missing links to the end of each row."""
+    return np.take_along_axis(links, np.argsort(links < 0, axis=1, kind="stable"), axis=1)
+
+
+@dataclass(frozen=True)
+class LaneSegments:
+    """The segments of lanes, for asking which lane a pose is on.
+
+    Attributes:
+        segments: Segments of car lanes.
+        lane: Dense lane index of each.
+        heading: Direction of each, radians.
+    """
+
+    segments: Segments
+    lane: Int[Array, " segment"]
+    heading: Float[Array, " segment"]
+
+    @classmethod
+    def of(cls, segments: Segments, graph: LaneGraph) -> LaneSegments:
+        """Car-lane segments among ``segments``, keyed by the graph's dense indices."""
+        rows = np.flatnonzero(among(segments.kind, CAR_LANE_KINDS))
+        lane = lane_of_feature(graph, segments.feature[rows])
+        rows, lane = rows[lane >= 0], lane[lane >= 0]
+        kept = segments.take(rows)
+        step = kept.b - kept.a
+        return cls(kept, lane, np.arctan2(step[:, 1], step[:, 0]))
+
+    def nearest(
+        self, xyz: Float[Array, "pose 3"], heading: Float[Array, " pose"], reach_m: float, turn_rad: float
+    ) -> tuple[Int[Array, " pose"], Float[Array, " pose"], Float[Array, " pose"]]:
+        """The lane that fits each pose best: nearest within reach, heading gate and level.
+
+        Returns:
+            Dense lane index (-1 none), arc length on it, distance from it in metres.
+        """
+        near = self._near(xyz[:, :2], reach_m)
+        if not len(near.lane):
+            return np.full(len(xyz), -1), np.zeros(len(xyz)), np.full(len(xyz), np.inf)
+        distance, s = near._measure(xyz, heading, turn_rad)
+        best = distance.argmin(axis=1)
+        rows = np.arange(len(xyz))
+        found = distance[rows, best] <= reach_m
+        return np.where(found, near.lane[best], -1), s[rows, best], distance[rows, best]
+
+    def around(
+        self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
+    ) -> list[tuple[int, float, float]]:
+        """All lanes that fit one pose: (lane, arc length on it, distance), the nearest first."""
+        near = self._near(xyz[None, :2], reach_m)
+        distance, s = near._measure(xyz[None], np.array([heading]), turn_rad)
+        found: dict[int, tuple[int, float, float]] = {}
+        for i in np.argsort(distance[0], kind="stable"):
+            if distance[0, i] > reach_m:
+                break
+            lane = int(near.lane[i])
+            found.setdefault(lane, (lane, float(s[0, i]), float(distance[0, i])))
+        return list(found.values())
+
+    def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
+        """The segments in the box of the poses, widened by the reach."""
+        if len(xy) == 0 or len(self.segments) == 0:
+            return LaneSegments(self.segments.take(np.zeros(0, int)), self.lane[:0], self.heading[:0])
+        rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
+        return LaneSegments(self.segments.take(rows), self.lane[rows], self.heading[rows])
+
+    def _measure(self, xyz: Array, heading: Array, turn_rad: float) -> tuple[Array, Array]:
+        """Distance (infinite where gated) and arc length of every pose on every segment."""
+        seg = self.segments
+        distance, along = point_to_segment(xyz[:, None, :2], seg.a[None, :, :2], seg.b[None, :, :2])
+        z = seg.a[:, 2] + along * (seg.b[:, 2] - seg.a[:, 2])
+        gated = np.abs(wrap(self.heading - heading[:, None])) > turn_rad
+        gated |= np.abs(z - xyz[:, 2:3]) > LEVEL_M
+        return np.where(gated, np.inf, distance), seg.start_m + along * seg.span_m
+
+
+def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
+    """Dense lane index of source feature rows, -1 where they are no lane of the graph."""
+    size = max(int(graph.feature.max(initial=-1)), int(feature.max(initial=-1))) + 2
+    table = np.full(size, -1)
+    table[graph.feature] = np.arange(graph.count)
+    return table[feature]

@@ -1,0 +1,316 @@
+"""Routes: ways along the lane graph from where the ego is, at one point per metre.
+
+Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the log's route
+see the ego's poses up to the current step and the goal region only; among routes that reach the goal equally well
+the one nearest to the log is taken. Routes come from this project's search of the lane graph (``graph``), or from
+the published one (``published``, :mod:`drivax.scenario.build.route_published`); both are drawn by the same code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from drivax.geometry.polylines import arc_lengths, headings, project, project_monotone, resample
+from drivax.scenario.build.lane_paths import (
+    CHANGE_M,
+    continue_straight,
+    follow,
+    is_change,
+    precede,
+    trace,
+    walk,
+)
+from drivax.scenario.build.lane_search import REACH_M, SAME_TURN_RAD, LaneSearch, Way
+from drivax.scenario.build.lanes import LaneGraph, LaneSegments
+from drivax.scenario.build.route_published import LEAST_M, published_ways
+from drivax.scenario.build.route_start import join
+from drivax.scenario.build.segments import thin_path
+
+Array = np.ndarray[Any, Any]
+
+#: How candidates are made: by the search of this project, or as published.
+RouteStyle = Literal["graph", "published"]
+
+SPACING_M = 1.0
+#: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
+AHEAD_M, AHEAD_S = 200.0, 12.0
+#: Routes run this far past the goal, straight on where the map ends.
+PAST_GOAL_M = 50.0
+BEHIND_M = 20.0
+#: Half a second before a lane change begins.
+REACTION_S = 0.5
+#: Time that a lane change takes at the present speed.
+CHANGE_S = 3.0
+#: A route whose nearest point is further from the goal does not lead there.
+GOAL_M = 10.0
+#: Where along the stretch of two parallel lanes a route may change from one to the other.
+CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Steps of the log shorter than this are jitter of a standing car; a log that gets no further than that has no way.
+STEP_M, STANDS_M = 0.5, 2.0
+#: The log's route goes on this far beyond the log.
+LOG_AHEAD_M = 100.0
+#: Its lanes are looked up at every so manyth of its points (0.5 to 3 m apart).
+LABEL_EVERY = 4
+
+
+@dataclass(frozen=True)
+class Route:
+    """Points 1 m apart along a way.
+
+    Attributes:
+        xyz: Points in the local frame, metres.
+        heading: Radians.
+        lane: Dense lane index under each point, -1 where there is none.
+    """
+
+    xyz: Float[Array, "point 3"]
+    heading: Float[Array, " point"]
+    lane: Int[Array, " point"]
+
+    @classmethod
+    def along(cls, xyz: Float[Array, "_ 3"], lane: Int[Array, " _"], most: int) -> Route:
+        """Resamples a polyline at 1 m, at most ``most`` points."""
+        points, index = resample(xyz, SPACING_M, most)
+        return cls(points, headings(points), lane[index])
+
+
+@dataclass(frozen=True)
+class EgoLog:
+    """The logged ego in the local frame.
+
+    Attributes:
+        xyz: Positions, zeros where not valid.
+        heading: Radians.
+        speed: m/s.
+        valid: Whether a step was observed.
+        current: The current step, which is valid.
+    """
+
+    xyz: Float[Array, "time 3"]
+    heading: Float[Array, " time"]
+    speed: Float[Array, " time"]
+    valid: Bool[Array, " time"]
+    current: int
+
+    @property
+    def last(self) -> int:
+        """The last valid step."""
+        return int(np.flatnonzero(self.valid)[-1])
+
+    @property
+    def seen(self) -> Float[Array, "step 3"]:
+        """Valid positions in order."""
+        return self.xyz[self.valid]
+
+    @property
+    def driven(self) -> Float[Array, "step 3"]:
+        """Valid positions up to the current step."""
+        return self.xyz[: self.current + 1][self.valid[: self.current + 1]]
+
+
+@dataclass(frozen=True)
+class RouteSet:
+    """Routes of a scenario.
+
+    Attributes:
+        routes: Route to the goal, the log's own, then alternatives.
+        on_lanes: Whether row 0 comes from the lane graph.
+        goal: The last logged position projected on row 0.
+        progress: Arc length of the logged ego on row 0 at every step, metres.
+    """
+
+    routes: tuple[Route, ...]
+    on_lanes: bool
+    goal: Float[Array, "2"]
+    progress: Float[Array, " time"]
+
+
+@dataclass(frozen=True)
+class Intent:
+    """What the source knows about where the ego wants to go; dense lane indices, empty where it does not.
+
+    Attributes:
+        lanes: The lanes of the intended route in order.
+        corridor: All lanes that the intended route may use.
+    """
+
+    lanes: tuple[int, ...] = ()
+    corridor: tuple[int, ...] = ()
+
+
+def find_routes(
+    graph: LaneGraph,
+    on: LaneSegments,
+    ego: EgoLog,
+    intent: Intent,
+    style: RouteStyle,
+    most_routes: int,
+    most_points: int,
+) -> RouteSet:
+    """All routes of a scenario.
+
+    Args:
+        graph: The lane graph.
+        on: Lane segments of the same graph.
+        ego: The logged ego.
+        intent: What the source says about the intended route; ``published`` routes do not look at it.
+        style: How candidates are made.
+        most_routes: Number of rows.
+        most_points: Points per route.
+    """
+    log = log_route(graph, on, ego, most_points)
+    draft = _published if style == "published" else _searched
+    best, others = draft(graph, on, ego, intent, (most_routes, most_points))
+    first = log if best is None else best
+    rest = [route for route in others if not _same(route, first)]
+    progress = log_progress(first, ego)
+    index = np.arange(len(first.xyz))
+    goal = np.array([np.interp(progress[ego.last], index, first.xyz[:, axis]) for axis in (0, 1)])
+    return RouteSet((first, log, *rest)[:most_routes], best is not None, goal, progress)
+
+
+def _searched(
+    graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
+) -> tuple[Route | None, list[Route]]:
+    """The route to the goal, if any, and the alternatives of the best-first search from the current step."""
+    pose = ego.xyz[ego.current], float(ego.heading[ego.current])
+    need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
+    search = LaneSearch.start(graph, on, *pose, need, intent.corridor)
+    drawer = _Drawer(graph, ego, most[1])
+    others = [drawer.draw(way, 0.0) for way in search.alternatives(most[0] - 1)]
+    end = ego.xyz[ego.last], float(ego.heading[ego.last])
+    if intent.lanes:
+        return _best(ego, drawer.variants([search.along(intent.lanes, *end)]), np.inf), others
+    return _best(ego, [*drawer.variants(search.to_goal(*end)), *others], GOAL_M), others
+
+
+def _published(
+    graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
+) -> tuple[Route | None, list[Route]]:
+    """The published candidates, the best score first, and the one of them that leads to the goal, if any."""
+    ego = replace(ego, current=int(np.argmax(ego.valid)))
+    search = LaneSearch.start(graph, on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
+    drawer = _Drawer(graph, ego, most[1], plain=True)
+    others = [drawer.draw(way, 0.0) for way in published_ways(search)]
+    return _best(ego, others, GOAL_M), others
+
+
+def _same(one: Route, other: Route) -> bool:
+    return len(one.xyz) == len(other.xyz) and bool(np.abs(one.xyz - other.xyz).max() < 0.1)
+
+
+def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
+    """The route that passes nearest to the goal region, then nearest to the log; None where none comes in reach."""
+    if not routes:
+        return None
+    path = thin_path(ego.seen[:, :2])
+    keys = []
+    for i, route in enumerate(routes):
+        _, distance = project(route.xyz, path)
+        keys.append((np.floor(distance[-1]), round(float(distance.mean()), 1), i))
+    goal_distance, _, best = min(keys)
+    return routes[best] if goal_distance < reach_m else None
+
+
+@dataclass(frozen=True)
+class _Drawer:
+    """Turns ways (lane sequences) into routes of at most ``most`` points for one ego.
+
+    A plain route begins beside the ego and keeps to the lanes; others begin 20 m behind the ego's first logged
+    position and bend to where the ego drove.
+    """
+
+    graph: LaneGraph
+    ego: EgoLog
+    most: int
+    plain: bool = False
+
+    def variants(self, ways: Sequence[Way]) -> list[Route]:
+        """Routes along the ways; a way with lane changes is drawn with early to late changes."""
+        routes = []
+        for way in ways:
+            steps = zip(way.lanes, way.lanes[1:], strict=False)
+            changes = any(is_change(self.graph, a, b) for a, b in steps)
+            routes += [self.draw(way, place) for place in (CHANGE_PLACES if changes else (0.0,))]
+        return routes
+
+    def draw(self, way: Way, place: float) -> Route:
+        """The route along a way to the end of its lanes and of those that follow them straight on."""
+        graph, ego = self.graph, self.ego
+        driven = ego.driven[:, :2]
+        behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(driven)[-1])
+        prefix, length = precede(graph, way.lanes[0], behind - way.s, driven)
+        begin = way.s + length - behind
+        ends = float(graph.lines.length[list(way.lanes)].sum()) - way.s
+        lanes = (*prefix, *follow(graph, way.lanes, ends, self.most * SPACING_M))
+        speed = float(ego.speed[ego.current])
+        change_m = max(CHANGE_M, CHANGE_S * speed)
+        line = trace(
+            graph,
+            lanes,
+            max(begin, 0.0),
+            -way.s - length,
+            (REACTION_S * speed, way.until),
+            place,
+            change_m,
+        )
+        line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
+        arc, _ = project(line[0], ego.seen[-1:, :2])
+        missing = float(arc[0]) + PAST_GOAL_M - float(arc_lengths(line[0])[-1])
+        xyz, label = continue_straight(line, 0.0, missing)
+        points, index = resample(xyz, SPACING_M, self.most)
+        return Route.along(points if self.plain else join(points, driven, change_m), label[index], self.most)
+
+
+def log_route(graph: LaneGraph, on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
+    """The logged ego's own way (privileged), continued along its last lane, else straight on.
+
+    Positions within half a metre of the one before are skipped: the jitter of a standing car is no way. Of a log that
+    stays within 2 m only the last pose is used.
+    """
+    seen, heading = ego.seen, ego.heading[ego.valid]
+    keep = [0]
+    for i in range(1, len(seen)):
+        if np.hypot(*(seen[i] - seen[keep[-1]])[:2]) >= STEP_M:
+            keep.append(i)
+    if np.hypot(*(seen - seen[0])[:, :2].T).max() < STANDS_M:
+        keep = keep[-1:]
+    pose, course = seen[keep[-1]], float(heading[keep[-1]])
+    line = np.concatenate((seen[keep], _ahead(graph, on, pose, course)))
+    probe = np.arange(0, len(line), LABEL_EVERY)
+    lane, _, _ = on.nearest(line[probe], headings(line)[probe], REACH_M, SAME_TURN_RAD)
+    return Route.along(line, np.repeat(lane, LABEL_EVERY)[: len(line)], most_points)
+
+
+def _ahead(graph: LaneGraph, on: LaneSegments, pose: Float[Array, "3"], heading: float) -> Array:
+    """Points 1 m apart ahead of a pose: along its lane, its lateral offset fading within 20 m; else straight."""
+    count = int(LOG_AHEAD_M)
+    distance = np.arange(1.0, count + 1.0)
+    lane, s, _ = on.nearest(pose[None], np.array([heading]), REACH_M, SAME_TURN_RAD)
+    if lane[0] < 0:
+        xy = pose[:2] + distance[:, None] * np.array([np.cos(heading), np.sin(heading)])
+    else:
+        foot, course = graph.lines.at(lane, s)[0], float(graph.lines.heading(lane, s)[0])
+        lateral = float((pose[:2] - foot[:2]) @ np.array([-np.sin(course), np.cos(course)]))
+        points, courses = walk(graph, lane, s, 1.0, count)
+        fade = lateral * np.maximum(1.0 - distance / BEHIND_M, 0.0)
+        xy = points[0] + fade[:, None] * np.stack((-np.sin(courses[0]), np.cos(courses[0])), axis=-1)
+    return np.concatenate((xy, np.full((count, 1), pose[2])), axis=1)
+
+
+def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
+    """Arc length of the logged ego along a route at every step, never decreasing, metres.
+
+    Each position is searched no further ahead than the ego has moved since the last valid one (and 2 m); steps
+    that are not valid repeat the last value.
+    """
+    rows = np.flatnonzero(ego.valid)
+    moved = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)
+    s = project_monotone(route.xyz, ego.seen[:, :2], 1.5 * moved + 2.0)
+    before = np.searchsorted(rows, np.arange(len(ego.valid)), side="right") - 1
+    return s[np.maximum(before, 0)]

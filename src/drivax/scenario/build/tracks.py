@@ -1,0 +1,226 @@
+"""Tracks sorted into those that move and those that stay where they are, with one box size each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from drivax.geometry.angles import wrap
+from drivax.scenario.build.lane_paths import walk
+from drivax.scenario.build.lanes import LaneGraph, LaneSegments
+from drivax.scenario.recording import Tracks
+from drivax.scenario.schema import AgentKind, among
+
+Array = np.ndarray[Any, Any]
+
+PARKED_M = 0.3
+PARKED_RAD = 0.1
+EXTENSION_STEP_M = 4.0
+#: Over this distance an extension fades from the agent's lateral offset to the centre of its lane.
+FADE_M = 20.0
+#: Movers rank as if they were this much nearer to the ego.
+MOVER_BONUS_M = 50.0
+MOVER_M = 2.0
+#: Bits of ``agent_flags``.
+EGO_BIT, PREDICT_BIT, INTEREST_BIT = 1, 2, 4
+#: Length, width and height where a source has none, metres (medians of Argoverse 2 sensor logs by class).
+DEFAULT_SIZES = {
+    AgentKind.NONE: (1.0, 1.0, 1.0),
+    AgentKind.VEHICLE: (4.1, 1.9, 1.6),
+    AgentKind.PEDESTRIAN: (0.7, 0.7, 1.8),
+    AgentKind.CYCLIST: (1.8, 0.6, 1.7),
+    AgentKind.OTHER: (1.0, 1.0, 1.0),
+    AgentKind.STATIC: (0.5, 0.5, 1.0),
+}
+DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
+#: No road user is longer; larger measurements are not believed.
+MOST_SIZE_M = 100.0
+
+
+@dataclass(frozen=True)
+class LocalTracks:
+    """Tracks in the local frame, float64, cleaned: zeros where not valid, headings wrapped.
+
+    Attributes:
+        xyz: Box centres, metres.
+        heading: Radians in [-pi, pi).
+        velocity: m/s.
+        size: Length, width, height: medians over the valid steps, metres.
+        valid: Whether a step was observed.
+        kind: Agent kinds.
+        track_id: Ids in the source.
+        ego: Row of the ego.
+        defaulted: How many tracks took a size from their class.
+    """
+
+    xyz: Float[Array, "track time 3"]
+    heading: Float[Array, "track time"]
+    velocity: Float[Array, "track time 2"]
+    size: Float[Array, "track 3"]
+    valid: Bool[Array, "track time"]
+    kind: Int[Array, " track"]
+    track_id: Int[Array, " track"]
+    ego: int
+    defaulted: int
+
+
+def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
+    """Moves tracks into the local frame and gives every track one box size.
+
+    Sizes vary by metres between steps of one object in public data; the median over valid measurements between 0
+    and 100 m is used, and class defaults where there is none.
+    """
+    valid = tracks.valid.astype(bool)
+    mask = valid[..., None]
+    xyz = np.concatenate((tracks.xy, tracks.z[..., None]), axis=-1) - origin
+    size, defaulted = _sizes(tracks, ego)
+    return LocalTracks(
+        xyz=np.where(mask, xyz, 0.0),
+        heading=np.where(valid, wrap(tracks.heading), 0.0),
+        velocity=np.where(mask, tracks.velocity, 0.0),
+        size=size,
+        valid=valid,
+        kind=tracks.kind.astype(np.int64),
+        track_id=tracks.track_id.astype(np.int64),
+        ego=ego,
+        defaulted=defaulted,
+    )
+
+
+def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], int]:
+    """Median box size of every track, and how many tracks needed a default."""
+    plain = np.nan_to_num(tracks.size)
+    measured = tracks.valid[..., None] & (plain > 0.0) & (plain <= MOST_SIZE_M)
+    size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(measured, 1, 2))
+    default = np.array([DEFAULT_SIZES[AgentKind(kind)] for kind in tracks.kind]).reshape(-1, 3)
+    default[ego] = DEFAULT_EGO_SIZE
+    missing = ~np.any(measured, axis=1)
+    return np.where(missing, default, size), int((missing.any(axis=1) & tracks.valid.any(axis=1)).sum())
+
+
+def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row time"]) -> Float[Array, "*row"]:
+    """Median over the valid entries of the last axis; 0 where none is valid."""
+    ordered = np.sort(np.where(valid, values, np.inf), axis=-1)
+    count = valid.sum(axis=-1)
+    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], axis=-1)[..., 0]
+    high = np.take_along_axis(
+        ordered, np.maximum(count // 2, 0).clip(max=values.shape[-1] - 1)[..., None], -1
+    )
+    with np.errstate(invalid="ignore"):
+        return np.where(count > 0, (low + high[..., 0]) / 2, 0.0)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Which track goes where.
+
+    Attributes:
+        moving: Rows of the moving block in slot order; the ego first.
+        parked: Rows of the parked block in slot order.
+        pose: Median x, y, z and heading of every track.
+        overflow: Tracks that fit neither, by name.
+    """
+
+    moving: Int[Array, " slot"]
+    parked: Int[Array, " parked_slot"]
+    pose: Float[Array, "track 4"]
+    overflow: dict[str, int]
+
+
+def place(tracks: LocalTracks, marked: Sequence[int], agents: int, parked: int) -> Placement:
+    """Sorts tracks into the moving and the parked block, the most relevant first.
+
+    A track is parked when at every valid step it is within 0.3 m of its median position and 0.1 rad of its median
+    heading. Rank: the ego, then marked tracks (to predict, of interest), then by the smallest distance to the ego
+    over the log, where movers count as 50 m nearer. Tracks that are never valid are left out and not counted.
+
+    Args:
+        tracks: The tracks.
+        marked: Rows of tracks to predict and of interest.
+        agents: Slots of the moving block.
+        parked: Slots of the parked block.
+    """
+    pose = median_pose(tracks)
+    away = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
+    turned = np.abs(wrap(tracks.heading - pose[:, None, 3]))
+    still = ((away <= PARKED_M) & (turned <= PARKED_RAD)) | ~tracks.valid
+    seen = tracks.valid.any(axis=1)
+    parks = still.all(axis=1) & seen
+    parks[tracks.ego] = False
+    rank = _rank(tracks, np.where(tracks.valid, away, 0.0).max(axis=1), marked)
+    order = np.argsort(rank, kind="stable")
+    moving, standing = order[(seen & ~parks)[order]], order[parks[order]]
+    overflow = {"agents": max(len(moving) - agents, 0), "parked": max(len(standing) - parked, 0)}
+    return Placement(
+        moving[:agents], standing[:parked], pose, {name: count for name, count in overflow.items() if count}
+    )
+
+
+def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
+    """Median x, y, z and heading over the valid steps; the heading's median is taken around its circular mean."""
+    xyz = masked_median(
+        np.swapaxes(tracks.xyz, 1, 2), np.broadcast_to(tracks.valid[:, None], _swapped(tracks))
+    )
+    weight = tracks.valid.astype(np.float64)
+    mean = np.arctan2((np.sin(tracks.heading) * weight).sum(1), (np.cos(tracks.heading) * weight).sum(1))
+    turn = masked_median(wrap(tracks.heading - mean[:, None]), tracks.valid)
+    return np.concatenate((xyz, wrap(mean + turn)[:, None]), axis=1)
+
+
+def _swapped(tracks: LocalTracks) -> tuple[int, int, int]:
+    rows, steps, width = tracks.xyz.shape
+    return rows, width, steps
+
+
+def _rank(
+    tracks: LocalTracks, moved: Float[Array, " track"], marked: Sequence[int]
+) -> Float[Array, " track"]:
+    """Sort key of every track, smaller is more relevant."""
+    both = tracks.valid & tracks.valid[tracks.ego]
+    apart = np.hypot(*np.moveaxis((tracks.xyz - tracks.xyz[tracks.ego])[..., :2], -1, 0))
+    rank = np.where(both, apart, 1e6).min(axis=1) - MOVER_BONUS_M * (moved > MOVER_M)
+    rank[list(marked)] -= 1e7
+    rank[tracks.ego] = -np.inf
+    return rank
+
+
+def extend(
+    tracks: LocalTracks, rows: Int[Array, " slot"], graph: LaneGraph, on: LaneSegments, count: int
+) -> Float[Array, "slot count 2"]:
+    """Where agents would go on after their last logged pose: along their lane, else straight ahead.
+
+    Vehicles and cyclists whose last valid pose lies within 3 m and 45 degrees of a lane follow it and its
+    straightest successors, 4 m apart; their lateral offset fades within 20 m. All others go straight on.
+
+    Args:
+        tracks: The tracks.
+        rows: Tracks to extend, each valid at least once.
+        graph: The lane graph.
+        on: Lane segments of the same graph.
+        count: Number of points.
+    """
+    last = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[rows][:, ::-1], axis=1)
+    xyz, heading = tracks.xyz[rows, last], tracks.heading[rows, last]
+    distance = EXTENSION_STEP_M * np.arange(1, count + 1)
+    direction = np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+    points = xyz[:, None, :2] + distance[:, None] * direction[:, None]
+    lane, s, _ = on.nearest(xyz, heading, reach_m=3.0, turn_rad=np.deg2rad(45.0))
+    drives = among(tracks.kind[rows], (AgentKind.VEHICLE, AgentKind.CYCLIST))
+    follows = np.flatnonzero((lane >= 0) & drives)
+    if len(follows) == 0:
+        return points
+    foot = graph.lines.at(lane[follows], s[follows])[..., :2]
+    normal = _left_normal(graph.lines.heading(lane[follows], s[follows]))
+    lateral = np.einsum("ai,ai->a", xyz[follows, :2] - foot, normal)
+    ahead, lane_heading = walk(graph, lane[follows], s[follows], EXTENSION_STEP_M, count)
+    fade = np.maximum(1.0 - distance / FADE_M, 0.0)
+    points[follows] = ahead + (lateral[:, None] * fade)[..., None] * _left_normal(lane_heading)
+    return points
+
+
+def _left_normal(heading: Float[Array, "*pose"]) -> Float[Array, "*pose 2"]:
+    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)

@@ -1,0 +1,1 @@
+"""Which scenarios of a set: tags, filters and splits."""

@@ -1,0 +1,249 @@
+"""Words that say what kind of scenario this is: one vocabulary for filters and strata, whatever the source.
+
+Every scenario gets every tag of :data:`TAGS` when it is assembled; readers and the built-in world add their own words
+(``place``, ``family``, ...), which are kept as they are. All tags describe the ego's log as it was driven: they sort
+scenarios, a planner never sees them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from drivax.geometry.angles import wrap
+from drivax.geometry.polylines import arc_lengths
+from drivax.scenario.build.filling import Parts
+from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
+from drivax.scenario.build.routes import STEP_M, Route
+from drivax.scenario.build.tracks import LocalTracks
+from drivax.scenario.recording import Recording
+from drivax.scenario.schema import DT_S, AgentKind, Flag, among
+
+Array = np.ndarray[Any, Any]
+
+#: Every tag that is computed here, and what it can be.
+TAGS: Mapping[str, tuple[str, ...]] = {
+    "type": ("straight", "lane_follow", "junction", "merge", "turn_left", "turn_right", "u_turn"),
+    "difficulty": ("easy", "medium", "hard"),
+    "density": ("low", "medium", "high"),
+    "moves": ("yes", "no"),
+    "lights": ("yes", "no"),
+    "limits": ("measured", "default", "none"),
+    "lane_graph": ("given", "chained", "none"),
+    "routes": ("graph", "published"),
+}
+#: A log that drives less does not move.
+MOVES_M = 5.0
+#: A turn changes the heading by this much within ``TURN_WITHIN_M`` of driving; a U-turn by that much.
+TURN_RAD, U_TURN_RAD, TURN_WITHIN_M = np.deg2rad(45.0), np.deg2rad(135.0), 40.0
+#: A straight log stays within a range of headings of this width.
+STRAIGHT_RAD = np.deg2rad(10.0)
+#: Lanes that leave one lane, or enter one lane, at angles that differ by more than this belong to a junction ...
+FORK_RAD = np.deg2rad(30.0)
+#: ... where they are no longer than this (a ramp is no junction).
+JUNCTION_LANE_M = 60.0
+#: Agents within ``NEAR_M`` of ego at the current step: below the first number low, from the second on high density.
+NEAR_M, DENSITY = 50.0, (5, 20)
+#: Difficulty is medium from the first number of demands on, hard from the second on.
+DIFFICULTY = (2, 3)
+VULNERABLE_M = 15.0
+#: Crossing traffic: this near, at least this fast, at an angle to ego's heading between these.
+CROSSING_M, CROSSING_MPS, CROSSING_RAD = 20.0, 1.0, (np.deg2rad(45.0), np.deg2rad(135.0))
+#: Braking: this much speed lost within a second.
+BRAKING_MPS = 2.0
+
+
+@dataclass(frozen=True)
+class Driven:
+    """The ego's log without the jitter of a standing car: poses at least half a metre apart.
+
+    Attributes:
+        arc: Distance driven, metres.
+        heading: Unwrapped, radians.
+        lane: Dense lane index under every metre of the log, -1 where there is none.
+    """
+
+    arc: Float[Array, " pose"]
+    heading: Float[Array, " pose"]
+    lane: Int[Array, " metre"]
+
+    @classmethod
+    def of(cls, tracks: LocalTracks, log: Route) -> Driven:
+        """From the ego's track and the route of its log."""
+        valid = tracks.valid[tracks.ego]
+        xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
+        keep = [0]
+        for i in range(1, len(xy)):
+            if np.hypot(*(xy[i] - xy[keep[-1]])) >= STEP_M:
+                keep.append(i)
+        arc = arc_lengths(xy[keep])
+        return cls(arc, np.unwrap(heading[keep]), log.lane[: int(arc[-1]) + 1])
+
+
+def scenario_tags(recording: Recording, parts: Parts, flags: Flag, routes: str) -> dict[str, str]:
+    """All tags of a scenario.
+
+    Args:
+        recording: The source, for its own tags.
+        parts: What the scenario consists of; row 1 of the routes is the log's.
+        flags: The scenario's flags.
+        routes: How its candidate routes were made.
+    """
+    driven = Driven.of(parts.tracks, parts.routes.routes[1] if len(parts.routes.routes) > 1 else _nowhere())
+    kind = type_of(driven, parts.graph)
+    density = density_of(parts.tracks, recording.current_step)
+    return {
+        **recording.tags,
+        "dataset": recording.dataset,
+        "type": kind,
+        "difficulty": difficulty_of(parts.tracks, kind, density),
+        "density": density,
+        "moves": "yes" if driven.arc[-1] >= MOVES_M else "no",
+        "lights": "yes" if len(parts.lights.z) else "no",
+        "limits": _limits(flags),
+        "lane_graph": _lane_graph(flags),
+        "routes": routes,
+    }
+
+
+def _nowhere() -> Route:
+    return Route(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64))
+
+
+def _limits(flags: Flag) -> str:
+    if Flag.DEFAULT_LIMITS in flags:
+        return "default"
+    return "measured" if Flag.SPEED_LIMITS in flags else "none"
+
+
+def _lane_graph(flags: Flag) -> str:
+    if Flag.LANE_GRAPH not in flags:
+        return "none"
+    return "chained" if Flag.CHAINED_GRAPH in flags else "given"
+
+
+def type_of(driven: Driven, graph: LaneGraph) -> str:
+    """What the ego does, the most specific that holds: U-turn, turn, merge, junction, bends of its lane, straight.
+
+    - ``u_turn``, ``turn_left``, ``turn_right``: the heading changes by 135 or 45 degrees within 40 m of driving, and
+      the log is on a lane of a junction or beside all lanes somewhere (else it is a bend of the road).
+    - ``merge``: it goes on to a lane that another lane enters in the same direction, outside junctions.
+    - ``junction``: it drives on a lane of a junction.
+    - ``lane_follow``, ``straight``: its headings differ by 10 degrees or more, or by less.
+
+    A log that drives less than 5 m is ``straight``.
+    """
+    if driven.arc[-1] < MOVES_M:
+        return "straight"
+    junction = junction_lanes(graph)
+    on = driven.lane[driven.lane >= 0]
+    crosses = bool(junction[on].any())
+    turn = _sharpest(driven)
+    if abs(turn) >= TURN_RAD and (crosses or len(on) < len(driven.lane)):
+        if abs(turn) >= U_TURN_RAD:
+            return "u_turn"
+        return "turn_left" if turn > 0 else "turn_right"
+    if _merges(on, graph, junction):
+        return "merge"
+    if crosses:
+        return "junction"
+    return "straight" if np.ptp(driven.heading) < STRAIGHT_RAD else "lane_follow"
+
+
+def _sharpest(driven: Driven) -> float:
+    """The largest change of heading within 40 m of driving, left positive, radians."""
+    within = np.abs(driven.arc[:, None] - driven.arc) <= TURN_WITHIN_M
+    turn = np.where(np.triu(within), driven.heading - driven.heading[:, None], 0.0)
+    return float(turn.flat[np.abs(turn).argmax()])
+
+
+def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
+    """Lanes inside junctions: turn paths of the source, and short lanes that fork off or join at an angle."""
+    result = graph.interpolating.copy()
+    if graph.count == 0:
+        return result
+    row = np.arange(graph.count)
+    begin, end = (
+        graph.lines.heading(row, s, END_SPAN_M) for s in (np.zeros(graph.count), graph.lines.length)
+    )
+    for links, heading in ((graph.successor, end), (graph.predecessor, begin)):
+        angle = wrap(heading[links][:, :, None] - heading[links][:, None])
+        both = (links >= 0)[:, :, None] & (links >= 0)[:, None]
+        forks = (both & (np.abs(angle) > FORK_RAD)).any(axis=2)
+        result[links[forks]] = True
+    return result & ((graph.lines.length <= JUNCTION_LANE_M) | graph.interpolating)
+
+
+def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, " lane"]) -> bool:
+    """Whether the log goes on to a lane that another lane enters as well, neither of them in a junction."""
+    changes = np.flatnonzero(lane[1:] != lane[:-1])
+    for a, b in zip(lane[changes], lane[changes + 1], strict=True):
+        into = graph.predecessor[b]
+        into = into[into >= 0]
+        if a in into and len(into) > 1 and not junction[into].any():
+            return True
+    return False
+
+
+def density_of(tracks: LocalTracks, current_step: int) -> str:
+    """How many road users there are within 50 m of ego at the current step: below 5, 5 to 19, 20 or more."""
+    here = tracks.valid[:, current_step] & _is_road_user(tracks)
+    apart = np.hypot(*(tracks.xyz[:, current_step, :2] - tracks.xyz[tracks.ego, current_step, :2]).T)
+    count = int((here & (apart <= NEAR_M)).sum())
+    return TAGS["density"][int(np.searchsorted(DENSITY, count, side="right"))]
+
+
+def _is_road_user(tracks: LocalTracks) -> Bool[Array, " track"]:
+    """Vehicles, pedestrians and cyclists other than ego."""
+    users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
+    users[tracks.ego] = False
+    return users
+
+
+def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
+    """How many demands there are on the ego: up to one is easy, two are medium, three or more are hard.
+
+    The demands: a manoeuvre (any type but ``straight`` and ``lane_follow``); high density; a pedestrian or cyclist
+    within 15 m; a vehicle at 1 m/s or more within 20 m that crosses ego's heading at 45 to 135 degrees; and the log's
+    ego losing 2 m/s of speed within a second. Distances are between centres at the same step, at any step of the log.
+    """
+    demands = (
+        kind not in ("straight", "lane_follow"),
+        density == "high",
+        _meets_vulnerable(tracks),
+        _meets_crossing(tracks),
+        _brakes(tracks),
+    )
+    return TAGS["difficulty"][int(np.searchsorted(DIFFICULTY, sum(demands), side="right"))]
+
+
+def _apart(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row time"]:
+    """Distance of tracks from ego at every step, infinite where either is not valid."""
+    offset = tracks.xyz[rows, :, :2] - tracks.xyz[tracks.ego, :, :2]
+    both = tracks.valid[rows] & tracks.valid[tracks.ego]
+    return np.where(both, np.hypot(offset[..., 0], offset[..., 1]), np.inf)
+
+
+def _meets_vulnerable(tracks: LocalTracks) -> bool:
+    rows = np.flatnonzero(among(tracks.kind, (AgentKind.PEDESTRIAN, AgentKind.CYCLIST)))
+    return bool((_apart(tracks, rows) <= VULNERABLE_M).any())
+
+
+def _meets_crossing(tracks: LocalTracks) -> bool:
+    rows = np.flatnonzero(tracks.kind == AgentKind.VEHICLE)
+    rows = rows[rows != tracks.ego]
+    angle = np.abs(wrap(tracks.heading[rows] - tracks.heading[tracks.ego]))
+    crosses = (angle >= CROSSING_RAD[0]) & (angle <= CROSSING_RAD[1])
+    speed = np.hypot(tracks.velocity[rows, :, 0], tracks.velocity[rows, :, 1])
+    return bool((crosses & (speed >= CROSSING_MPS) & (_apart(tracks, rows) <= CROSSING_M)).any())
+
+
+def _brakes(tracks: LocalTracks) -> bool:
+    speed = np.hypot(*tracks.velocity[tracks.ego].T)
+    valid, second = tracks.valid[tracks.ego], round(1.0 / DT_S)
+    both = valid[second:] & valid[:-second]
+    return bool((both & (speed[:-second] - speed[second:] >= BRAKING_MPS)).any())

@@ -1,1 +1,0 @@
-"""Pictures, animations and the HTML report."""

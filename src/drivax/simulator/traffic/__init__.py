@@ -1,0 +1,1 @@
+"""Traffic models: how every agent that is not driven moves."""

@@ -1,0 +1,292 @@
+"""Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
+
+All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
+leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima
+(a sort costs several times as much), and only these are measured against the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y
+from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.smallest import first_smallest, number_of, numbered
+from drivax.scenario.record import record
+from drivax.simulator.traffic.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, AgentPaths
+from drivax.simulator.types import Frame
+
+#: How many things C are measured against a path. Six would do (docs/log), but eight fill a vector.
+CLOSEST = 8
+#: Free space that a corridor has beside the vehicle, m.
+SIDE_M = 0.1
+#: Pieces that stand for the path ahead, and rectangles around as many of them each.
+PIECES, RECTANGLES = 12, 3
+#: How far the path may run beside its pieces, m: rectangles are so much wider.
+_BULGE_M = 0.5
+#: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
+BEHIND_M = 1.0
+#: How far a vehicle looks: this, what it drives in so many seconds, what it needs to stop with 3 m/s2; at most so far.
+_LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
+#: Gap of a free road, m; a number, so that gradients stay finite.
+FREE_M = 1e4
+#: No gap between things that overlap is below this, m.
+LEAST_GAP_M = -50.0
+#: So many low bits of a squared distance hold the thing or piece; what is left is exact to 0.03 % (of 1 m2 at least).
+_SLOT_BITS, _PIECE_BITS = 10, 4
+
+
+@record
+class Movers:
+    """R vehicles on their paths.
+
+    Attributes:
+        box: x, y, cos, sin, length, width.
+        z: Height of the box centre, m.
+        arc: Place along the path, m.
+        speed: m/s.
+        slot: Slot of the frame.
+        ignored: Slots of things that do not count, -1 for none.
+    """
+
+    box: Float[Array, "R 6"]
+    z: Float[Array, " R"]
+    arc: Float[Array, " R"]
+    speed: Float[Array, " R"]
+    slot: Int[Array, " R"]
+    ignored: Int[Array, "R 2"]
+
+
+@record
+class Leaders:
+    """What R vehicles have ahead of them.
+
+    Attributes:
+        gap: Free path up to the nearest thing in the corridor, bumper to bumper, m; 10 km where there is none.
+        speed: Speed of that thing along the path, m/s.
+        things: Slots of the closest things around the corridor.
+        real: Whether there is one.
+    """
+
+    gap: Float[Array, " R"]
+    speed: Float[Array, " R"]
+    things: Int[Array, "R C"]
+    real: Bool[Array, "R C"]
+
+
+def path_poses(
+    paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]
+) -> tuple[Float[Array, "R 4"], Float[Array, "R 2"]]:
+    """Poses (x, y, cos, sin) at arc lengths of a scenario's paths; heights and the speeds that the paths allow."""
+    at = arc / paths.spacing[index]
+    low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
+    part = jnp.clip(at - low, 0.0, 1.0)[:, None]
+
+    def between(table: Float[Array, "N R M F"]) -> Float[Array, "R F"]:
+        def both(row: Array, low: Array) -> Float[Array, "2 F"]:
+            first = (index, row, low, jnp.int32(0))
+            return jax.lax.dynamic_slice(table, first, (1, 1, 2, table.shape[-1]))[0, 0]
+
+        ends = jax.vmap(both)(jnp.arange(arc.shape[0], dtype=jnp.int32), low)
+        return ends[:, 0] * (1 - part) + ends[:, 1] * part
+
+    here = between(paths.points)
+    unit = jax.lax.rsqrt(jnp.maximum(here[:, PATH_COS] ** 2 + here[:, PATH_SIN] ** 2, 1e-9))
+    return here * jnp.where(jnp.arange(4) >= PATH_COS, unit[:, None], 1.0), between(paths.profile)
+
+
+def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
+    """The nearest thing in the corridor of each vehicle.
+
+    The corridor is as wide as the vehicle and 0.1 m more on either side. A thing is in it when its box, as wide as it
+    is across the path, reaches into it and its centre is ahead of the vehicle's; things on another level are not.
+
+    Args:
+        paths: Paths of the bank.
+        index: Row of the bank.
+        movers: The vehicles.
+        frame: Everyone now.
+    """
+    look = _look(movers.speed)
+    rows, arcs = _path_ahead(paths, index, movers, look)
+    nodes = rows[..., :2]
+    things, real = _closest(movers, frame, nodes)
+    box, velocity = frame.box[things], frame.velocity[things]
+    # Coordinates one by one: pairs of numbers at the end of an array do not vectorise.
+    x, y = nodes[..., X, None], nodes[..., Y, None]
+    keys = []
+    for number in range(PIECES):
+        ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
+        keys.append(numbered(1.0 + _from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
+    best = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
+    # Written out once: XLA would compute it anew for each of the columns that are read.
+    best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
+    x0, y0, *before, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, best), -1, 0)
+    slopes = *before, cos1, sin1
+    arc, end = (jnp.take_along_axis(arcs, best + at, axis=1) for at in (0, 1))
+    part, distance = _from_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
+    long = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
+    ux, uy = (x1 - x0) / long, (y1 - y0) / long
+    beside = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), slopes) * long
+    distance = jnp.where((part > 0.0) & (part < 1.0), beside * beside, distance)
+    along = arc + part * (end - arc) - movers.arc[:, None]
+    cos = jnp.abs(box[..., COS] * ux + box[..., SIN] * uy)
+    sin = jnp.abs(box[..., SIN] * ux - box[..., COS] * uy)
+    half_length = cos * box[..., LENGTH] / 2 + sin * box[..., WIDTH] / 2
+    half_width = sin * box[..., LENGTH] / 2 + cos * box[..., WIDTH] / 2
+    room = movers.box[:, None, WIDTH] / 2 + SIDE_M + half_width
+    beyond = (along >= look[:, None]) | ((best == PIECES - 1) & (part >= 1.0))
+    inside = real & (distance < room * room) & (along > 0.0) & ~beyond
+    gap = jnp.where(inside, along - half_length - movers.box[:, None, LENGTH] / 2, FREE_M)
+    nearest = first_smallest(gap, least=LEAST_GAP_M)[:, None] == jnp.arange(CLOSEST)
+    speed = jnp.sum(jnp.where(nearest, velocity[..., 0] * ux + velocity[..., 1] * uy, 0.0), axis=1)
+    return Leaders(gap=jnp.min(gap, axis=1), speed=speed, things=things, real=real)
+
+
+def _both_ends(rows: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[Array, "R C 8"]:
+    """The rows of two points on end of each path, side by side: one contiguous read each."""
+
+    def both(path: Float[Array, "K 4"], at: Array) -> Float[Array, " 8"]:
+        return jax.lax.dynamic_slice(path, (at, jnp.int32(0)), (2, 4)).reshape(8)
+
+    return jax.vmap(jax.vmap(both, in_axes=(None, 0)))(rows, first)
+
+
+def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Where on a piece, as a share of it, the point nearest to another one lies, and their squared distance."""
+    ux, uy, wx, wy = x1 - x0, y1 - y0, x - x0, y - y0
+    part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
+    dx, dy = wx - part * ux, wy - part * uy
+    return part, dx * dx + dy * dy
+
+
+def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
+    """How far to the left of a straight piece the path runs, as a share of its length: the cubic with both tangents.
+
+    Args:
+        part: Where on the piece, as a share of it.
+        way: Direction of the piece: cosine, sine.
+        tangents: Directions of the path at its beginning and end: cosine, sine, cosine, sine.
+    """
+    (ux, uy), slopes = way, []
+    for cos, sin in (tangents[:2], tangents[2:]):
+        slopes.append(jnp.clip((ux * sin - uy * cos) / jnp.maximum(ux * cos + uy * sin, 0.1), -1.0, 1.0))
+    return part * (1 - part) * ((1 - part) * slopes[0] - part * slopes[1])
+
+
+def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
+    """How far a vehicle looks along its path, m."""
+    return jnp.minimum(_LOOK_M + _LOOK_S * speed + speed * speed / (2 * _LOOK_MPS2), _LOOK_MOST_M)
+
+
+def _path_ahead(
+    paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
+) -> tuple[Float[Array, "R K 4"], Float[Array, "R K"]]:
+    """Rows of the path from the point behind the vehicle to as far as it looks, and their arc lengths."""
+    spacing = paths.spacing[index]
+    # One point more than it takes, since the first one lies behind.
+    stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
+    first = (movers.arc / spacing).astype(jnp.int32)
+    place = jnp.clip(first[:, None] + stride[:, None] * jnp.arange(PIECES + 1), 0, PATH_POINTS - 1)
+    rows = paths.points[index, jnp.arange(place.shape[0])[:, None], place]
+    return rows, place * spacing[:, None]
+
+
+def _closest(
+    movers: Movers, frame: Frame, nodes: Float[Array, "R K 2"]
+) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
+    """The closest things whose box reaches into one of the rectangles around the corridor."""
+    me = movers.box[:, None]
+    behind = me[..., LENGTH] / 2 + BEHIND_M
+    box = columns(frame.box)
+    near = reaching(box, nodes, me[..., WIDTH] / 2 + SIDE_M + _BULGE_M, behind, 0.0, RECTANGLES)
+    slot = jnp.arange(frame.valid.shape[0], dtype=jnp.int32)
+    near &= frame.valid & (slot != movers.slot[:, None])
+    near &= jnp.abs(frame.z - movers.z[:, None]) <= LEVEL_M
+    near &= (slot != movers.ignored[:, :1]) & (slot != movers.ignored[:, 1:])
+    return closest(near, movers.box, box)
+
+
+def columns(box: Float[Array, "S 6"]) -> Float[Array, "6 S"]:
+    """The columns of boxes as rows of their own.
+
+    By a product with the unit matrix: a mere transposition is gone before operations are fused, and every one of them
+    reads with strides then.
+    """
+    unit = jnp.eye(box.shape[1], dtype=box.dtype)
+    return jnp.einsum("fg,sg->fs", unit, box, precision=jax.lax.Precision.HIGHEST)
+
+
+def closest(
+    near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "6 S"]
+) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
+    """Of the boxes (their :func:`columns`) that are near the C whose centres are the closest; and which are real."""
+    dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
+    key = jnp.where(near, numbered(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
+    # Computed once: without the barrier XLA computes it anew for each of the minima.
+    key = jax.lax.optimization_barrier(key)
+    found = [jnp.min(key, axis=1, keepdims=True)]
+    for _ in range(CLOSEST - 1):
+        found.append(jnp.min(jnp.where(key > found[-1], key, jnp.inf), axis=1, keepdims=True))
+    chosen = jnp.concatenate(found, axis=1)
+    real = jnp.isfinite(chosen)
+    return jnp.where(real, number_of(chosen, _SLOT_BITS), 0), real
+
+
+def reaching(
+    box: Float[Array, "6 S"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
+    rectangles: int,
+) -> Bool[Array, "R S"]:  # fmt: skip
+    """Which boxes reach into one of the rectangles along the chords of K points on a path.
+
+    Args:
+        box: Boxes, as :func:`columns`.
+        nodes: Points on the path.
+        half: Half the width of the corridor, m.
+        behind: How much further back the first rectangle reaches, m.
+        beyond: How much further on the last one reaches, m.
+        rectangles: How many; K - 1 is a multiple of it.
+    """
+    around = _rectangles(nodes, half, behind, beyond, rectangles)
+    deep, wide = box[LENGTH] / 2, box[WIDTH] / 2
+    found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
+    for number in range(rectangles):
+        x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
+        turn_cos = jnp.abs(box[COS] * cos + box[SIN] * sin)
+        turn_sin = jnp.abs(box[SIN] * cos - box[COS] * sin)
+        ahead = jnp.abs(box[X] * cos + (box[Y] * sin - (x * cos + y * sin)))
+        left = jnp.abs(box[Y] * cos - (box[X] * sin + (y * cos - x * sin)))
+        found |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
+            left < width + turn_sin * deep + turn_cos * wide
+        )
+    return found
+
+
+def _rectangles(
+    nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any, count: int
+) -> tuple[Float[Array, "R Q"], ...]:
+    """Rectangles around stretches of paths: x, y, cosine, sine, half the length, half the width."""
+    long = (nodes.shape[1] - 1) // count
+    # All points but the last, by stretches; the end of each is (chord, 0) in its own frame.
+    x, y = (nodes[:, :-1, axis].reshape(len(nodes), count, long) for axis in (X, Y))
+    rest_x, rest_y = x - x[..., :1], y - y[..., :1]
+    chord_x, chord_y = nodes[:, long::long, X] - x[..., 0], nodes[:, long::long, Y] - y[..., 0]
+    chord = jnp.sqrt(jnp.maximum(chord_x * chord_x + chord_y * chord_y, 1e-6))
+    # Beyond its end a path is one point; there any direction will do.
+    cos, sin = jnp.where(chord > 1e-2, chord_x / chord, 1.0), jnp.where(chord > 1e-2, chord_y / chord, 0.0)
+    ahead = rest_x * cos[..., None] + rest_y * sin[..., None]
+    left = rest_y * cos[..., None] - rest_x * sin[..., None]
+    number = jnp.arange(count)
+    near = ahead.min(axis=-1) - half - jnp.where(number == 0, behind, 0.0)
+    far = jnp.maximum(ahead.max(axis=-1), chord) + half + jnp.where(number == count - 1, beyond, 0.0)
+    right, left = left.min(axis=-1) - half, left.max(axis=-1) + half
+    on, aside = (near + far) / 2, (right + left) / 2
+    centre_x, centre_y = x[..., 0] + on * cos - aside * sin, y[..., 0] + on * sin + aside * cos
+    # Once, not for every box.
+    return jax.lax.optimization_barrier((centre_x, centre_y, cos, sin, (far - near) / 2, (left - right) / 2))

@@ -1,0 +1,102 @@
+"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded.
+
+Others: ``simulator.traffic.reactive`` (``idm``) and ``simulator.traffic.override``; ``simulator.traffic.catalogue``
+knows them by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_Z, WORD, ScenarioBank
+from drivax.simulator.types import HISTORY, Frame, Scene
+
+
+@dataclass(frozen=True)
+class LogTraffic:
+    """The others replay the recording and do not react."""
+
+    name: str = "log"
+
+    def start(self, bank: ScenarioBank, index: Any, step: Any) -> tuple[()]:
+        """Nothing: the bank and the step say it all."""
+        return ()
+
+    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> tuple[()]:
+        """Nothing."""
+        return ()
+
+    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+        """The logged rows ``back`` steps ago; steps before the recording repeat its first one."""
+        return bank.agents[scene.index, jnp.clip(scene.step - back, 0, bank.steps - 1)]
+
+
+def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "16 4"]:
+    """The last 16 logged motions of a slot up to ``step``.
+
+    Where the log does not reach back (before its start, or before the agent appeared) the motion is extended
+    backwards at the velocity of the earliest known step.
+    """
+    at = step - jnp.arange(HISTORY - 1, -1, -1)
+    rows = bank.agents[index, jnp.clip(at, 0, bank.steps - 1), slot]
+    known = (rows[:, AGENT_VALID] > 0) & (at >= 0)
+    # The earliest row of the unbroken stretch that ends now.
+    unbroken = jnp.flip(jnp.cumprod(jnp.flip(known.astype(jnp.int32)))) > 0
+    first = jnp.minimum(HISTORY - jnp.sum(unbroken), HISTORY - 1)
+    base = rows[first]
+    missing = (first - jnp.arange(HISTORY))[:, None] * 0.1
+    heading = jnp.arctan2(rows[:, AGENT_SIN], rows[:, AGENT_COS])
+    speed = jnp.sum(rows[:, 5:7] * rows[:, 3:5], axis=-1)
+    own = jnp.stack([rows[:, 0], rows[:, 1], heading, jnp.maximum(speed, 0.0)], axis=-1)
+    extended = own[first] - missing * jnp.stack([base[5], base[6], jnp.zeros(()), jnp.zeros(())])
+    return jnp.where(unbroken[:, None], own, extended)
+
+
+def frame_of(
+    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: Scene, back: int
+) -> Frame:
+    """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
+
+    Args:
+        bank: The scenarios.
+        index: Row of the bank.
+        step: The present step; the frame is that of ``step - back``.
+        agents: Rows of the moving slots, from the traffic model.
+        cast: Scenes of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are nobody's.
+        back: How many steps ago, 0 to 15; reactive traffic remembers 9.
+    """
+    driven = cast.history[:, HISTORY - 1 - back]
+    cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
+    one = jnp.ones_like(cos)
+    # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
+    rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
+    rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
+    # Before the recording nobody else was seen.
+    agents = agents.at[:, AGENT_VALID].mul(step >= back)
+    z = agents[:, AGENT_Z].at[cast.slot].set(cast.z, mode="drop")
+    agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
+    box = bank.agent_box[index]
+    at = jnp.clip(step - back, 0, bank.steps - 1)
+    bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
+    there = (bit & 1 > 0) & (step >= back)
+    parked, more = bank.parked[index], len(box) - len(agents)
+    z = jnp.where(there, parked[:, AGENT_Z], jnp.pad(z, (0, more)))
+    agents = jnp.where(there[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
+    return Frame(
+        box=jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1),
+        velocity=agents[:, 5:7],
+        z=z,
+        valid=agents[:, 7] > 0,
+        kind=box[:, 3].astype(jnp.int32),
+        lights=jnp.where(step >= back, bank.light_state[index, at], -1),
+    )
+
+
+def alone(scene: Scene) -> Scene:
+    """The cast of a scenario with one driven agent."""
+    return jax.tree.map(lambda leaf: leaf[None], scene)

@@ -1,0 +1,161 @@
+"""Agents that do what they are told (``override``): given trajectories, or given actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from drivax.errors import UsageError
+from drivax.scenario.bank.queries import around_lanes
+from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.record import record
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.traffic.log import LogTraffic, logged_history
+from drivax.simulator.types import Scene, Traffic
+
+#: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
+Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"]]
+
+
+@record
+class Given:
+    """What K agents of every scenario do, step by step; part of the bank.
+
+    Attributes:
+        slot: Their slots, -1 for nobody.
+        motion: x, y, heading, speed.
+        z: Height of the box centre, m.
+        valid: Whether they are there.
+    """
+
+    slot: Int[Array, "N K"]
+    motion: Float[Array, "N T K 4"]
+    z: Float[Array, "N T K"]
+    valid: Bool[Array, "N T K"]
+
+
+@dataclass(frozen=True)
+class OverrideTraffic:
+    """The agents of ``bank.given`` do what they are told, everyone else behaves as in ``base``.
+
+    In reactive traffic the others see and avoid them.
+    """
+
+    base: Traffic = field(default_factory=LogTraffic)
+
+    @property
+    def name(self) -> str:
+        """As printed in tables: ``override``, or ``override+idm``."""
+        return "override" if self.base.name == "log" else f"override+{self.base.name}"
+
+    def prepare(self, bank: ScenarioBank) -> ScenarioBank:
+        """The bank with what ``base`` needs."""
+        prepare = getattr(self.base, "prepare", None)
+        return bank if prepare is None else prepare(bank)
+
+    def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
+        """State of ``base``; the bank says the rest.
+
+        Raises:
+            UsageError: If nothing is given in the bank.
+        """
+        if bank.given is None:
+            raise UsageError(
+                "the bank does not say what overridden agents do", cure="use override.with_given first"
+            )
+        return self.base.start(bank, index, step)
+
+    def advance(self, bank: ScenarioBank, scene: Scene, frame: Any) -> Any:
+        """State of ``base`` one step later."""
+        return self.base.advance(bank, scene, frame)
+
+    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+        """Rows of ``base``, with those of the overridden agents as given."""
+        rows, given = self.base.agents(bank, scene, back), bank.given
+        step = jnp.clip(scene.step - back, 0, bank.steps - 1)
+        motion, valid = given.motion[scene.index, step], given.valid[scene.index, step]
+        cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
+        parts = [motion[:, 0], motion[:, 1], given.z[scene.index, step], cos, sin]
+        parts += [motion[:, 3] * cos, motion[:, 3] * sin, valid.astype(cos.dtype)]
+        slot = given.slot[scene.index]
+        slot = jnp.where(slot >= 0, slot, rows.shape[0])
+        return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
+
+
+def with_given(
+    bank: ScenarioBank,
+    slots: Int[Array, "N K"],
+    motion: Float[Array, "N T K 4"],
+    valid: Bool[Array, "N T K"] | None = None,
+) -> ScenarioBank:
+    """The bank with given trajectories; heights are those of the nearest lane, from the logged one on.
+
+    Differentiable with respect to ``motion``.
+
+    Args:
+        bank: The scenarios.
+        slots: Moving agents of each scenario, -1 for nobody.
+        motion: x, y (m), heading (rad), speed (m/s) at every step of the log.
+        valid: Whether they are there; always by default.
+    """
+    valid = jnp.ones(motion.shape[:3], bool) if valid is None else valid
+    slots = jnp.asarray(slots, jnp.int32)
+
+    def heights(index: Array, slot: Array, line: Float[Array, "T 4"]) -> Float[Array, " T"]:
+        at = jnp.maximum(slot, 0)
+        seen = jnp.argmax(bank.agents[index, :, at, AGENT_VALID] > 0)
+        half = bank.agent_box[index, at, 2] / 2
+
+        def climb(ground: Array, pose: Array) -> tuple[Array, Array]:
+            heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+            ground = around_lanes(bank, index, pose[:2], heading, pose[None, :2], ground).z
+            return ground, ground + half
+
+        line = jax.lax.stop_gradient(line)
+        return jax.lax.scan(climb, bank.agents[index, seen, at, AGENT_Z] - half, line)[1]
+
+    z = jax.vmap(jax.vmap(heights, (None, 0, 1), 1))(jnp.arange(len(bank)), slots, motion)
+    return replace(bank, given=Given(slots, motion, z, valid))
+
+
+def motions_of_actions(
+    bank: ScenarioBank,
+    slots: Int[Array, "N K"],
+    actions: Float[Array, "N steps K D"],
+    move: Move,
+    begin: int = CURRENT_STEP,
+) -> Float[Array, "N T K 4"]:
+    """Trajectories of agents that carry out given actions from step ``begin`` on; as logged until then.
+
+    Differentiable with respect to ``actions``. Agents that were not seen at step ``begin`` begin where they were seen
+    last, or first.
+
+    Args:
+        bank: The scenarios.
+        slots: Moving agents of each scenario, -1 for nobody.
+        actions: One per step from ``begin`` on; after the last one it is repeated.
+        move: The dynamics under the action space, such as ``Task().motion``.
+        begin: Step of the log at which they take over, at most 15 steps of whose past are kept.
+    """
+    steps = bank.steps - 1 - begin
+    wanted = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
+
+    def drive(index: Array, slot: Array, acts: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
+        at = jnp.maximum(slot, 0)
+        past = logged_history(bank, index, begin, at)
+        size = bank.agent_box[index, at, 0]
+
+        def one(motion: Array, action: Array) -> tuple[Array, Array]:
+            after = move(motion, action, size)
+            return after, after
+
+        driven = jax.lax.scan(one, past[-1], acts[wanted])[1]
+        before = jnp.concatenate([jnp.repeat(past[:1], max(begin + 1 - len(past), 0), 0), past])[-begin - 1 :]
+        return jnp.concatenate([before, driven])
+
+    return jax.vmap(jax.vmap(drive, (None, 0, 1), 1))(jnp.arange(len(bank)), jnp.asarray(slots), actions)

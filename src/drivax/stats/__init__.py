@@ -1,0 +1,1 @@
+"""Intervals, tests, clusters and effect sizes; knows numbers, not driving."""

@@ -1,0 +1,267 @@
+"""How a scenario goes without an event, seen along the way that ego drives: where things are staged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
+from drivax.simulator.idm import idm_acceleration
+from drivax.synthetic.roads.curves import STEP_M
+from drivax.synthetic.traffic.roles import Cast, Motion
+
+#: Events begin in this range of steps of the recording, and are over or in full swing at the last one.
+EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
+#: Steps from an event's first one until it can be seen what the actor is about to do, and the time, s.
+NOTICED = 4
+NOTICED_S = NOTICED * DT_S
+#: Ego's way goes on so far beyond the end of its drive, m.
+_BEYOND_M = 160.0
+#: Slower than this ego is no occasion for an event, m/s.
+_SLOWEST_MPS = 4.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """Ego's way: where it went, and on along its path; samples half a metre apart.
+
+    Attributes:
+        xy, heading: The samples.
+        at: Where on the way ego is at each step, m.
+    """
+
+    xy: Float64[np.ndarray, "point 2"]
+    heading: Float64[np.ndarray, " point"]
+    at: Float64[np.ndarray, " time"]
+
+    @property
+    def length_m(self) -> float:
+        """Length, m."""
+        return STEP_M * (len(self.xy) - 1)
+
+    def pose(
+        self, station: Float64[np.ndarray, "*n"], left_m: Float64[np.ndarray, "*n"] | float = 0.0
+    ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
+        """Positions this far to the left of stations, and the way's heading there."""
+        place = np.clip(station / STEP_M, 0.0, len(self.xy) - 1.001)
+        index = place.astype(int)
+        share = place - index
+        heading = self.heading[index] + share * (self.heading[index + 1] - self.heading[index])
+        xy = self.xy[index] + share[..., None] * (self.xy[index + 1] - self.xy[index])
+        normal = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+        return xy + np.asarray(left_m)[..., None] * normal, heading
+
+    def place(self, station: float) -> tuple[Float64[np.ndarray, " 2"], float]:
+        """Position and heading at one station."""
+        xy, heading = self.pose(np.array([station]))
+        return xy[0], float(heading[0])
+
+    def projected(
+        self, xy: Float64[np.ndarray, "n 2"]
+    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Station of the nearest place of the way, and how far to its left points are."""
+        rel = xy[:, None] - self.xy
+        index = np.argmin(np.sum(rel**2, axis=-1), axis=1)
+        rel = rel[np.arange(len(xy)), index]
+        cos, sin = np.cos(self.heading[index]), np.sin(self.heading[index])
+        return STEP_M * index + rel[:, 0] * cos + rel[:, 1] * sin, rel[:, 1] * cos - rel[:, 0] * sin
+
+
+def ego_track(motion: Motion) -> Track:
+    """The way of row 0: its trace, then the rest of its path, or straight on where the path ends."""
+    xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    moved = np.concatenate([[True], np.diff(arc) > 1e-3])
+    # Rounding must not let a standing ego creep.
+    points, turned, along = xy[moved], heading[moved], arc[moved]
+    if motion.paths:
+        curve = motion.paths[0].curve
+        place = int(np.argmin(np.hypot(*(curve.xy - xy[-1]).T))) + 2
+        rest, turn = curve.xy[place:], curve.heading[place:]
+        gaps = np.hypot(*np.diff(np.concatenate([points[-1:], rest]), axis=0).T)
+        points = np.concatenate([points, rest])
+        shift = 2 * math.pi * np.round((turned[-1] - turn[:1]) / (2 * math.pi))
+        turned = np.concatenate([turned, turn + shift])
+        along = np.concatenate([along, along[-1] + np.cumsum(gaps)])
+    out = np.array([np.cos(turned[-1]), np.sin(turned[-1])])
+    points = np.concatenate([points, [points[-1] + 300.0 * out]])
+    turned, along = np.append(turned, turned[-1]), np.append(along, along[-1] + 300.0)
+    station = np.arange(0.0, arc[-1] + _BEYOND_M, STEP_M)
+    sampled = np.stack([np.interp(station, along, points[:, k]) for k in (0, 1)], axis=-1)
+    return Track(sampled, np.interp(station, along, turned), arc)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The scenario without the event.
+
+    Attributes:
+        cast: Who is in it.
+        motion: How they go; row 0 is ego.
+        first_step: Step of ``motion`` at which the recording begins.
+    """
+
+    cast: Cast
+    motion: Motion
+    first_step: int
+
+    @cached_property
+    def track(self) -> Track:
+        """Ego's way."""
+        return ego_track(self.motion)
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps."""
+        return self.motion.xy.shape[1]
+
+    @property
+    def last_step(self) -> int:
+        """Last step of the recording."""
+        return min(self.first_step + STEPS, self.steps) - 1
+
+    @property
+    def times_s(self) -> Float64[np.ndarray, " time"]:
+        """Times on the clock of the lights: the recording begins at 0."""
+        return (np.arange(self.steps) - self.first_step) * DT_S
+
+    @property
+    def ego_size_m(self) -> Float64[np.ndarray, " 3"]:
+        """Ego's length, width, height."""
+        return self.motion.size_m[0]
+
+    def drawn_step(self, rng: np.random.Generator) -> int | None:
+        """A step at which an event may begin and ego is not slow, or None."""
+        steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)
+        steps = steps[self.motion.speed[0, steps] > _SLOWEST_MPS]
+        return int(rng.choice(steps)) if len(steps) else None
+
+    @cached_property
+    def _lane_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Every second sample of all lanes: position, heading, lane."""
+        lanes = self.cast.network.lanes
+        return (
+            np.concatenate([lane.curve.xy[::2] for lane in lanes]),
+            np.concatenate([lane.curve.heading[::2] for lane in lanes]),
+            np.concatenate([np.full(len(lane.curve.xy[::2]), i) for i, lane in enumerate(lanes)]),
+        )
+
+    def lane_at(self, station: float) -> int:
+        """The lane on which ego is at a station (-1: none), the route's where several coincide."""
+        xy, heading = self.track.place(station)
+        points, turned, lane = self._lane_points
+        gap = np.hypot(*(points - xy).T)
+        near = (gap < 2.0) & (np.cos(turned - heading) > 0.8)
+        if not near.any():
+            return -1
+        on_route = near & np.isin(lane, self.cast.route)
+        chosen = on_route if on_route.any() else near
+        return int(lane[chosen][np.argmin(gap[chosen])])
+
+    def neighbour(self, station: float, side: int) -> int:
+        """The lane of the same direction beside ego's at a station, 1 left, -1 right; -1 where there is none."""
+        lane = self.lane_at(station)
+        if lane < 0:
+            return -1
+        here = self.cast.network.lanes[lane]
+        return here.left if side > 0 else here.right
+
+    @cached_property
+    def lane_ends(self) -> list[tuple[float, int]]:
+        """Where lanes beside ego's way end or lead off the road: stations, and on which side they are."""
+        result = []
+        for lane in self.cast.network.lanes:
+            if lane.ends or lane.exit_only:
+                (station,), (aside,) = self.track.projected(lane.curve.xy[-1:])
+                if 2.0 < abs(aside) < 5.5 and station > 0:
+                    result.append((float(station), 1 if aside > 0 else -1))
+        return result
+
+    def edge_m(self, station: float, side: int) -> float:
+        """How far the nearest road edge is from ego's way at a station, to the left (1) or right (-1), m."""
+        origin, heading = self.track.place(station)
+        out = side * np.array([-np.sin(heading), np.cos(heading)])
+        best = math.inf
+        for edge in self.cast.network.edges:
+            a = edge.xy - origin
+            b = np.roll(a, -1, axis=0)
+            # In the frame (out, along): where the side crosses the ray.
+            ay, by = a @ [-out[1], out[0]], b @ [-out[1], out[0]]
+            across = (ay > 0) != (by > 0)
+            if across.any():
+                ax, bx = (a @ out)[across], (b @ out)[across]
+                at = ax + (bx - ax) * ay[across] / (ay[across] - by[across])
+                best = min(best, float(np.min(at[at > 0.0], initial=math.inf)))
+        return best
+
+    def plain_road(self, station: float) -> bool:
+        """Whether there is an ordinary lane, no junction, under ego at a station, and no crosswalk near."""
+        lane = self.lane_at(station)
+        network = self.cast.network
+        if lane < 0 or network.lanes[lane].connector:
+            return False
+        xy, _ = self.track.place(station)
+        return all(np.hypot(*(c.axis.mean(axis=0) - xy)) > 14.0 for c in network.crossings)
+
+    @cached_property
+    def connectors(self) -> list[int]:
+        """The ways across junctions that ego takes during the recording, or would take right after it."""
+        begin, end = self.track.at[self.first_step + EARLIEST], self.track.at[self.last_step] + 30.0
+        found = {self.lane_at(station) for station in np.arange(begin, end, 3.0).tolist()}
+        return sorted(i for i in found if i >= 0 and self.cast.network.lanes[i].connector)
+
+    def meets_junction(self, low_m: float, high_m: float) -> bool:
+        """Whether ego's way has a light, a sign or a crossing way between two stations, where actors are deaf."""
+        lanes = self.cast.network.lanes
+        found = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
+        return any(lanes[lane].connector for lane in found if lane >= 0)
+
+    def on_way(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
+        """For all vehicles their station at a step, and whether they drive on ego's way (ego itself does not count)."""
+        count = self.motion.vehicles
+        station, aside = self.track.projected(self.motion.xy[:count, step])
+        _, heading = self.track.pose(station)
+        same = np.cos(self.motion.heading[:count, step] - heading) > 0.8
+        on = self.motion.valid[:count, step] & (np.abs(aside) < 1.0) & same
+        on[0] = False
+        return station, on
+
+    def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> Scene:
+        """The scenario with somebody put ahead of ego, rear bumper at these stations, who is there since a step.
+
+        Ego drives as it would without, or slower by the common law of following.
+        """
+        drivers, at, speed = self.cast.drivers.idm, self.track.at, self.motion.speed[0]
+        law = replace(
+            drivers,
+            headway_s=drivers.headway_s[:1],
+            acceleration_mps2=drivers.acceleration_mps2[:1],
+            comfortable_braking_mps2=drivers.comfortable_braking_mps2[:1],
+        )
+        ahead = np.gradient(rear_m, DT_S)
+        where, how = at.copy(), speed.copy()
+        for t in range(since, self.steps - 1):
+            v = how[t : t + 1]
+            gap = rear_m[t : t + 1] - where[t] - self.ego_size_m[0] / 2
+            a = idm_acceleration(v, np.maximum(speed.max(keepdims=True), 1.0), gap, ahead[t : t + 1], law)
+            after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
+            moved = (float(v[0]) + after) / 2 * DT_S
+            # Bends, lights and others still hold it where they did.
+            where[t + 1] = min(where[t] + moved, at[t + 1])
+            how[t + 1] = min(after, (where[t + 1] - where[t]) / DT_S if where[t + 1] == at[t + 1] else after)
+        xy, heading = self.track.pose(where)
+        motion = self.motion
+        changed = replace(
+            motion,
+            xy=np.concatenate([xy[None], motion.xy[1:]]),
+            heading=np.concatenate([heading[None], motion.heading[1:]]),
+            speed=np.concatenate([how[None], motion.speed[1:]]),
+        )
+        result = replace(self, motion=changed)
+        # The way is the same; only where ego is on it is not.
+        result.__dict__["track"] = replace(self.track, at=where)
+        return result

@@ -1,0 +1,1 @@
+"""The expert that drives ego: plan, reservations, smoothing and checks."""

@@ -1,0 +1,202 @@
+"""Which places of ego's way are taken at which time: by other road users, and by lights and rules at stop lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from drivax.geometry.boxes import overlap
+from drivax.synthetic.expert.trajectories import SPACING_M, Way, way_boxes
+from drivax.synthetic.roads.network import Control, RoadNetwork
+from drivax.synthetic.roads.signals import Colour
+from drivax.synthetic.traffic.paths import LaneSpan, Path
+
+#: Kept free around ego: at its bumpers and at its sides, m; what is checked in the end is 0.1 m.
+HARD_M = (0.35, 0.2)
+#: Liked free around ego, m; and where somebody is on foot or on a bicycle.
+NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
+#: Every so many samples of the way are looked at first.
+_STRIDE = 4
+#: Nobody likes to pass a light that turns red sooner than this, s.
+_LATE_YELLOW_S = 1.0
+#: Where ego has to give way, nobody who goes first may be nearer than this, s.
+_YIELD_S = 2.0
+#: Where ego rests before a line, m from it.
+_SHORT_M = 0.5
+
+
+@dataclass(frozen=True)
+class Meetings:
+    """Where ego's box on its way would meet other users: one entry for each (user, step, sample of the way).
+
+    Attributes:
+        hard: True where they would touch, else they would only be close.
+    """
+
+    user: Int64[np.ndarray, " meeting"]
+    step: Int64[np.ndarray, " meeting"]
+    point: Int64[np.ndarray, " meeting"]
+    hard: Bool[np.ndarray, " meeting"]
+
+    def only(self, keep: Bool[np.ndarray, " meeting"]) -> Meetings:
+        """Some of the meetings."""
+        return Meetings(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A line that ego's centre may not pass for a while.
+
+    Attributes:
+        base_m: Where it is, m ahead of ego along the path.
+        closed: When it must not be passed.
+        late: When it should not be passed.
+    """
+
+    base_m: float
+    closed: Bool[np.ndarray, " time"]
+    late: Bool[np.ndarray, " time"]
+
+
+def meetings(
+    way: Way,
+    size_m: Float64[np.ndarray, " 3"],
+    others: Float64[np.ndarray, "user time 6"],
+    valid: Bool[np.ndarray, "user time"],
+    people: Bool[np.ndarray, " user"],
+) -> Meetings:
+    """All meetings of ego's box along a way with the boxes of others.
+
+    Args:
+        way: Ego's way.
+        size_m: Ego's length, width, height.
+        others: Boxes of the others.
+        valid: When they exist.
+        people: Who is on foot or on a bicycle.
+    """
+    liked = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
+    still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
+    ego = way_boxes(way, size_m)
+    moving = _met(ego, others, valid & ~still[:, None], liked)
+    # Who never moves is looked at once.
+    once = _met(ego, others[:, :1], still[:, None], liked)
+    steps = others.shape[1]
+    return Meetings(
+        user=np.concatenate([moving.user, np.repeat(once.user, steps)]),
+        step=np.concatenate([moving.step, np.tile(np.arange(steps), len(once.step))]),
+        point=np.concatenate([moving.point, np.repeat(once.point, steps)]),
+        hard=np.concatenate([moving.hard, np.repeat(once.hard, steps)]),
+    )
+
+
+def _met(
+    ego: Float64[np.ndarray, "point 6"],
+    others: Float64[np.ndarray, "user time 6"],
+    valid: Bool[np.ndarray, "user time"],
+    liked_m: Float64[np.ndarray, "user 2"],
+) -> Meetings:
+    """Meetings of boxes: first of circles around them at every fourth sample, then exactly."""
+    reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + liked_m).T)
+    reach += _STRIDE * SPACING_M / 2
+    user, step = np.nonzero(valid & _around(others, ego, reach))
+    coarse = ego[::_STRIDE, :2]
+    at = others[user, step, :2]
+    gap = (at[:, None, 0] - coarse[:, 0]) ** 2 + (at[:, None, 1] - coarse[:, 1]) ** 2
+    row, block = np.nonzero(gap < reach[user, None] ** 2)
+    point = (block[:, None] * _STRIDE + np.arange(_STRIDE) - _STRIDE // 2).ravel()
+    row = np.repeat(row, _STRIDE)
+    inside = (point >= 0) & (point < len(ego))
+    row, point = row[inside], point[inside]
+    other, mine = others[user[row], step[row]], ego[point]
+    close = overlap(_wider(mine, liked_m[user[row]]), other)
+    row, point, other, mine = row[close], point[close], other[close], mine[close]
+    hard = overlap(_wider(mine, np.array(HARD_M)), other)
+    return Meetings(user[row], step[row], point, hard)
+
+
+def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
+    """Boxes with this much more at each end and at each side."""
+    size = box[:, 4:] + 2 * by_m
+    return np.concatenate([box[:, :4], size], axis=1)
+
+
+def _around(
+    others: Float64[np.ndarray, "user time 6"],
+    ego: Float64[np.ndarray, "point 6"],
+    reach: Float64[np.ndarray, " user"],
+) -> Bool[np.ndarray, "user time"]:
+    """Who is near the rectangle around the way at all."""
+    low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
+    outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)
+    return outside < reach[:, None]
+
+
+def walls(
+    network: RoadNetwork,
+    path: Path,
+    ego_m: tuple[float, float],
+    times_s: Float64[np.ndarray, " time"],
+    passed: Float64[np.ndarray, " time"],
+    arrivals: dict[int, Bool[np.ndarray, " time"]],
+) -> list[Wall]:
+    """The stop lines ahead.
+
+    Args:
+        network: The roads.
+        path: Ego's path.
+        ego_m: Where on it ego's centre is now, and half of ego's length.
+        times_s: Times, on the clock of the lights.
+        passed: Where on the path ego's centre was at these times in the last run: it tells when its turn came.
+        arrivals: For connectors, when somebody who goes first is on them or about to be.
+    """
+    from_m, half_m = ego_m
+    result = []
+    colour, to_red = None, None
+    if network.signals is not None:
+        colour, to_red = network.signals.colours(times_s, len(network.lanes))
+    for span in path.spans:
+        lane = network.lanes[span.lane]
+        line = span.begin_m - half_m
+        if not lane.connector or line <= from_m:
+            continue
+        closed = np.zeros(len(times_s), bool)
+        late = closed.copy()
+        if colour is not None and to_red is not None:
+            closed |= colour[:, span.lane] == Colour.RED
+            late |= (colour[:, span.lane] == Colour.YELLOW) & (to_red[:, span.lane] < _LATE_YELLOW_S)
+        if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
+            closed |= passed <= line
+        for first in lane.yields_to:
+            late |= arrivals.get(first, np.zeros(len(times_s), bool))
+        if closed.any() or late.any():
+            result.append(Wall(line - _SHORT_M - from_m, closed, late))
+    return result
+
+
+def arrivals(
+    network: RoadNetwork,
+    paths: list[Path],
+    distance_m: Float64[np.ndarray, "vehicle time"],
+    valid: Bool[np.ndarray, "vehicle time"],
+    half_m: Float64[np.ndarray, " vehicle"],
+) -> dict[int, Bool[np.ndarray, " time"]]:
+    """For each connector to which another yields: when a vehicle (ego left out) is on it or nearly so."""
+    watched = {first for lane in network.lanes for first in lane.yields_to}
+    result: dict[int, Bool[np.ndarray, " time"]] = {}
+    for vehicle in range(1, len(paths)):
+        for span in paths[vehicle].spans:
+            if span.lane in watched:
+                here = _on(network, span, distance_m[vehicle], half_m[vehicle]) & valid[vehicle]
+                early = round(_YIELD_S / 0.1)
+                coming = np.convolve(here[::-1], np.ones(early + 1), mode="full")[: len(here)][::-1] > 0
+                result[span.lane] = result.get(span.lane, np.zeros(len(here), bool)) | coming
+    return result
+
+
+def _on(
+    network: RoadNetwork, span: LaneSpan, at_m: Float64[np.ndarray, " time"], half_m: float
+) -> Bool[np.ndarray, " time"]:
+    length = span.scale * network.lanes[span.lane].length_m
+    return (at_m + half_m > span.begin_m) & (at_m - half_m < span.begin_m + length)

@@ -1,0 +1,299 @@
+"""Why a scenario must not be shown: ego is no expert in it, or somebody does what nobody does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from drivax.geometry.boxes import corners, overlap
+from drivax.scenario.schema import DT_S, AgentKind
+from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
+from drivax.synthetic.roads.signals import Colour
+from drivax.synthetic.traffic.paths import Path
+from drivax.synthetic.traffic.roles import Cast, Motion, Staging
+
+#: Ego is tested for overlap with so much around it, m: its replay in float32, beside others who are recorded with
+#: noise, must not touch either.
+EGO_SKIN_M = 0.1
+#: An ego that moves less than this shows nothing, m.
+_LEAST_M = 10.0
+#: A car stands below this, within so many metres before a stop line, in the last seconds before it passes.
+_STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
+#: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.
+_WRONG_WAY_M = 2.0
+#: Further than this from the lanes of its way ego is beside it, m; the metric says 2.
+_BESIDE_M = 1.9
+#: Lanes of both directions that are as near as this, to each other, tell nothing, m.
+_DOUBT_M = 0.5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why a scenario must not be shown.
+
+    Attributes:
+        cause: A word for it, or empty.
+        users: The rows of the motion that ego touches, if that is the cause.
+        step: When it first does.
+    """
+
+    cause: str = ""
+    users: tuple[int, ...] = ()
+    step: int = 0
+
+
+def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
+    """Everybody's boxes in the order of :mod:`drivax.geometry.boxes`."""
+    size = np.broadcast_to(motion.size_m[:, None, :2], (*motion.heading.shape, 2))
+    heading = motion.heading[..., None]
+    return np.concatenate([motion.xy, np.cos(heading), np.sin(heading), size], axis=-1)
+
+
+def fault(
+    cast: Cast,
+    motion: Motion,
+    times_s: Float64[np.ndarray, " time"],
+    first_step: int,
+    staging: Staging,
+    hardest_mps2: float,
+) -> Fault:
+    """Judges a motion from a step on.
+
+    Args:
+        cast: Everybody.
+        motion: What they did.
+        times_s: Times of its steps, on the clock of the lights.
+        first_step: Where the recording begins.
+        staging: What is staged: it excuses who acts in it.
+        hardest_mps2: Ego must not brake harder than this.
+    """
+    now = slice(first_step, None)
+    speed = motion.speed[0, now]
+    if np.sum(np.abs(speed)) * DT_S < _LEAST_M:
+        return Fault("ego_hardly_moves")
+    if not motion.valid[0, now].all():
+        return Fault("ego_leaves_map")
+    box = user_boxes(motion)[:, now]
+    pairs = touching(box, motion.valid[:, now], _tested(motion))
+    if (pairs[0] < box.shape[1]).any():
+        users = np.flatnonzero(pairs[0] < box.shape[1])
+        return Fault("ego_collides", tuple(users.tolist()), first_step + int(pairs[0].min()))
+    if np.diff(speed).min() < -(hardest_mps2 + 0.02) * DT_S:
+        return Fault("ego_brakes_hard")
+    if leaves_road(cast.network, box[0]):
+        return Fault("ego_leaves_road")
+    cause = _rules_broken(cast, motion, times_s, first_step)
+    if cause:
+        return Fault(cause)
+    excused = bool(cast.parked) or eventful(staging)
+    if not excused and goes_against_traffic(cast.network, box[0, :, :2], motion.heading[0, now]):
+        return Fault("ego_wrong_way")
+    return Fault("others_collide" if (pairs < box.shape[1]).any() else "")
+
+
+def eventful(staging: Staging) -> bool:
+    """Whether anything is staged."""
+    return any(vars(staging).values())
+
+
+def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
+    """Which pairs must not touch: people pass each other as they like, and who never moves was put there."""
+    person = motion.kind == AgentKind.PEDESTRIAN
+    moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
+    return (moves[:, None] | moves) & ~(person[:, None] & person)
+
+
+def touching(
+    box: Float64[np.ndarray, "user time 6"],
+    valid: Bool[np.ndarray, "user time"],
+    tested: Bool[np.ndarray, "user user"],
+) -> Int64[np.ndarray, "user user"]:
+    """When pairs of users first overlap; row 0 (ego) is tested with a skin of 10 cm around it.
+
+    Args:
+        box: Boxes.
+        valid: When they exist.
+        tested: The pairs to look at.
+
+    Returns:
+        The step, or the number of steps for pairs that never do.
+    """
+    box = box.copy()
+    box[0, :, 4:] += 2 * EGO_SKIN_M
+    reach = np.hypot(box[:, 0, 4], box[:, 0, 5]) / 2
+    # Who never comes near: the rectangles that hold the centres, the reaches added, do not meet.
+    at = np.where(valid[..., None], box[..., :2], np.nan)
+    with np.errstate(all="ignore"):
+        low = np.where(valid[..., None], at, np.inf).min(axis=1) - reach[:, None]
+        high = np.where(valid[..., None], at, -np.inf).max(axis=1) + reach[:, None]
+    meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=-1)
+    one, other = np.nonzero(np.triu(tested & meet, 1))
+    gap = np.sum((box[one, :, :2] - box[other, :, :2]) ** 2, axis=-1)
+    near = (gap < ((reach[one] + reach[other]) ** 2)[:, None]) & valid[one] & valid[other]
+    pair, time = np.nonzero(near)
+    hit = overlap(box[one[pair], time], box[other[pair], time])
+    result = np.full((len(box), len(box)), box.shape[1])
+    np.minimum.at(result, (one[pair[hit]], other[pair[hit]]), time[hit])
+    return np.minimum(result, result.T)
+
+
+def inside(
+    points: Float64[np.ndarray, "point 2"], rings: tuple[Float64[np.ndarray, "_ 2"], ...]
+) -> Bool[np.ndarray, " point"]:
+    """Whether points lie in the area that closed rings bound, islands left out (even-odd rule, exact)."""
+    crossings = np.zeros(len(points), int)
+    x, y = points[:, 0, None], points[:, 1, None]
+    for ring in rings:
+        a, b = ring, np.roll(ring, -1, axis=0)
+        near = (np.minimum(a, b) <= points.max(axis=0)) & (np.maximum(a, b) >= points.min(axis=0))
+        # A ray to the right meets only sides at the points' heights that do not end left of them all.
+        keep = near[:, 1] & (np.maximum(a, b)[:, 0] >= points[:, 0].min())
+        (ax, ay), (bx, by) = a[keep].T, b[keep].T
+        across = (ay > y) != (by > y)
+        side = (bx - ax) * (y - ay) - (x - ax) * (by - ay)
+        crossings += np.sum(across & ((side > 0) == (by > ay)), axis=1)
+    return crossings % 2 == 1
+
+
+def leaves_road(network: RoadNetwork, box: Float64[np.ndarray, "time 6"]) -> bool:
+    """Whether a corner of the box is ever outside the edges."""
+    moved = np.append(True, np.abs(np.diff(box[:, :4], axis=0)).max(axis=1) > 0.0)
+    points = corners(box[moved]).reshape(-1, 2)
+    return not bool(inside(points, tuple(edge.xy for edge in network.edges)).all())
+
+
+def passes(
+    lane: Lane, front: Float64[np.ndarray, "time 2"], heading: Float64[np.ndarray, " time"]
+) -> Bool[np.ndarray, " step"]:
+    """During which steps a front bumper passes the line where a lane begins, in the lane's direction.
+
+    Args:
+        lane: The lane; its line is as wide as it is and square to it.
+        front: Middle of the front bumper.
+        heading: Heading.
+    """
+    begin = lane.curve.start
+    c, s = math.cos(begin.heading), math.sin(begin.heading)
+    dx, dy = front[:, 0] - begin.x, front[:, 1] - begin.y
+    ahead, left = dx * c + dy * s, dy * c - dx * s
+    within = (np.abs(left) < lane.width_m / 2 + 0.3) & (np.cos(heading - begin.heading) > 0.5)
+    return (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & within[1:]
+
+
+def _rules_broken(
+    cast: Cast,
+    motion: Motion,
+    times_s: Float64[np.ndarray, " time"],
+    first_step: int,
+) -> str:
+    """Whether somebody runs a red light, or ego passes a stop sign without standing."""
+    network, now = cast.network, slice(first_step, None)
+    red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
+    if network.signals is not None:
+        red = network.signals.colours(times_s[now], len(network.lanes))[0] == Colour.RED
+    dark = red[:-1] & red[1:]
+    for i, path in enumerate(motion.paths or cast.paths):
+        heading, valid = motion.heading[i, now], motion.valid[i, now]
+        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[i, 0] / 2
+        front = motion.xy[i, now] + ahead
+        for span in path.spans:
+            lane = network.lanes[span.lane]
+            stop = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
+            if not lane.connector or not (stop or dark[:, span.lane].any()):
+                continue
+            passed = passes(lane, front, heading) & valid[:-1] & valid[1:]
+            if np.any(passed & dark[:, span.lane]):
+                return "ego_runs_red" if i == 0 else "other_runs_red"
+            if stop and not _stood(lane, motion, first_step, front, passed):
+                return "ego_runs_stop_sign"
+        if i == 0 and _passes_beside(network, path, motion.xy[0, now], front, heading, dark):
+            return "ego_runs_red"
+    return ""
+
+
+def _passes_beside(
+    network: RoadNetwork,
+    path: Path,
+    xy: Float64[np.ndarray, "time 2"],
+    front: Float64[np.ndarray, "time 2"],
+    heading: Float64[np.ndarray, " time"],
+    dark: Bool[np.ndarray, "step lane"],
+) -> bool:
+    """Whether ego goes around something over the line of a lane that is not its own and has red.
+
+    As the metric has it: beside the way the lights of other lanes count, too.
+    """
+    own = {span.lane for span in path.spans}
+    others = [k for k in np.flatnonzero(dark.any(axis=0)) if network.lanes[k].connector and k not in own]
+    passed = [passes(network.lanes[k], front, heading) & dark[:, k] for k in others]
+    if not np.any(passed):
+        return False
+    way = np.concatenate([network.lanes[k].curve.xy for k in own])
+    off = np.hypot(*(xy[:, None] - way).transpose(2, 0, 1)).min(axis=1) > _BESIDE_M
+    return bool((np.any(passed, axis=0) & off[1:]).any())
+
+
+def last_stop(cast: Cast, motion: Motion, first_step: int) -> int:
+    """When ego last stands before a stop sign that it then passes; the first step where it never does so."""
+    heading = motion.heading[0]
+    front = motion.xy[0] + np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[0, 0] / 2
+    result = first_step
+    for span in (motion.paths or cast.paths)[0].spans:
+        lane = cast.network.lanes[span.lane]
+        if lane.connector and lane.control in (Control.STOP, Control.ALL_WAY_STOP):
+            for step in np.flatnonzero(passes(lane, front, heading)):
+                standing = np.flatnonzero(motion.speed[0, first_step : step + 1] < _STANDING_MPS)
+                result = max([result, *(first_step + standing[-1:]).tolist()])
+    return result
+
+
+def _stood(
+    lane: Lane,
+    motion: Motion,
+    first_step: int,
+    front: Float64[np.ndarray, "time 2"],
+    passed: Bool[np.ndarray, " step"],
+) -> bool:
+    """Whether ego stood close before a line in the seconds before it passed (which it may never do)."""
+    for step in np.flatnonzero(passed):
+        # Ego may have stood before the recording begins: the motion knows.
+        begin = max(0, first_step + int(step) - round(_STOOD_S / DT_S))
+        gap = np.hypot(*(motion.xy[0, begin : first_step + step + 1] - lane.curve.xy[0]).T)
+        close = gap < motion.size_m[0, 0] / 2 + _BEFORE_LINE_M
+        slow = motion.speed[0, begin : first_step + step + 1] < _STANDING_MPS
+        if not np.any(close & slow):
+            return False
+    return True
+
+
+def against_traffic(
+    network: RoadNetwork, xy: Float64[np.ndarray, "place 2"], heading: Float64[np.ndarray, " place"]
+) -> Bool[np.ndarray, " place"]:
+    """Which poses are nearest to the centre of a lane that leads the other way (135 degrees or more apart).
+
+    In junctions lanes cross: another lane that is hardly further away and is not against the heading decides.
+    """
+    at = np.concatenate([lane.curve.xy[::2] for lane in network.lanes])
+    course = np.concatenate([lane.curve.heading[::2] for lane in network.lanes])
+    near = ((at >= xy.min(axis=0) - 6.0) & (at <= xy.max(axis=0) + 6.0)).all(axis=1)
+    at, course = at[near], course[near]
+    if not len(at):
+        return np.zeros(len(xy), bool)
+    gap = np.hypot(xy[:, None, 0] - at[:, 0], xy[:, None, 1] - at[:, 1])
+    against = np.cos(heading[:, None] - course) < math.cos(math.radians(135.0))
+    opposed = np.where(against, gap, np.inf).min(axis=1)
+    return opposed < np.where(against, np.inf, gap).min(axis=1) - _DOUBT_M
+
+
+def goes_against_traffic(
+    network: RoadNetwork, xy: Float64[np.ndarray, "time 2"], heading: Float64[np.ndarray, " time"]
+) -> bool:
+    """Whether more than 2 m are travelled against traffic within any second."""
+    every = 2
+    wrong = against_traffic(network, xy[::every], heading[::every])
+    travelled = np.hypot(*np.diff(xy[::every], axis=0).T) * wrong[1:]
+    window = round(1.0 / (every * DT_S))
+    return bool(np.convolve(travelled, np.ones(window)).max() > _WRONG_WAY_M)

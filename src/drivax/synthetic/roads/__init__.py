@@ -1,0 +1,1 @@
+"""Road networks: curves, lanes, signals and the families that draw them."""

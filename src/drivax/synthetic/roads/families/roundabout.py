@@ -1,0 +1,302 @@
+"""A roundabout with three or four arms and one or two lanes; who comes in yields to who goes round.
+
+Traffic goes round counter-clockwise. With two lanes the left lane of an arm leads to the inner circle and the right
+one to the outer circle; from both one leaves into the lane of the same side. Who leaves from the inner circle crosses
+the outer one, and yields to it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.scenario.schema import RoadKind
+from drivax.synthetic.roads.curves import (
+    STEP_M,
+    Curve,
+    Pose,
+    connected,
+    from_curvature,
+    joined,
+    smooth_step,
+    straight,
+    winding,
+)
+from drivax.synthetic.roads.draft import Draft, ring
+from drivax.synthetic.roads.families.street import CROSSWALK_M
+from drivax.synthetic.roads.network import Control, Crossing, Line, RoadNetwork, Start, conflicting
+from drivax.synthetic.roads.style import GRID, RoadStyle
+
+#: Radius of the fillet by which one enters and leaves, at least, m.
+_FILLET_M = 11.5
+#: The splitter keeps its width for the first of these distances from the yield line and is gone at the second, m.
+_SPLITTER_M = (13.0, 42.0)
+#: From the yield line to the crosswalk's axis: a car's length remains free, m.
+_CROSSING_M = 6.5
+#: Between a kerb and the lane beside it, m.
+_KERB_M = 0.4
+#: What is left of a circle between an entry and the next exit, m: who is on one is clear of the other.
+_ARC_M = 3.3
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The measures that all arms share.
+
+    Attributes:
+        radius_m: Of the circle's lane centres, inner first.
+        join: Angle from an arm to where the lane of that circle joins or leaves it, rad.
+        gap_m: Width between the directions at the yield lines.
+        yield_m: Distance of the yield lines from the centre.
+        circle_m, width_m: Width of lanes in the circle and on the arms.
+    """
+
+    radius_m: tuple[float, ...]
+    join: tuple[float, ...]
+    gap_m: float
+    yield_m: float
+    circle_m: float
+    width_m: float
+    shoulder_m: float
+    limit_mps: float
+
+    def aside_m(self, j: int) -> float:
+        """From an arm's middle line to the centre of its lane ``j`` at the yield line."""
+        return self.gap_m / 2 + (j + 0.5) * self.width_m
+
+    def spread_m(self, middle: Curve) -> Float64[np.ndarray, " point"]:
+        """Half the gap between the directions along an arm."""
+        begin, end = _SPLITTER_M
+        return self.gap_m / 2 * (1.0 - smooth_step((middle.arc_m - begin) / (end - begin)))
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """An arm and its part of the circle: lanes by circle, inner first."""
+
+    heading: float
+    middle: Curve
+    inward: list[int]
+    outward: list[int]
+
+
+@dataclass(frozen=True)
+class Roundabout:
+    """Settings of the family ``roundabout``.
+
+    Attributes:
+        arm_m: Length of every arm beyond its yield line.
+        radius_m: Radius of the outer circle's lane centre with one lane and with two, low and high.
+        two_lane_share: Share of roundabouts with two lanes.
+        three_arm_share: Share of roundabouts with three arms.
+        gap_m: Width between the directions at the yield lines, where the splitter islands are.
+        skew: Largest deviation of an arm from an even division, rad, where there is room for it.
+        limit_mps: Highest limit of the arms.
+        circle_mps: Limit in the circle.
+        marked_share: Share of roundabouts with crosswalks.
+    """
+
+    arm_m: float = 230.0
+    radius_m: tuple[tuple[float, float], tuple[float, float]] = ((13.0, 20.0), (19.0, 25.0))
+    two_lane_share: float = 0.3
+    three_arm_share: float = 0.35
+    gap_m: tuple[float, float] = (2.0, 3.2)
+    skew: float = math.radians(15.0)
+    limit_mps: float = 15.7
+    circle_mps: float = 8.4
+    marked_share: float = 0.85
+    name: str = "roundabout"
+
+    def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
+        """Draws a roundabout; ego may begin on any arm, 12 to 85 m before its yield line."""
+        plan = self._plan(rng, style)
+        draft = Draft()
+        arms = [self._arm(rng, draft, plan, heading) for heading in self._headings(rng, plan)]
+        chains = _go_round(draft, plan, arms, self.circle_mps)
+        _set_priorities(draft)
+        _edges(
+            draft,
+            plan,
+            arms,
+            chains,
+            float(rng.uniform(1.2, 2.0)) if rng.random() < style.walk_share else None,
+        )
+        marked = bool(rng.random() < self.marked_share)
+        for arm in arms:
+            _paint(draft, plan, arm)
+            _cross(draft, plan, arm, marked)
+        starts = [
+            Start(lane, draft.lanes[lane].length_m - 85.0, draft.lanes[lane].length_m - 12.0)
+            for arm in arms
+            for lane in arm.inward
+        ]
+        return draft.network(self.name, tuple(starts))
+
+    def _plan(self, rng: np.random.Generator, style: RoadStyle) -> _Plan:
+        lanes = 2 if rng.random() < self.two_lane_share else 1
+        # Lanes side by side must not count as one another's conflict.
+        width = max(float(rng.uniform(*style.width_m)), 3.15 if lanes == 2 else 0.0)
+        circle, gap = width + float(rng.uniform(0.7, 1.2)), float(rng.uniform(*self.gap_m))
+        outer = float(rng.uniform(*self.radius_m[lanes - 1]))
+        radius = [outer - circle * (lanes - 1 - j) for j in range(lanes)]
+        join, reach = zip(*(_join(r, gap / 2 + (j + 0.5) * width) for j, r in enumerate(radius)), strict=True)
+        limits = [limit for limit in style.limits_mps if limit <= self.limit_mps]
+        return _Plan(
+            radius_m=tuple(radius),
+            join=join,
+            gap_m=gap,
+            yield_m=max(*reach, outer + circle / 2 + 1.0),
+            circle_m=circle,
+            width_m=width,
+            shoulder_m=float(rng.uniform(*style.shoulder_m)),
+            limit_mps=float(rng.choice(limits)),
+        )
+
+    def _headings(self, rng: np.random.Generator, plan: _Plan) -> list[float]:
+        count = 3 if rng.random() < self.three_arm_share else 4
+        pairs = zip(plan.join, plan.radius_m, strict=True)
+        room = 2 * math.pi / count - max(2 * join + _ARC_M / radius for join, radius in pairs)
+        skew = min(self.skew, room / 2)
+        base = float(rng.uniform(-math.pi, math.pi))
+        return [base + 2 * math.pi * i / count + float(rng.uniform(-skew, skew)) for i in range(count)]
+
+    def _arm(self, rng: np.random.Generator, draft: Draft, plan: _Plan, heading: float) -> _Arm:
+        """Lays the lanes of one arm: straight near the circle, then bending gently."""
+        near = straight(Pose(0.0, 0.0, heading).ahead(plan.yield_m), 50.0)
+        far = winding(
+            rng, self.arm_m - 50.0, max_curvature=1 / 110, max_turn=math.radians(24.0), start=near.end
+        )
+        middle = joined(near, far)
+        spread = plan.spread_m(middle)
+        inward, outward = [], []
+        for j in range(len(plan.radius_m)):
+            aside = spread + (j + 0.5) * plan.width_m
+            inward.append(draft.lane(middle.displaced(aside).reversed(), plan.width_m, plan.limit_mps))
+            outward.append(draft.lane(middle.displaced(-aside), plan.width_m, plan.limit_mps))
+        for way in (inward, outward):
+            if len(way) == 2:
+                draft.beside(*way)
+        return _Arm(heading, middle, inward, outward)
+
+
+def _join(radius: float, aside: float) -> tuple[float, float]:
+    """Angle from an arm at which its lane meets the circle, and how far from the centre the bend to it begins.
+
+    The arm's lane (parallel to the arm, ``aside`` beside it) and the circle's tangent at angle d meet at a distance
+    ``t = (r sin d - aside) / cos d`` from the circle; a fillet with that tangent has the radius ``t / tan(45 - d/2)``.
+    """
+    angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
+    tangents = (radius * np.sin(angles) - aside) / np.cos(angles)
+    wide = tangents / np.tan(math.pi / 4 - angles / 2) >= _FILLET_M
+    chosen = int(np.argmax(wide)) if wide.any() else -1
+    angle, tangent = float(angles[chosen]), float(tangents[chosen])
+    return angle, (radius - aside * math.sin(angle)) / math.cos(angle) + tangent
+
+
+def _on_circle(radius: float, angle: float) -> Pose:
+    return Pose(radius * math.cos(angle), radius * math.sin(angle), angle + math.pi / 2)
+
+
+def _arc(radius: float, begin: float, end: float) -> Curve:
+    length = radius * (end - begin)
+    count = max(4, math.ceil(length / STEP_M) + 1)
+    chord = 2 * radius * math.sin((end - begin) / (count - 1) / 2)
+    # Steps are chords, so that the samples lie on the circle.
+    curvature = np.full(count, (end - begin) / (count - 1) / chord)
+    return from_curvature(curvature, chord, _on_circle(radius, begin))
+
+
+def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list[list[Curve]]:
+    """Adds entries, exits and circles; returns the outermost way from every arm to the next one."""
+    chains: list[list[Curve]] = []
+    for j, (radius, join) in enumerate(zip(plan.radius_m, plan.join, strict=True)):
+        entries, exits, passes = [], [], []
+        for arm in arms:
+            a, b = draft.lanes[arm.inward[j]].curve, draft.lanes[arm.outward[j]].curve
+            entry = connected(a.end, _on_circle(radius, arm.heading + join))
+            leave = connected(_on_circle(radius, arm.heading - join), b.start)
+            around = _arc(radius, arm.heading - join, arm.heading + join)
+            for way, curve, width in ((entries, entry, plan.width_m), (exits, leave, plan.width_m),
+                                      (passes, around, plan.circle_m)):  # fmt: skip
+                way.append(draft.lane(curve, width, limit, connector=True))
+            draft.link(arm.inward[j], entries[-1])
+            draft.link(exits[-1], arm.outward[j])
+        for i, arm in enumerate(arms):
+            k = (i + 1) % len(arms)
+            ahead = (arms[k].heading - arm.heading) % (2 * math.pi)
+            curve = _arc(radius, arm.heading + join, arm.heading + ahead - join)
+            arc = draft.lane(curve, plan.circle_m, limit)
+            for before, after in ((entries[i], arc), (passes[i], arc), (arc, exits[k]), (arc, passes[k])):
+                draft.link(before, after)
+            if j == len(plan.radius_m) - 1:
+                lanes = (arm.inward[j], entries[i], arc, exits[k], arms[k].outward[j])
+                chains.append([draft.lanes[lane].curve for lane in lanes])
+    return chains
+
+
+def _set_priorities(draft: Draft) -> None:
+    """Who goes round has priority over who comes in, and over who leaves across an outer circle."""
+    lanes = tuple(draft.lanes)
+    conflicts = conflicting(lanes)
+    arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
+    passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
+    for i in range(len(lanes)):
+        over = tuple(int(k) for k in np.flatnonzero(conflicts[i]) if k in passes)
+        if over and i not in passes:
+            draft.change(i, control=Control.YIELD, yields_to=over)
+
+
+def _edges(
+    draft: Draft, plan: _Plan, arms: list[_Arm], chains: list[list[Curve]], walk_m: float | None
+) -> None:
+    """The outer boundary along the outermost ways, the island in the middle and the splitters on the arms."""
+    sides = []
+    for chain in chains:
+        line = joined(*chain)
+        ends = np.cumsum([curve.arc_m[-1] for curve in chain])
+        wide = smooth_step((line.arc_m - ends[0]) / (ends[1] - ends[0]))
+        wide -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
+        reach = plan.width_m / 2 + plan.shoulder_m + wide * (plan.circle_m - plan.width_m) / 2
+        sides.append(line.displaced(-reach))
+        if walk_m is not None:
+            draft.walks.append(line.displaced(-reach - walk_m))
+    draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*sides)))
+    island = plan.radius_m[0] - plan.circle_m / 2 - _KERB_M
+    angles = np.arange(0.0, 2 * math.pi, 1.0 / island)
+    draft.edges.append(
+        Line(RoadKind.EDGE_MEDIAN, island * np.stack([np.cos(angles), -np.sin(angles)], axis=-1))
+    )
+    for arm in arms:
+        half = plan.spread_m(arm.middle) - _KERB_M
+        here = arm.middle.piece(0, int(np.argmax(half < 0.15)) - 1)
+        half = half[: len(here.xy)]
+        draft.edges.append(
+            Line(RoadKind.EDGE_MEDIAN, ring(here.displaced(half), here.displaced(-half).reversed()))
+        )
+
+
+def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
+    spread, lanes = plan.spread_m(arm.middle), len(arm.inward)
+    for side in (-1.0, 1.0):
+        draft.mark(RoadKind.LINE_SOLID_SINGLE_YELLOW, arm.middle.displaced(side * (spread + 0.08)))
+        for j in range(1, lanes + 1):
+            kind = RoadKind.LINE_SOLID_SINGLE_WHITE if j == lanes else RoadKind.LINE_BROKEN_SINGLE_WHITE
+            draft.mark(kind, arm.middle.displaced(side * (spread + j * plan.width_m)))
+
+
+def _cross(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
+    """People cross an arm one car's length before the yield line, by way of the splitter."""
+    half = plan.gap_m / 2 + len(arm.inward) * plan.width_m + plan.shoulder_m
+    here = arm.middle.start
+    at = here.ahead(_CROSSING_M)
+    lanes = [(lane, draft.lanes[lane].length_m - _CROSSING_M) for lane in arm.inward]
+    lanes += [(lane, _CROSSING_M) for lane in arm.outward]
+    axis = np.array([[p.x, p.y] for p in (at.aside(-half), at.aside(half))])
+    draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
+    if marked:
+        near, far = (here.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
+        corners = [near.aside(half), far.aside(half), far.aside(-half), near.aside(-half)]
+        draft.crosswalks.append(Line(RoadKind.CROSSWALK, np.array([[p.x, p.y] for p in corners])))

@@ -1,0 +1,141 @@
+"""Everyone's paths as arrays of one shape, so that one step of traffic is a few operations over all vehicles."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.drivers import Drivers
+from drivax.synthetic.traffic.paths import SLOTS, Path
+
+
+def speed_profile(
+    path: Path, factor: float, lateral_mps2: float, slowing_mps2: float, top_mps: float = np.inf
+) -> Float64[np.ndarray, " p"]:
+    """The fastest speed at each sample that respects limits, bends and the braking towards them.
+
+    ``v(s)^2 = min over s' >= s of (vmax(s')^2 + 2 b (s' - s))`` with ``vmax = min(factor x limit, sqrt(a_lat / |k|))``.
+    """
+    cap = np.minimum((factor * path.limit_mps) ** 2, lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-6))
+    cap = np.minimum(cap, top_mps**2)
+    ramp = 2 * slowing_mps2 * path.step_m * np.arange(len(cap))
+    return np.sqrt(np.minimum.accumulate((cap + ramp)[::-1])[::-1] - ramp)
+
+
+class PathTables:
+    """Lookup tables of all paths; a row changes when its vehicle goes over to another path.
+
+    Attributes:
+        table: x, y, heading and fastest speed at each sample.
+        step_m, last: Distance between samples and index of the last one.
+        lane, lane_m: Lanes taken up at each sample, and where on them.
+        begin, scale, since, until: Per lane of the network: where it begins on the path (nan: it does not), and the
+            range of own positions in which others on it matter.
+        way, way_begin, way_end: Connectors on the path in order (-1: none), and where they begin and end.
+        crossing, crossing_m: Crossings on the path in order of travel (-1: none), and where their near side is.
+        stop_m: Where the last lane ends although the road goes on, m (infinite: it does not).
+    """
+
+    def __init__(self, network: RoadNetwork, paths: list[Path], drivers: Drivers) -> None:
+        self._network, self._drivers = network, drivers
+        self.paths = list(paths)
+        count, lanes = len(paths), len(network.lanes)
+        self._crossings: dict[int, list[tuple[int, float]]] = {}
+        for number, crossing in enumerate(network.crossings):
+            for lane, along in crossing.lanes if crossing.marked else ():
+                self._crossings.setdefault(lane, []).append((number, along - crossing.width_m / 2))
+        # Later paths may be longer: half as much room again costs nothing.
+        points = int(1.5 * max(len(path.curve.xy) for path in paths))
+        ways = 4 + max(sum(network.lanes[s.lane].connector for s in path.spans) for path in paths)
+        self.table = np.zeros((count, points, 4))
+        self.lane = np.full((count, points, SLOTS), -1)
+        self.lane_m = np.zeros((count, points, SLOTS))
+        self.step_m, self.last = np.ones(count), np.ones(count, int)
+        self.begin, self.scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
+        self.since, self.until = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
+        self.way = np.full((count, ways), -1)
+        self.way_begin, self.way_end = np.full((count, ways), np.inf), np.full((count, ways), np.inf)
+        self.crossing = np.full((count, 4), -1)
+        self.crossing_m = np.full((count, 4), np.inf)
+        self.stop_m = np.full(count, np.inf)
+        for row, path in enumerate(paths):
+            self.replace(row, path)
+
+    def replace(self, row: int, path: Path) -> None:
+        """Enters the path of one vehicle."""
+        self.paths[row] = path
+        d, n = self._drivers, len(path.curve.xy)
+        self._make_room(n)
+        fastest = speed_profile(
+            path, d.speed_factor[row], d.lateral_mps2[row], d.slowing_mps2[row], d.top_speed_mps[row]
+        )
+        self.table[row, :n, :2] = path.curve.xy
+        self.table[row, :n, 2], self.table[row, :n, 3] = path.curve.heading, fastest
+        self.table[row, n:] = self.table[row, n - 1]
+        self.lane[row, :n], self.lane_m[row, :n] = path.lane, path.lane_m
+        self.lane[row, n:] = -1
+        self.step_m[row], self.last[row] = path.step_m, n - 1
+        self.begin[row], self.scale[row] = np.nan, 1.0
+        self.since[row], self.until[row] = -np.inf, np.inf
+        self.way[row], self.way_begin[row], self.way_end[row] = -1, np.inf, np.inf
+        self._enter_lanes(row, path)
+        final = max(path.spans, key=lambda span: span.end_m if span.until_m == np.inf else -1.0)
+        lane = self._network.lanes[final.lane]
+        self.stop_m[row] = path.length_m if lane.ends and not lane.successors else np.inf
+
+    def _enter_lanes(self, row: int, path: Path) -> None:
+        ways, crossings = [], []
+        for span in path.spans:
+            lane = span.lane
+            self.begin[row, lane], self.scale[row, lane] = span.begin_m, span.scale
+            self.since[row, lane], self.until[row, lane] = span.from_m, span.until_m
+            if self._network.lanes[lane].connector and span.until_m == np.inf:
+                ways.append((span.begin_m, span.end_m, lane))
+            for number, along in self._crossings.get(lane, ()):
+                crossings.append((span.begin_m + span.scale * along, number))
+        for k, (begin, end, lane) in enumerate(sorted(ways)[: self.way.shape[1]]):
+            self.way[row, k], self.way_begin[row, k], self.way_end[row, k] = lane, begin, end
+        if len(crossings) > self.crossing.shape[1]:
+            more = len(crossings) - self.crossing.shape[1]
+            self.crossing = np.pad(self.crossing, ((0, 0), (0, more)), constant_values=-1)
+            self.crossing_m = np.pad(self.crossing_m, ((0, 0), (0, more)), constant_values=np.inf)
+        self.crossing[row], self.crossing_m[row] = -1, np.inf
+        for k, (at, number) in enumerate(sorted(crossings)):
+            self.crossing_m[row, k], self.crossing[row, k] = at, number
+
+    def _make_room(self, points: int) -> None:
+        more = points - self.table.shape[1]
+        if more > 0:
+            pad = ((0, 0), (0, more), (0, 0))
+            self.table = np.pad(self.table, pad, mode="edge")
+            self.lane = np.pad(self.lane, pad, constant_values=-1)
+            self.lane_m = np.pad(self.lane_m, pad)
+
+    def copy(self) -> PathTables:
+        """A copy whose rows can be replaced without changing this one."""
+        result = object.__new__(PathTables)
+        for name, value in vars(self).items():
+            setattr(result, name, value.copy() if isinstance(value, np.ndarray | list) else value)
+        return result
+
+    def at(
+        self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, "v 4"]:
+        """x, y, heading and fastest speed at positions on the paths of some vehicles."""
+        place = position_m / self.step_m[rows]
+        index = np.minimum(np.maximum(place.astype(int), 0), self.last[rows] - 1)
+        share = np.minimum(np.maximum(place - index, 0.0), 1.0)[:, None]
+        flat, index = self.table.reshape(-1, 4), index + rows * self.table.shape[1]
+        low = flat.take(index, axis=0)
+        return low + share * (flat.take(index + 1, axis=0) - low)
+
+    def on(
+        self, position_m: Float64[np.ndarray, " v"], rows: Int64[np.ndarray, " v"]
+    ) -> tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]]:
+        """The lanes taken up at positions on the paths (-1: no more), and where on them, m."""
+        step = self.step_m[rows]
+        index = np.minimum(np.maximum(np.rint(position_m / step).astype(int), 0), self.last[rows])
+        beyond, index = position_m - index * step, index + rows * self.lane.shape[1]
+        along = self.lane_m.reshape(-1, SLOTS).take(index, axis=0) + beyond[:, None]
+        return self.lane.reshape(-1, SLOTS).take(index, axis=0), along

@@ -1,0 +1,240 @@
+"""Who is on the road: vehicles of many sizes with drivers of many tempers, placed with safe gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.scenario.schema import AgentKind, RoadKind
+from drivax.synthetic.roads.network import Lane, RoadNetwork
+from drivax.synthetic.traffic.drivers import Drivers
+from drivax.synthetic.traffic.paths import Path, Sway, lane_path
+from drivax.synthetic.traffic.roles import Scripted
+
+#: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time added per m/s.
+_GAP_M, _GAP_S = 5.0, 0.9
+#: Free gaps on busy lanes as a share of those elsewhere.
+_BUSY = 0.4
+#: Nobody cycles where cars may go faster, m/s.
+_CYCLED_MPS = 16.0
+#: How far from the lane's right side cyclists ride, m.
+_KERB_M = 0.55
+#: Nobody is placed so little time before a lane ends although the road goes on, s.
+_MERGE_S = 5.0
+#: From where ahead of a standing thing to where behind it nobody is placed in its lane, m, and the widest vehicle.
+_BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
+#: Vehicles on different lanes that take up the same strip are this far apart, centre to centre, m.
+_APART_M = 15.0
+_CAR, _VAN, _TRUCK, _BUS, _CYCLIST = range(5)
+#: Smallest and largest length, width and height of each type, m.
+_SIZES = np.array(
+    [
+        [[3.9, 1.7, 1.35], [5.3, 2.05, 1.85]],
+        [[5.0, 1.95, 2.0], [6.4, 2.1, 2.7]],
+        [[7.0, 2.3, 2.8], [9.5, 2.5, 3.6]],
+        [[10.5, 2.5, 2.9], [12.0, 2.55, 3.3]],
+        [[1.7, 0.6, 1.65], [1.9, 0.7, 1.85]],
+    ]
+)
+#: Length and width of the largest vehicle, m.
+LONGEST_M: tuple[float, float] = (float(_SIZES[_BUS, 1, 0]), float(_SIZES[_BUS, 1, 1]))
+
+
+@dataclass(frozen=True)
+class Density:
+    """How full the roads are.
+
+    Attributes:
+        spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
+        vehicles: Most vehicles beside ego; the nearest to ego are kept.
+        van_share, truck_share, bus_share: Shares of these among all; the rest are cars.
+        cyclist_share: Share of cyclists among those who are placed on streets.
+        leader_share: Share of scenarios in which somebody is placed right ahead of ego.
+    """
+
+    spacing_m: tuple[float, float] = (25.0, 90.0)
+    vehicles: int = 32
+    van_share: float = 0.1
+    truck_share: float = 0.05
+    bus_share: float = 0.02
+    cyclist_share: float = 0.03
+    leader_share: float = 0.5
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Vehicles placed on lanes: lane index, and distance of the centre along it in m."""
+
+    lane: tuple[int, ...]
+    along_m: tuple[float, ...]
+
+
+def placed(
+    network: RoadNetwork,
+    ego_lane: int,
+    ego_along_m: float,
+    density: Density,
+    rng: np.random.Generator,
+    parked: tuple[Scripted, ...] = (),
+    busy: Collection[int] = (),
+) -> Placement:
+    """Draws where the others begin: nobody on a connector, and nobody too close to ego or to another.
+
+    Args:
+        network: The roads.
+        ego_lane: Lane on which ego begins.
+        ego_along_m: Distance of ego along that lane, m.
+        density: How full the roads are.
+        rng: Source of chance.
+        parked: Who stands somewhere all the time: nobody begins in it or right behind it.
+        busy: Lanes that are as full as the network's busy ones.
+    """
+    spacing = rng.uniform(*density.spacing_m)
+    found: list[tuple[int, float]] = []
+    if rng.random() < density.leader_share:
+        ahead = ego_along_m + rng.uniform(18.0, 45.0)
+        if ahead < network.lanes[ego_lane].length_m - 6.0:
+            found.append((ego_lane, ahead))
+    for index, lane in enumerate(network.lanes):
+        if lane.connector:
+            continue
+        least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
+        taken = [along for where, along in found if where == index]
+        taken += [ego_along_m] if index == ego_lane else []
+        mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
+        at = rng.uniform(6.0, 6.0 + mean)
+        while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
+            if all(abs(at - other) > least for other in taken):
+                found.append((index, float(at)))
+                taken.append(float(at))
+            at += least + rng.exponential(mean)
+    found = [place for place in found if not _blocked(network, *place, parked)]
+    found = _apart_at_joints(network, found, ego_lane, ego_along_m)
+    here = network.lanes[ego_lane].curve
+    ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
+    found.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
+    found = _apart_in_space(network, found, (ego_lane, ego_along_m))[: density.vehicles]
+    return Placement(tuple(lane for lane, _ in found), tuple(along for _, along in found))
+
+
+def _apart_in_space(
+    network: RoadNetwork, found: list[tuple[int, float]], ego: tuple[int, float]
+) -> list[tuple[int, float]]:
+    """Drops who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
+    kept: list[tuple[float, float]] = []
+    result = []
+    for place in [ego, *found]:
+        lane, along = network.lanes[place[0]], place[1]
+        x, y = _point(network, *place)
+        heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
+        cos, sin = np.cos(heading), np.sin(heading)
+        near = (
+            abs((x - a) * cos + (y - b) * sin) < _APART_M and abs((y - b) * cos - (x - a) * sin) < _WIDEST_M
+            for a, b in kept
+        )
+        if not any(near):
+            kept.append((float(x), float(y)))
+            result.append(place)
+    return result[1:]
+
+
+def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
+    """Whether somebody stands in the lane here or so near ahead that it could not be passed."""
+    curve = network.lanes[lane].curve
+    place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
+    cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
+    for other in parked:
+        dx, dy = other.xy[0] - curve.xy[place]
+        ahead, aside = dx * cos + dy * sin, abs(dy * cos - dx * sin)
+        if -_BEHIND_M < ahead < _BEFORE_M and aside < (_WIDEST_M + other.size_m[1]) / 2:
+            return True
+    return False
+
+
+def _apart_at_joints(
+    network: RoadNetwork, found: list[tuple[int, float]], ego_lane: int, ego_along_m: float
+) -> list[tuple[int, float]]:
+    """Drops who stands too close behind the first vehicle of a following lane."""
+    kept = []
+    first: dict[int, float] = {}
+    for lane, along in [*found, (ego_lane, ego_along_m)]:
+        first[lane] = min(along, first.get(lane, np.inf))
+    last: dict[int, float] = {ego_lane: ego_along_m}
+    for lane, along in found:
+        last[lane] = max(along, last.get(lane, 0.0))
+    for lane, along in found:
+        this = network.lanes[lane]
+        least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
+        after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
+        # Only the last vehicle of a lane can be too close to the next lane's first one. Ego always stays.
+        behind_ego = ego_lane in this.predecessors
+        gap_to_ego = network.lanes[ego_lane].length_m - ego_along_m + along if behind_ego else np.inf
+        if (along < last[lane] or this.length_m - along + after > least) and gap_to_ego > least:
+            kept.append((lane, along))
+    return kept
+
+
+def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray, " 2"]:
+    curve = network.lanes[lane].curve
+    return curve.xy[min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)]
+
+
+def drawn_drivers(
+    count: int, density: Density, rng: np.random.Generator, lanes: Sequence[Lane] | None = None
+) -> Drivers:
+    """Draws vehicles and drivers: hurried and patient, close and careful.
+
+    Args:
+        count: How many.
+        density: Shares of the types.
+        rng: Source of chance.
+        lanes: Where each begins: nobody cycles on fast roads, and only cyclists are on bicycle lanes.
+    """
+    shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
+    drawn = np.searchsorted(shares, rng.random(count), side="right")
+    # The types in the order of the shares; whoever is left drives a car.
+    kind = (drawn + 1) % (len(shares) + 1)
+    if lanes is not None:
+        fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
+        kind[(kind == _CYCLIST) & fast] = _CAR
+        kind[np.array([lane.kind == RoadKind.LANE_BIKE for lane in lanes], bool)] = _CYCLIST
+    low, high = _SIZES[kind, 0], _SIZES[kind, 1]
+    size = rng.uniform(low, high)
+    heavy, cyclist = (kind == _TRUCK) | (kind == _BUS), kind == _CYCLIST
+    slower = np.where(heavy, 0.85, 1.0)
+    return Drivers(
+        kind=np.where(cyclist, AgentKind.CYCLIST, AgentKind.VEHICLE).astype(np.int8),
+        size_m=size,
+        speed_factor=slower * rng.normal(0.92, 0.12, count).clip(0.55, 1.1),
+        top_speed_mps=np.where(cyclist, rng.uniform(4.0, 7.0, count), np.inf),
+        lateral_mps2=np.where(heavy, 0.8, 1.0) * rng.uniform(1.8, 2.5, count),
+        slowing_mps2=rng.uniform(1.1, 1.8, count),
+        yellow_mps2=rng.uniform(2.3, 3.0, count),
+        jerk_mps3=rng.uniform(3.0, 5.0, count),
+        headway_s=rng.uniform(1.1, 2.0, count),
+        acceleration_mps2=np.where(cyclist, 0.6, np.where(heavy, 0.7, 1.0)) * rng.uniform(1.1, 2.0, count),
+        braking_mps2=rng.uniform(2.0, 3.0, count),
+        politeness=rng.uniform(0.0, 0.5, count),
+        reaction_s=rng.uniform(0.1, 0.6, count),
+        critical_gap_s=rng.uniform(3.5, 6.0, count),
+    )
+
+
+def driven_path(
+    network: RoadNetwork, lanes: tuple[int, ...], cyclist: bool, rng: np.random.Generator
+) -> Path:
+    """The path of somebody along lanes: cars near the middle, cyclists near the right side."""
+    if not cyclist:
+        return lane_path(network, lanes, Sway.drawn(rng, 0.2))
+    narrowest = min(network.lanes[lane].width_m for lane in lanes)
+    return lane_path(network, lanes, Sway.drawn(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
+
+
+def joined_drivers(first: Drivers, rest: Drivers) -> Drivers:
+    """One table of both."""
+    return Drivers(
+        **{name: np.concatenate([value, getattr(rest, name)]) for name, value in vars(first).items()}
+    )

@@ -1,0 +1,177 @@
+"""Who takes part in a scenario: ego on its way, the others with their drivers, people on foot, parked cars, lights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.synthetic.domains import Domain
+from drivax.synthetic.events.destinations import Aim, AimedWay, drawn_aimed_way, green_on_arrival, rearranged
+from drivax.synthetic.expert import driver as expert
+from drivax.synthetic.roads.network import Control, RoadNetwork
+from drivax.synthetic.roads.signals import SignalPlan
+from drivax.synthetic.traffic.conflicts import giving_way, met_on, with_feeders
+from drivax.synthetic.traffic.drivers import Drivers
+from drivax.synthetic.traffic.parking import parked_cars
+from drivax.synthetic.traffic.path_arrays import speed_profile
+from drivax.synthetic.traffic.paths import Path, random_lanes
+from drivax.synthetic.traffic.pedestrians import placed_walkers
+from drivax.synthetic.traffic.population import drawn_drivers, driven_path, joined_drivers, placed
+from drivax.synthetic.traffic.roles import Cast
+
+#: Shares of what the light does for ego: green on arrival, turning green, turning red.
+SignalTiming = tuple[float, float, float]
+#: Ego begins at least this far along its way, m.
+_LEAST_M = 12.0
+#: Further ways that are drawn for ego in the hope that it has to give way.
+_WAYS = 4
+
+
+def draw_cast(
+    network: RoadNetwork,
+    domain: Domain,
+    times_s: Float64[np.ndarray, " time"],
+    lane_change_share: float,
+    timing: SignalTiming,
+    rng: np.random.Generator,
+    aims: Sequence[Aim] = (),
+    critical: bool = False,
+) -> Cast:
+    """Draws ego, its way and lights, then the others and theirs.
+
+    Args:
+        network: The roads.
+        domain: How full they are, and of whom.
+        times_s: Times of all steps; the recording begins at time 0, before it traffic warms up.
+        lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
+        timing: Shares of what the light does for ego.
+        rng: Source of chance.
+        aims: Places of which ego should pass one unhindered; without any it begins and goes where it likes.
+        critical: Ego takes a way on which it has to give way to others if there is one, and these are many.
+    """
+    driver = expert.drawn_expert(rng)
+    aimed = drawn_aimed_way(network, giving_way(network) if critical else aims, rng)
+    first_s = float(times_s[0])
+    way = _drawn_way(network, driver, first_s, lane_change_share, rng, aimed)
+    for _ in range(_WAYS if critical and aimed is None else 0):
+        if met_on(network, way.path):
+            break
+        way = _drawn_way(network, driver, first_s, lane_change_share, rng, None)
+    rivals = with_feeders(network, met_on(network, way.path)) if critical else frozenset()
+    path, lanes, at = way.path, way.lanes, way.at_m
+    network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
+    here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
+    density = domain.density
+    parked = parked_cars(
+        network, float(rng.uniform(*domain.parked_share)), domain.double_share, rng, len(times_s)
+    )
+    others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
+    if aimed is not None:
+        others = rearranged(others, aimed, (here.lane, at - here.begin_m), rng)
+    begin = [network.lanes[lane] for lane in others.lane]
+    drivers = joined_drivers(driver, drawn_drivers(len(begin), density, rng, begin))
+    paths = [path]
+    for lane, cyclist in zip(others.lane, drivers.cyclist[1:], strict=True):
+        paths.append(driven_path(network, random_lanes(network, lane, rng, rivals), bool(cyclist), rng))
+    distance = np.array([at, *others.along_m])
+    return Cast(
+        network=network,
+        paths=paths,
+        drivers=drivers,
+        distance_m=distance,
+        speed_mps=_first_speeds(network, paths, drivers, distance, rng),
+        route=lanes,
+        walkers=placed_walkers(network, float(rng.uniform(*domain.walkers)), rng, times_s),
+        parked=parked,
+    )
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Ego's lanes, its path along them, and where on it it begins."""
+
+    lanes: tuple[int, ...]
+    path: Path
+    at_m: float
+
+
+def _drawn_way(
+    network: RoadNetwork,
+    driver: Drivers,
+    first_s: float,
+    lane_change_share: float,
+    rng: np.random.Generator,
+    aimed: AimedWay | None,
+) -> _Way:
+    """Ego begins so far back that the warm-up brings it to where the recording should begin."""
+    if aimed is None:
+        start = network.starts[int(rng.integers(len(network.starts)))]
+        lanes, change = expert.expert_lanes(network, start.lane, lane_change_share, rng)
+    else:
+        start, lanes, change = aimed.start, aimed.lanes, None
+    path = expert.expert_path(network, lanes, change, rng)
+    cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
+    first = next(span for span in path.spans if span.lane == start.lane)
+    at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
+    return _Way(lanes, path, at)
+
+
+def _lights(
+    network: RoadNetwork,
+    lanes: tuple[int, ...],
+    timing: SignalTiming,
+    aimed: AimedWay | None,
+    rng: np.random.Generator,
+) -> SignalPlan | None:
+    """The lights with their clock set for the first one on ego's way, or on its way past the place it is aimed at."""
+    plan, ahead = network.signals, lanes if aimed is None else lanes[aimed.place :]
+    lit = [lane for lane in ahead if network.lanes[lane].control == Control.SIGNAL]
+    if plan is None or not lit:
+        return plan
+    if aimed is not None and aimed.alone:
+        return green_on_arrival(plan, lit[0])
+    return _timed(plan, lit[0], timing, rng)
+
+
+def _timed(
+    plan: SignalPlan, way: int, shares: tuple[float, float, float], rng: np.random.Generator
+) -> SignalPlan:
+    """Sets the plan's clock so that ego's light does something of interest during the recording (time 0 on)."""
+    phase = plan.phase_of(way)
+    what = int(rng.choice(3, p=shares))
+    if what == 0:  # green for a while before ego comes
+        green_at = -rng.uniform(0.0, 3.0)
+    elif what == 1:  # turns green
+        green_at = rng.uniform(0.5, 5.0)
+    else:  # turns yellow, then red
+        green_at = rng.uniform(0.3, 4.5) - plan.green_s[phase]
+    return replace(plan, offset_s=float(green_at) - plan.starts_s[phase])
+
+
+def _first_speeds(
+    network: RoadNetwork,
+    paths: list[Path],
+    drivers: Drivers,
+    distance: Float64[np.ndarray, " vehicle"],
+    rng: np.random.Generator,
+) -> Float64[np.ndarray, " vehicle"]:
+    """Speeds from which everybody can still stop at the next stop line, whatever the light will do."""
+    speeds = []
+    for i, path in enumerate(paths):
+        fastest = speed_profile(
+            path,
+            drivers.speed_factor[i],
+            drivers.lateral_mps2[i],
+            drivers.slowing_mps2[i],
+            drivers.top_speed_mps[i],
+        )
+        speed = fastest[min(int(distance[i] / path.step_m), len(fastest) - 1)] * rng.uniform(0.7, 1.0)
+        front = distance[i] + drivers.size_m[i, 0] / 2
+        lines = [s.begin_m - front for s in path.spans if network.lanes[s.lane].connector]
+        room = min((line for line in lines if line >= 0), default=math.inf)
+        speeds.append(min(float(speed), math.sqrt(2 * 1.5 * max(room - 2.0, 0.0))))
+    return np.array(speeds)

@@ -1,0 +1,165 @@
+"""Who is in a scenario and what is staged in it: everything that is decided before anybody moves, and what they did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int8
+
+from drivax.scenario.schema import AgentKind
+from drivax.synthetic.roads.curves import Curve, Pose
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.drivers import Drivers
+from drivax.synthetic.traffic.paths import Path
+
+
+@dataclass(frozen=True)
+class Walker:
+    """A pedestrian: walks along a curve and waits at kerbs.
+
+    Attributes:
+        way: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
+        start_m: Position along the way when traffic begins, before the warm-up.
+        speed_mps: Wanted speed.
+        crossing: Index of the crossing that the way leads over, -1 none.
+        kerb_m, across_m: Where on the way the kerbs are: where to wait, and where the road is left again.
+        size_m: Length, width, height.
+    """
+
+    way: Curve
+    start_m: float
+    speed_mps: float
+    crossing: int = -1
+    kerb_m: float = 0.0
+    across_m: float = 0.0
+    size_m: tuple[float, float, float] = (0.6, 0.6, 1.75)
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A road user that moves as told, whatever happens: parked, or part of an event.
+
+    Attributes:
+        speed: Along the heading; negative when reversing.
+        valid: False before it exists and after it is gone.
+    """
+
+    kind: AgentKind
+    size_m: tuple[float, float, float]
+    xy: Float64[np.ndarray, "time 2"]
+    heading: Float64[np.ndarray, " time"]
+    speed: Float64[np.ndarray, " time"]
+    valid: Bool[np.ndarray, " time"]
+
+    @classmethod
+    def standing(
+        cls, kind: AgentKind, size_m: tuple[float, float, float], pose: Pose, steps: int
+    ) -> Scripted:
+        """Somebody who stays where it is."""
+        xy = np.tile([pose.x, pose.y], (steps, 1))
+        return cls(kind, size_m, xy, np.full(steps, pose.heading), np.zeros(steps), np.ones(steps, bool))
+
+
+@dataclass(frozen=True)
+class Cast:
+    """Everybody in a scenario; row 0 of ``paths`` and ``drivers`` is ego.
+
+    Attributes:
+        paths: Of vehicles and of cyclists who ride on lanes.
+        distance_m: Where on its path each centre begins.
+        route: Lanes of ego's intended route, in order.
+        parked: Cars that stand beside or in the lanes all the time.
+    """
+
+    network: RoadNetwork
+    paths: list[Path]
+    drivers: Drivers
+    distance_m: Float64[np.ndarray, " vehicle"]
+    speed_mps: Float64[np.ndarray, " vehicle"]
+    route: tuple[int, ...]
+    walkers: tuple[Walker, ...] = ()
+    parked: tuple[Scripted, ...] = ()
+
+
+@dataclass(frozen=True)
+class Override:
+    """From one step to another (both included) a vehicle accelerates as told, or less."""
+
+    vehicle: int
+    first_step: int
+    last_step: int
+    acceleration_mps2: float
+
+
+@dataclass(frozen=True)
+class Tailgate:
+    """A vehicle keeps only this time gap to whoever is ahead, all the time."""
+
+    vehicle: int
+    headway_s: float
+
+
+@dataclass(frozen=True)
+class Staging:
+    """What an event changes in how traffic goes; vehicles in the way of its making (``removed``) do not take part."""
+
+    overrides: tuple[Override, ...] = ()
+    extras: tuple[Scripted, ...] = ()
+    tailgates: tuple[Tailgate, ...] = ()
+    removed: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class EgoPlan:
+    """Ego drives as told from a step on: its pose and signed speed at that step and all later ones."""
+
+    first_step: int
+    xy: Float64[np.ndarray, "time 2"]
+    heading: Float64[np.ndarray, " time"]
+    speed: Float64[np.ndarray, " time"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What everyone did. Users are, in this order: vehicles and cyclists (ego first), walkers, parked, extras.
+
+    Attributes:
+        kind: ``AgentKind`` of each user.
+        size_m: Length, width, height.
+        xy, heading, speed: Pose of the box centre and speed along the heading (signed).
+        valid: False before a user exists and after it has left the map.
+        distance_m: Position along each vehicle's (present) path; only for vehicles.
+        acceleration: Acceleration of each vehicle during the step that begins here.
+    """
+
+    kind: Int8[np.ndarray, " user"]
+    size_m: Float64[np.ndarray, "user 3"]
+    xy: Float64[np.ndarray, "user time 2"]
+    heading: Float64[np.ndarray, "user time"]
+    speed: Float64[np.ndarray, "user time"]
+    valid: Bool[np.ndarray, "user time"]
+    distance_m: Float64[np.ndarray, "vehicle time"]
+    acceleration: Float64[np.ndarray, "vehicle time"]
+    paths: list[Path] = field(default_factory=list)
+
+    @property
+    def vehicles(self) -> int:
+        """How many of the users are vehicles or cyclists on paths."""
+        return len(self.distance_m)
+
+    def since(self, step: int) -> Motion:
+        """The same from a step on."""
+        return self._at(slice(step, None))
+
+    def until(self, step: int) -> Motion:
+        """The same before a step."""
+        return self._at(slice(step))
+
+    def every(self, stride: int) -> Motion:
+        """The same at every so-manieth step."""
+        return self._at(slice(None, None, stride))
+
+    def _at(self, steps: slice) -> Motion:
+        timed = ("xy", "heading", "speed", "valid", "distance_m", "acceleration")
+        return replace(self, **{name: getattr(self, name)[:, steps] for name in timed})

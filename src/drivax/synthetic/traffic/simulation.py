@@ -1,0 +1,386 @@
+"""Traffic at 10 Hz: many vehicles on lane paths who follow, stop, give way, change lanes and go around things.
+
+The law of following is the simulator's own (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a
+few dozen array operations over vehicles, whatever their number. Who may enter a junction is decided in
+:mod:`drivax.synthetic.traffic.right_of_way`, who changes lanes in :mod:`drivax.synthetic.traffic.lane_changes`, what
+is in the way in
+:mod:`drivax.synthetic.traffic.obstacles`.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from drivax.scenario.schema import DT_S
+from drivax.simulator.idm import idm_acceleration
+from drivax.synthetic.traffic.detours import DETOUR_MARGIN_M, LOOK_M, Detours, swerver
+from drivax.synthetic.traffic.lane_changes import HELP_MPS2, Change, Helped, LaneChanges, Situation
+from drivax.synthetic.traffic.lateral import change_onto, followed
+from drivax.synthetic.traffic.leaders import Leaders
+from drivax.synthetic.traffic.obstacles import Boxes, Standing, in_the_way
+from drivax.synthetic.traffic.path_arrays import PathTables
+from drivax.synthetic.traffic.paths import Path, Sway, lane_path, onward
+from drivax.synthetic.traffic.pedestrians import Walkers
+from drivax.synthetic.traffic.right_of_way import Moment, RightOfWay
+from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion, Staging
+from drivax.synthetic.traffic.scripted import boxes_at, everybody, standing_and_moving
+
+#: Where drivers want to come to rest before a stop line, m from the front bumper.
+_STOP_SHORT_M = 1.0
+#: Before a thing that stands in the lane they keep room to pass it, m; before a lane's end, to change.
+_KEEP_M, _END_M = 5.0, 10.0
+#: A driver follows the speed profile with this reaction, s.
+_SPEED_TIME_S = 0.6
+#: Jerk beyond a driver's own is used when braking harder than this, m/s2.
+_EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
+#: Lane changes and ways around things are considered every so many steps.
+_DECIDE_EVERY = 5
+#: A driver stays in its lane for this long after a change, s.
+_REST_S = 4.0
+#: Drivers stop for people where this is enough when they come, m/s2, and once they do brake up to this.
+_YIELD_MPS2, _HARDEST_MPS2 = 3.0, 8.0
+#: Braking for lines, as a multiple of what is needed.
+_FIRMLY = 1.3
+#: Longest reaction, steps.
+_SLOWEST = 6
+#: A planned ego is expected at stop lines this far ahead of time, steps.
+_FORESEEN = 25
+_NOBODY = boxes_at((), 0)
+
+
+class Traffic:
+    """Everybody, moved step by step.
+
+    Args:
+        cast: Who there is.
+        times_s: Times of all steps to come, on the clock of the signals.
+    """
+
+    def __init__(self, cast: Cast, times_s: Float64[np.ndarray, " time"]) -> None:
+        self.cast, self.times_s = cast, times_s
+        self.tables = PathTables(cast.network, cast.paths, cast.drivers)
+        self.parked = boxes_at(cast.parked, 0)
+        self.standing = Standing(self.parked, self.tables, cast.drivers.size_m[:, 1])
+        self.right_of_way = RightOfWay(cast.network, cast.drivers)
+        self.detours = Detours(cast.network)
+        shape = (len(times_s), len(cast.network.lanes))
+        self.colour, self.to_red = np.zeros(shape, np.int8), np.zeros(shape)
+        if cast.network.signals is not None:
+            self.colour, self.to_red = cast.network.signals.colours(times_s, shape[1])
+
+    def until(self, steps: int) -> Traffic:
+        """The same, ending earlier."""
+        shorter = copy.copy(self)
+        shorter.times_s = self.times_s[:steps]
+        return shorter
+
+    def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
+        """Moves everyone through all steps.
+
+        Args:
+            staging: What an event changes.
+            ego: How ego drives from a step on; None: like everybody.
+        """
+        return _Run(self, staging or Staging(), ego).finished()
+
+
+class _Run:
+    """One run of a traffic."""
+
+    def __init__(self, traffic: Traffic, staging: Staging, ego: EgoPlan | None) -> None:
+        self._fixed, self._staging, self._ego = traffic, staging, ego
+        cast = traffic.cast
+        self._network, self._drivers = cast.network, cast.drivers
+        for told in staging.tailgates:
+            self._drivers = self._drivers.with_headway(told.vehicle, told.headway_s)
+        self._size_m = cast.drivers.size_m[:, :2]
+        self._half_m, self._width_m = self._size_m[:, 0] / 2, self._size_m[:, 1]
+        count = len(cast.paths)
+        self._rows = np.arange(count)
+        self._twice = np.concatenate([self._rows, self._rows])
+        self._idm = self._drivers.idm
+        self._tables = traffic.tables.copy()
+        self._fixtures, self._movers = standing_and_moving(staging.extras)
+        boxes = traffic.parked.joined(boxes_at(self._fixtures, 0))
+        self._standing = traffic.standing.copy()
+        if self._fixtures:
+            self._standing = Standing(boxes, self._tables, self._width_m)
+        self._right_of_way = traffic.right_of_way
+        self._right_of_way.reset()
+        self._changes = LaneChanges(self._network, cast.drivers, boxes)
+        self._walkers = Walkers(self._network, cast.walkers, traffic.times_s) if cast.walkers else None
+        self._claims = np.zeros(len(self._network.crossings), bool)
+        self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path: who stops for people
+        self._delay = np.rint(cast.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
+        self._at, self._speed = cast.distance_m.copy(), cast.speed_mps.copy()
+        for row in staging.removed:  # it has left before anything begins
+            self._at[row] = cast.paths[row].length_m
+        self._last = np.zeros(count)
+        self._memory = np.zeros((_SLOWEST + 1, count))
+        self._busy_m = np.full(count, -np.inf)  # until here on its path a vehicle is changing or passing
+        self._rest = np.zeros(count, int)  # from this step on it may change again
+        self._helped = Helped(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+        self._leaders = Leaders(self._network, self._drivers)
+        # Of leaders, lines and things: the gaps to them, and how fast they are.
+        self._gaps, self._leads = np.full((3, count), np.inf), np.zeros((3, count))
+        self._promised = np.full(count, -1)
+        self._plan_at = followed(self._tables.paths[0], ego.xy) if ego is not None else np.zeros(0)
+        self._people = self._vehicles = _NOBODY
+
+    def finished(self) -> Motion:
+        """Goes through all steps and collects what happened."""
+        count, steps = len(self._rows), len(self._fixed.times_s)
+        pose, walked = np.zeros((count, steps, 3)), np.zeros((len(self._fixed.cast.walkers), steps, 4))
+        speed, at, acceleration = (np.zeros((count, steps)) for _ in range(3))
+        valid = np.zeros((count, steps), bool)
+        for t in range(steps):
+            planned = self._put_ego(t)
+            active = self._at + self._half_m < self._tables.last * self._tables.step_m
+            active[0] |= planned
+            soon = self._at + self._speed * _SPEED_TIME_S
+            row = self._tables.at(np.concatenate([self._at, soon]), self._twice)
+            here, fastest = row[:count, :3], row[:count, 3]
+            if planned and self._ego is not None:
+                k = t - self._ego.first_step
+                here[0] = (*self._ego.xy[k], self._ego.heading[k])
+            self._vehicles = Boxes(here[:, :2], here[:, 2], self._speed, self._size_m)
+            self._walk(t, active, walked)
+            pose[:, t], speed[:, t], at[:, t], valid[:, t] = here, self._speed, self._at, active
+            wanted = self._wanted(t, fastest, row[count:, 3], active)
+            if t % _DECIDE_EVERY == 0:
+                self._decide(t, wanted, fastest, active)
+            acceleration[:, t] = self._advance(self._acted(t, wanted), active)
+        if self._ego is not None:
+            k = slice(self._ego.first_step, steps - 1)
+            acceleration[0, k] = np.diff(speed[0, self._ego.first_step :]) / DT_S
+        vehicles = (pose, speed, valid, at, acceleration)
+        return everybody(self._fixed.cast, self._staging, vehicles, walked, self._tables.paths)
+
+    def _swap(self, row: int, path: Path, at: float) -> None:
+        self._tables.replace(row, path)
+        self._standing.replace(row, path)
+        self._at[row] = at
+        self._halting[row : row + 1] = False
+        self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
+
+    def _put_ego(self, t: int) -> bool:
+        """Puts ego where its plan says; whether there is a plan for this step."""
+        if self._ego is None or t < self._ego.first_step:
+            return False
+        k = t - self._ego.first_step
+        self._at[0], self._speed[0] = self._plan_at[k], self._ego.speed[k]
+        return True
+
+    def _walk(
+        self, t: int, active: Bool[np.ndarray, " v"], walked: Float64[np.ndarray, "walker time 4"]
+    ) -> None:
+        """Moves the walkers and gathers everybody who moves as told."""
+        self._people = _NOBODY
+        if self._walkers is not None:
+            people, self._claims = self._walkers.step(t, self._vehicles, active, self._fixed.colour[t])
+            walked[:, t, :2], walked[:, t, 2], walked[:, t, 3] = people.xy, people.heading, people.speed
+            self._people = people
+        there = tuple(extra for extra in self._movers if extra.valid[t])
+        if there:
+            self._people = self._people.joined(boxes_at(there, t))
+
+    def _wanted(
+        self,
+        t: int,
+        fastest: Float64[np.ndarray, " v"],
+        ahead: Float64[np.ndarray, " v"],
+        active: Bool[np.ndarray, " v"],
+    ) -> Float64[np.ndarray, " v"]:
+        """The acceleration that each driver would like: the least that leaders, lines, things and speed allow.
+
+        The fastest speed that each driver likes is given for here, and for where it will be a little later.
+        """
+        gaps, leads = self._gaps, self._leads
+        gaps[0], leader = self._leaders.ahead(self._tables, self._at, active)
+        leads[0] = self._speed[leader]
+        # Lines and things are looked at by turns; in between they come nearer as they did.
+        if t % 2 or t == 0:
+            gaps[1] = self._stops(t, active, leader)
+        else:
+            gaps[1] -= self._speed * DT_S
+        if t % 2 == 0:
+            gaps[2], leads[2] = in_the_way(self._tables, self._vehicles, self._at, active, self._people)
+        else:
+            gaps[2] += (leads[2] - self._speed) * DT_S
+        # Speeds below zero are those of a told ego that reverses: to the law it stands.
+        speed = np.maximum(self._speed, 0.0)
+        following = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
+        # What stands still is not braked for harder than it takes to stop there, and a little more.
+        needed = speed**2 / (2 * np.maximum(gaps[1] - (2.0 - _STOP_SHORT_M), 0.1))
+        lines = np.maximum(following[1], -_FIRMLY * needed - 0.5)
+        wanted = np.minimum(np.minimum(following[0], lines), following[2])
+        wanted = np.minimum(wanted, (ahead - self._speed) / _SPEED_TIME_S)
+        return self._helping(wanted, fastest)
+
+    def _helping(
+        self, wanted: Float64[np.ndarray, " v"], fastest: Float64[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, " v"]:
+        """Makes room for those who must change lanes, and lets these fall in behind whom they will follow."""
+        h = self._helped
+        if len(h.behind):
+            gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
+            idm = self._drivers.chosen(h.behind).idm
+            speed = self._speed[h.behind]
+            helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
+            # Nobody who is past can be let in; nobody is helped by a standstill.
+            helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
+            np.minimum.at(wanted, h.behind, helpful)
+        return wanted
+
+    def _stops(
+        self, t: int, active: Bool[np.ndarray, " v"], leader: Int64[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, " v"]:
+        """Room as the law counts it (2 m are kept) to where to stop: lines, crossings, things, the lane's end."""
+        p, front = self._tables, self._at + self._half_m
+        promised = self._promised
+        if self._ego is not None and t >= self._ego.first_step:
+            then = min(t - self._ego.first_step + _FORESEEN, len(self._plan_at) - 1)
+            promised[0] = np.sum(p.way_begin[0] < self._plan_at[then] + self._half_m[0])
+        now = Moment(
+            step=t,
+            colour=self._fixed.colour[t],
+            to_red=self._fixed.to_red[t],
+            front_m=front,
+            rear_m=self._at - self._half_m,
+            speed=self._speed,
+            active=active,
+            room_m=self._gaps[0],
+            leader=leader,
+            leader_speed=self._leads[0],
+            promised=promised,
+            told=bool(promised[0] >= 0),
+        )
+        # Drivers stop closer to a line than to a bumper.
+        room = self._right_of_way.lines(now, p) + 2.0 - _STOP_SHORT_M
+        if np.count_nonzero(self._claims):
+            room = np.minimum(room, self._crossings(front) + 2.0 - _STOP_SHORT_M)
+        room = np.minimum(room, p.stop_m - front - _END_M)
+        if len(self._standing.boxes):
+            room = np.minimum(room, self._standing.gap(front) + 2.0 - _KEEP_M)
+        return room
+
+    def _crossings(self, front: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
+        """Distance to the next crossing that people claim; who cannot stop with ease when they come goes on."""
+        away = self._tables.crossing_m - front[:, None]
+        needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
+        halt = self._claims[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
+        if self._halting.shape != halt.shape:
+            self._halting = np.zeros_like(halt)
+        self._halting = halt & (needed < np.where(self._halting, _HARDEST_MPS2, _YIELD_MPS2))
+        return np.where(self._halting, away, np.inf).min(axis=1)
+
+    def _acted(self, t: int, wanted: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
+        """What drivers do: what they wanted a reaction time ago, or what the event makes them do."""
+        depth = len(self._memory)
+        if t == 0:
+            self._memory[:] = wanted
+        self._memory[t % depth] = wanted
+        result = self._memory[(t - self._delay) % depth, self._rows]
+        for override in self._staging.overrides:
+            if override.first_step <= t <= override.last_step:
+                who = override.vehicle
+                result[who] = min(result[who], override.acceleration_mps2)
+        return result
+
+    def _advance(
+        self, wanted: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
+    ) -> Float64[np.ndarray, " v"]:
+        """Moves everyone by one step and returns the accelerations; speeds never fall below zero."""
+        jerk = np.where(wanted < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
+        a = np.clip(wanted, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
+        after = self._speed + a * DT_S
+        halted = after <= 0.0
+        # Who stops inside the step travels v^2 / (2 |a|), and stands.
+        travelled = np.where(
+            halted, self._speed**2 / (2 * np.maximum(-a, 1e-9)), (self._speed + after) * DT_S / 2
+        )
+        self._at = self._at + np.where(active, travelled, 0.0)
+        self._last = np.where(halted, 0.0, a)
+        self._speed = np.where(active, np.maximum(after, 0.0), 0.0)
+        return a
+
+    def _decide(
+        self,
+        t: int,
+        wanted: Float64[np.ndarray, " v"],
+        fastest: Float64[np.ndarray, " v"],
+        active: Bool[np.ndarray, " v"],
+    ) -> None:
+        """Lane changes and ways around things that begin now."""
+        calm = (self._at > self._busy_m) & (self._rest <= t) & active
+        calm &= ~self._staged(t)
+        free = calm.copy()
+        free[0] = False
+        now = Situation(self._at, self._speed, active, free, fastest, wanted)
+        changes, self._helped = self._changes.decide(now, self._tables)
+        for change in changes:
+            self._change(t, change)
+            calm[change.vehicle] = False
+        if self._ego is not None and t >= self._ego.first_step:
+            calm[0] = False
+        self._pass(t, calm)
+
+    def _staged(self, t: int) -> Bool[np.ndarray, " v"]:
+        """Who does not decide because an event has decided for it."""
+        result = np.zeros(len(self._rows), bool)
+        for told in self._staging.overrides:
+            result[told.vehicle] |= t >= told.first_step
+        return result
+
+    def _change(self, t: int, change: Change) -> None:
+        row, present = change.vehicle, self._tables.paths[change.vehicle]
+        lanes = [change.lane]
+        ahead = {span.lane for span in present.spans}
+        while self._network.lanes[lanes[-1]].successors:
+            after = onward(self._network, lanes)
+            beside = [k for k in after if k in ahead]
+            # The old way where it is open, else one of the ways by turns: no chance is needed here.
+            lanes.append(beside[0] if beside else after[(row + len(lanes)) % len(after)])
+        sway = Sway((0.08,), (0.07,), (float(row),))
+        path, at = change_onto(
+            lane_path(self._network, tuple(lanes), sway), present, self._at[row], change.length_m
+        )
+        self._swap(row, path, at)
+        self._busy_m[row], self._rest[row] = at + change.length_m, t + round(_REST_S / DT_S)
+
+    def _pass(self, t: int, calm: Bool[np.ndarray, " v"]) -> None:
+        """Ways around what stands in the lane, for those who are near it and cannot change lanes in time."""
+        halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
+        stuck = np.zeros(len(self._rows), bool)
+        for told in self._staging.overrides:
+            stuck[told.vehicle] |= told.first_step <= t <= told.last_step and self._speed[told.vehicle] < 0.05
+        anybody = bool(stuck.any())
+        standing = self._standing.boxes
+        if anybody or len(halted):
+            near = calm & (self._speed < 3.0)
+            big = halted.chosen(halted.size_m[:, 0] > 1.2)
+            anybody |= len(big) > 0
+            standing = standing.joined(self._vehicles.chosen(stuck)).joined(big)
+        else:
+            near = calm & (self._standing.gap(self._at + self._half_m) < 45.0)
+        if not len(standing):
+            return
+        for row in np.flatnonzero(near & (self._speed < 9.0)).tolist():
+            front, half = self._at[row] + self._half_m[row], self._width_m[row] / 2
+            if anybody or self._standing.meets(row, front, half + DETOUR_MARGIN_M, LOOK_M):
+                self._pass_by(t, row, standing, stuck)
+
+    def _pass_by(self, t: int, row: int, standing: Boxes, stuck: Bool[np.ndarray, " v"]) -> None:
+        """A way around what stands ahead of a vehicle, if there is one."""
+        others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
+        moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
+        size = (float(2 * self._half_m[row]), float(self._width_m[row]))
+        who = swerver(self._network, self._tables, row, (self._at[row], self._speed[row]), size)
+        found = self._fixed.detours.find(who, standing, moving)
+        if found is not None:
+            path, end = found
+            self._swap(row, path, float(self._at[row]))
+            self._busy_m[row], self._rest[row] = end, t + round(_REST_S / DT_S)

@@ -1,1 +1,0 @@
-"""A scenario player in the browser."""
