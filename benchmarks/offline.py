@@ -27,8 +27,7 @@ from drivax import settings
 from drivax.curation.ensemble import ScoutsConfig, train_scouts
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.members import Agents
-from drivax.learning.program import Program
+from drivax.learning.program import Agents, Program
 from drivax.learning.sampler import draw, sampler
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet

@@ -25,8 +25,7 @@ from drivax import settings
 from drivax.learning.algorithms.ppo import Ppo
 from drivax.learning.collector import collect
 from drivax.learning.config import TrainConfig
-from drivax.learning.members import Agents
-from drivax.learning.program import Program
+from drivax.learning.program import Agents, Program
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import versions

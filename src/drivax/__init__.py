@@ -32,7 +32,7 @@ _HOMES = {
 }
 
 #: jaxlib 0.10's CPU client runs the parts of a program on a pool of threads, and in programs that train several agents
-#: side by side one now and then is never woken up again (see also ``learning.threads``). Without its scheduler for
+#: side by side one now and then is never woken up again (see also ``learning.devices``). Without its scheduler for
 #: concurrency the parts run one after the other. XLA ends a process that gives a flag it does not know; so the version
 #: counts.
 _XLA_FLAG, _XLA_SERIES = "--xla_cpu_enable_concurrency_optimized_scheduler", "0.10."

@@ -15,8 +15,7 @@ from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.loop import train
-from drivax.learning.members import Agents
-from drivax.learning.program import Program
+from drivax.learning.program import Agents, Program
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet

@@ -12,7 +12,7 @@ from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import logged, train
-from drivax.learning.stopping import Preempted
+from drivax.learning.training_log import Preempted
 from drivax.tracking.sinks import MetricLog, read_rows
 
 NETWORK = {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]}

@@ -15,7 +15,7 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
-from drivax.learning.stopping import patience_is_up
+from drivax.learning.training_log import patience_is_up
 from drivax.learning.validation import rank
 from drivax.report.loaded_runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank

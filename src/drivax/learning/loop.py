@@ -18,11 +18,9 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.first_state import first_state, inherited, with_step
 from drivax.learning.folders import create_folders, facts, resumed_folders
-from drivax.learning.members import Agents
 from drivax.learning.policy_traffic import find_traffic
-from drivax.learning.program import Program
-from drivax.learning.stopping import Preempted, StopSignal
-from drivax.learning.training_log import Journal
+from drivax.learning.program import Agents, Program
+from drivax.learning.training_log import Journal, Preempted, StopSignal
 from drivax.learning.validation import Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
