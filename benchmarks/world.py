@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from drivax.api import evaluate, load
+from drivax.files import write_text
 from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
@@ -37,7 +38,7 @@ from drivax.synthetic.events.kinds import SEVERITY_MPS2
 from drivax.synthetic.expert.comfort import LIMITS
 from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
-from drivax.tracking.run_folder import versions, write_text
+from drivax.tracking.run_folder import versions
 from world_measures import (
     NEAR_S,
     against,

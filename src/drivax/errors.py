@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+#: The extra that installs a package, by the name under which the package is imported.
+_EXTRAS = {
+    "google": "womd", "google_crc32c": "womd", "pyarrow": "av2", "shapely": "maps", "pyproj": "maps",
+    "matplotlib": "show", "av": "show", "tensorboardX": "track", "gymnasium": "gym",
+}  # fmt: skip
 
 
 class DrivaxError(Exception):
@@ -52,3 +60,19 @@ class UsageError(DrivaxError):
     """The command, an option or a configuration value cannot be what the user meant."""
 
     status = 2
+
+
+def missing_package(error: ImportError) -> UsageError | None:
+    """Return the error for an optional package that is not installed, None if no extra installs it."""
+    package = (error.name or "").split(".")[0]
+    if package not in _EXTRAS:
+        return None
+    return UsageError(f"{package} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
+
+
+def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return the cure for an unknown name: the closest known name, or all of them."""
+    known = list(names)
+    if close := difflib.get_close_matches(name, known, n=1, cutoff=cutoff):
+        return f"did you mean {close[0]!r}?"
+    return f"use one of {', '.join(known)}" if known else "there are none"

@@ -1,4 +1,4 @@
-"""Folders under construction: hidden, locked, continued after a kill, and published by one rename.
+"""Output files and folders: checked before the work, written under a hidden name, published by one rename.
 
 While the folder ``sets/a`` is being written, ``sets/.a.partial`` holds::
 
@@ -17,7 +17,7 @@ import glob
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -40,15 +40,71 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def check_output(path: Path, overwrite: bool, *, folder: bool = False) -> None:
+    """Refuse an output that exists, before any work is done.
+
+    Args:
+        path: The file, or the folder, to be written.
+        overwrite: Whether an existing one of the same kind may be replaced.
+        folder: Whether a folder is to be written.
+
+    Raises:
+        UsageError: It exists and ``overwrite`` is not given, or it is a file where a folder is to be written, or the
+            other way round.
+    """
+    if not path.exists():
+        return
+    if path.is_dir() != folder:
+        there, wanted = ("a folder", "file") if path.is_dir() else ("a file", "folder")
+        raise UsageError(f"output is {there}", file=path, cure=f"name a {wanted} to write")
+    if not overwrite:
+        kind = "folder" if folder else "file"
+        raise UsageError(
+            f"output {kind} already exists", file=path, cure="choose another or pass --overwrite"
+        )
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a binary file that takes the name ``path`` once it is complete and on the disk; an error leaves nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    try:
+        with partial.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+        sync_folder(path.parent)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    with atomic_write(path) as file:
+        file.write(text.encode())
+
+
 def write_json(path: Path, value: Any) -> None:
-    """Write strict JSON so that a file of this name is whole or not there."""
-    draft = path.with_name(f".{path.name}")
-    file = draft.open("wb")
-    with file:
-        file.write(json.dumps(value, indent=1, allow_nan=False).encode())
-        sync_and_close(file)
-    draft.rename(path)
-    sync_folder(path.parent)
+    """Write strict JSON atomically."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False))
+
+
+@contextlib.contextmanager
+def replace_folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder that takes the place of ``path`` once it is complete; an error changes nothing there."""
+    partial, old = (path.parent / f".{path.name}.{name}-{os.getpid()}" for name in ("partial", "old"))
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if path.exists():
+            path.rename(old)
+        partial.rename(path)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 class PartialFolder:

@@ -5,17 +5,15 @@ Below every room but the errors, so that rooms which know no YAML can find what 
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import inspect
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 
 _FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 
@@ -40,9 +38,7 @@ def find_named(name: str) -> Any:
     for part in path.split("."):
         if not hasattr(found, part):
             inside = [known for known in vars(found) if not known.startswith("_")]
-            near = difflib.get_close_matches(part, inside, n=1)
-            cure = f"did you mean {near[0]!r}?" if near else f"define {part} there"
-            raise UsageError(f"{name!r}: {module_name!r} has no {part!r}", cure=cure)
+            raise UsageError(f"{name!r}: {module_name!r} has no {part!r}", cure=did_you_mean(part, inside))
         found = getattr(found, part)
     return found
 
@@ -125,11 +121,3 @@ def protocol_members(protocol: Any) -> list[str]:
             own = [*vars(cls).get("__annotations__", {}), *vars(cls)]
             names += [n for n in own if not n.startswith("_") and n not in names]
     return names
-
-
-def nearest(name: str, names: Sequence[str]) -> str:
-    """A cure for a misspelt name: the nearest valid one, else all of them."""
-    near = difflib.get_close_matches(name, names, n=1)
-    if near:
-        return f"did you mean {near[0]!r}?"
-    return f"use one of {', '.join(names)}" if names else "there are none"

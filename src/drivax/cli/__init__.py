@@ -9,7 +9,6 @@ argument.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
@@ -19,7 +18,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from drivax.errors import DrivaxError, UsageError
+from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
 
 
 @dataclass(frozen=True)
@@ -65,19 +64,6 @@ COMMANDS = {
     ),
 }
 
-#: Packages that come with an extra, by the name they are imported under.
-_EXTRAS = {
-    "google_crc32c": "womd",
-    "google": "womd",
-    "pyarrow": "av2",
-    "shapely": "maps",
-    "pyproj": "maps",
-    "matplotlib": "show",
-    "av": "show",
-    "tensorboardX": "track",
-    "gymnasium": "gym",
-}
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
@@ -114,8 +100,8 @@ def describe(error: BaseException) -> tuple[str, int]:
         return str(error), error.status
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", 130
-    if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get((error.name or "").split(".")[0])):
-        return f"{error.name} is not installed; pip install 'drivax[{extra}]'", 1
+    if isinstance(error, ImportError) and (missing := missing_package(error)):
+        return str(missing), 1
     if isinstance(error, OSError) and error.strerror:
         place = "" if error.filename is None else f"{error.filename}: "
         return f"{place}{error.strerror}", 1
@@ -149,10 +135,8 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"drivax {metadata.version('drivax')}")
         return 0
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        cure = f"did you mean {near[0]!r}?" if near else "see drivax --help"
         kind = "option" if name.startswith("-") else "command"
-        raise UsageError(f"there is no {kind} {name!r}", cure=cure)
+        raise UsageError(f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS))
     return _run(name, COMMANDS[name], rest)
 
 

@@ -54,10 +54,10 @@ def run(args: Compare) -> int:
     from drivax.evaluation.comparison import compare
     from drivax.evaluation.plan import ComparisonPlan
     from drivax.evaluation.stored import open_driven_set, read_seeds
+    from drivax.files import write_text
     from drivax.report.comparison_text import comparison_text
     from drivax.report.pages.comparison import write_comparison
     from drivax.report.pages.page import refuse_page
-    from drivax.tracking.run_folder import write_text
 
     if len(args.runs) not in (0, 2):
         raise UsageError(f"{len(args.runs)} runs are named", cure="write drivax compare A B")

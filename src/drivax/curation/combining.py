@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.errors import UsageError
-from drivax.plugins import nearest
+from drivax.errors import UsageError, did_you_mean
 
 Steps = Float[np.ndarray[Any, Any], "N T"]
 Valid = Bool[np.ndarray[Any, Any], "N T"]
@@ -58,7 +57,7 @@ class Combination:
         """
         for name in (*self.weights, *(() if isinstance(self.scenario, str) else self.scenario)):
             if name not in there:
-                raise UsageError(f"there is no component {name!r}", cure=nearest(name, sorted(there)))
+                raise UsageError(f"there is no component {name!r}", cure=did_you_mean(name, sorted(there)))
 
     def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
         """Scores in [0, 1]: of every step the weighted mean of its components, and of every scenario.

@@ -20,9 +20,8 @@ from drivax.curation.published import PublishedConfig
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.scoring import Progress, score_steps, valid_steps
-from drivax.errors import DataError, UsageError
+from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.networks.distributions import Actions
-from drivax.plugins import nearest
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 from drivax.stats.ranking import rank_correlation
@@ -97,7 +96,7 @@ def curate(name: str, wanted: Wanted) -> ScoreTable:
         DataError: It cannot score this set.
     """
     if name not in METHODS:
-        raise UsageError(f"there is no method {name!r}", cure=nearest(name, sorted(METHODS)))
+        raise UsageError(f"there is no method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
     if (wanted.like is not None) != (name == "random_matched"):
         raise UsageError(
             "random_matched needs --like, a table of the same set, and no other method takes it",

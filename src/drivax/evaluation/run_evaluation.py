@@ -9,6 +9,7 @@ from typing import Any
 
 from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate_scenarios
+from drivax.files import replace_folder
 from drivax.metrics.selection import selected
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.sizes import Sizes
@@ -21,7 +22,7 @@ from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, learned_from, refuse_existing, replacing
+from drivax.tracking.run_folder import RunFolder, learned_from, refuse_existing
 
 #: Columns of the headline, with their short names.
 HEADLINE = {
@@ -103,7 +104,7 @@ def run_evaluation(
     if trained := learned_from(config.planner):
         notes["trained_on"] = trained
     # A folder of that name is always a whole run.
-    with replacing(Path(out)) as partial:
+    with replace_folder(Path(out)) as partial:
         RunFolder.create(partial, config, data=[data], overwrite=True, **notes, **results.notes())
         results.write(partial)
     return results

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from drivax.errors import UsageError
-from drivax.plugins import nearest
+from drivax.errors import UsageError, did_you_mean
 from drivax.stats.clusters import dense, stratum_of_clusters
 
 #: Strata of fewer recordings than this are taken together.
@@ -49,7 +48,7 @@ def strata_of(entries: Sequence[Mapping[str, Any]], tags: Sequence[str]) -> list
     known = {name: None for entry in entries for name in entry["tags"]}
     for tag in tags:
         if tag not in known:
-            raise UsageError(f"no scenario has a tag {tag!r}", cure=nearest(tag, list(known)))
+            raise UsageError(f"no scenario has a tag {tag!r}", cure=did_you_mean(tag, list(known)))
     return [" ".join(str(entry["tags"].get(tag, "unknown")) for tag in tags) for entry in entries]
 
 

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.results import NOT_SUMMARISED
 from drivax.evaluation.stored import EpisodeTable, mismatch
-from drivax.plugins import nearest
 
 
 def refuse_misfits(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
@@ -61,7 +60,7 @@ def refuse_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool)
     for table in tables:
         if metric not in table.metrics:
             known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
-            raise UsageError(f"{table.folder} has no metric {metric!r}", cure=nearest(metric, known))
+            raise UsageError(f"{table.folder} has no metric {metric!r}", cure=did_you_mean(metric, known))
     if metric in NOT_SUMMARISED:
         raise UsageError(f"no mean of {metric} makes sense", cure="choose another metric")
     if metric.endswith("_partial"):

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.metrics.catalogue import EVENTS, METRICS, SETS, Metric, Operator
 from drivax.metrics.steps import StepValue
-from drivax.plugins import find_named, is_dotted, nearest
+from drivax.plugins import find_named, is_dotted
 from drivax.simulator.types import FACTS
 
 #: What a configuration says: the name of a set, or names of sets, metrics and metrics of the user's own.
@@ -87,7 +87,7 @@ def catalogue(wanted: Wanted) -> Mapping[str, Metric]:
 
 def _known(name: str) -> str:
     if name not in METRICS:
-        raise UsageError(f"there is no metric {name!r}", cure=nearest(name, [*SETS, *METRICS]))
+        raise UsageError(f"there is no metric {name!r}", cure=did_you_mean(name, [*SETS, *METRICS]))
     return name
 
 
@@ -99,7 +99,9 @@ def _own(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
         raise UsageError(f"{entry!r}: there is another metric {name!r}", cure="give it another name")
     missing = [one for one in found.inputs if one not in METRICS and one not in others]
     if missing:
-        raise UsageError(f"{entry!r} is computed from {missing[0]!r}", cure=nearest(missing[0], [*METRICS]))
+        raise UsageError(
+            f"{entry!r} is computed from {missing[0]!r}", cure=did_you_mean(missing[0], [*METRICS])
+        )
     return found
 
 

@@ -9,11 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.evaluation.results import ADDED
 from drivax.evaluation.tables import Cell, Table, collisions_table, differences_table, results_table
 from drivax.metrics.catalogue import METRICS, SETS
-from drivax.plugins import nearest
 from drivax.report.breakdowns import strata_tables, transfer_tables
 from drivax.report.comparison import metric_names
 from drivax.report.episodes import DrivenSet
@@ -82,7 +81,7 @@ def exported(runs: Sequence[Evaluation], more: Sequence[str] = ()) -> list[str]:
     asked = {"progress"}
     for entry in more:
         if entry not in SETS and entry not in names:
-            raise UsageError(f"no run has a mean of {entry!r}", cure=nearest(entry, names))
+            raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
         asked.update(SETS.get(entry, (entry,)))
     first = headline(names)
     rest = [name for name in names if name in asked or name not in (*METRICS, *ADDED)]

@@ -14,8 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from drivax.errors import UsageError
-from drivax.plugins import nearest
+from drivax.errors import UsageError, did_you_mean
 from drivax.settings.structure import Flag, kind_of, plain, structure
 from drivax.settings.text import parse_yaml, write_yaml
 
@@ -62,7 +61,7 @@ def preset(name: str) -> Path:
     """
     names = presets()
     if name not in names:
-        raise UsageError(f"there is no preset or file {name!r}", cure=nearest(name, names))
+        raise UsageError(f"there is no preset or file {name!r}", cure=did_you_mean(name, names))
     return _configs() / f"{name}.yaml"
 
 

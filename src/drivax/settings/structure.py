@@ -15,8 +15,8 @@ import cattrs
 from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError, IterableValidationError
 from cattrs.gen import make_dict_structure_fn
 
-from drivax.errors import DrivaxError, UsageError
-from drivax.plugins import dotted_name, find_named, is_dotted, nearest, refuse_arguments, refuse_missing
+from drivax.errors import DrivaxError, UsageError, did_you_mean
+from drivax.plugins import dotted_name, find_named, is_dotted, refuse_arguments, refuse_missing
 from drivax.settings.text import parse_yaml
 
 _UNIONS = (Union, types.UnionType)
@@ -119,7 +119,7 @@ def _to_literal(value: Any, cls: Any) -> Any:
         for candidate in allowed:
             if type(option) in (type(candidate), Flag) and option == candidate:
                 return candidate
-    near = nearest(str(value), [str(option) for option in allowed])
+    near = did_you_mean(str(value), [str(option) for option in allowed])
     raise ValueError(f"{str(value)!r} is none of {', '.join(map(str, allowed))}; {near}")
 
 
@@ -210,7 +210,7 @@ def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
         raise ValueError(f"has no kind; use one of {', '.join(records)}")
     kind = str(value["kind"])
     if kind not in records:
-        raise ValueError(f"there is no kind {kind!r}; {nearest(kind, list(records))}")
+        raise ValueError(f"there is no kind {kind!r}; {did_you_mean(kind, list(records))}")
     if "kind" not in {field.name for field in dataclasses.fields(records[kind])}:
         del value["kind"]
     return _converter().structure(value, records[kind])
@@ -312,7 +312,7 @@ def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
     if isinstance(error, ForbiddenExtraKeysError):
         names = [field.name for field in dataclasses.fields(error.cl)]
         unknown = sorted(error.extra_fields)[0]
-        return f"there is no such setting; {nearest(unknown, names)}", _join(path, unknown)
+        return f"there is no such setting; {did_you_mean(unknown, names)}", _join(path, unknown)
     if isinstance(error, ClassValidationError | IterableValidationError):
         noted, plain_errors = error.group_exceptions()
         if noted:

@@ -14,12 +14,11 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array
 
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.learning.driving import Driving
 from drivax.networks.encoders import EncoderConfig, GroupSpec, MlpConfig
 from drivax.networks.entity import EntityConfig
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
-from drivax.plugins import nearest
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator.simulator import Simulator
@@ -72,7 +71,9 @@ class EncoderBench:
     def __post_init__(self) -> None:
         for name in self.only:
             if name not in ENCODERS and name not in VARIANTS:
-                raise UsageError(f"there is no encoder {name!r}", cure=nearest(name, [*ENCODERS, *VARIANTS]))
+                raise UsageError(
+                    f"there is no encoder {name!r}", cure=did_you_mean(name, [*ENCODERS, *VARIANTS])
+                )
         if not self.batches or min(*self.batches, self.repeats, 1) < 1:
             raise UsageError(
                 f"batches {self.batches}, repeats {self.repeats}", cure="use at least one, of 1 or more"

@@ -14,6 +14,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.evaluation.run_evaluation import EvaluationConfig, format_summary, run_evaluation
 from drivax.evaluation.tables import paired_differences
+from drivax.files import write_text
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
@@ -25,7 +26,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import describe_run, write_text
+from drivax.tracking.run_folder import describe_run
 
 #: Planners that the trained policy is compared with.
 REFERENCES = ("expert", "constant_velocity", "idm")

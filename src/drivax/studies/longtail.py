@@ -23,6 +23,7 @@ from drivax.curation.subset import top_rows
 from drivax.curation.weights import draws_of
 from drivax.errors import UsageError
 from drivax.evaluation.stored import read_evaluation
+from drivax.files import write_text
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.folders import hashes
@@ -72,7 +73,7 @@ from drivax.studies.longtail_results import (
     summary,
 )
 from drivax.tracking.checkpoints import Checkpoints
-from drivax.tracking.run_folder import RunFolder, write_text
+from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.sinks import read_rows
 from drivax.tracking.workers import one_core_each
 

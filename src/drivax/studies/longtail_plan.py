@@ -13,9 +13,8 @@ from drivax import settings
 from drivax.curation.arms import AGENTS
 from drivax.curation.ensemble import ScoutsConfig
 from drivax.curation.weights import WeightConfig
-from drivax.errors import UsageError
+from drivax.errors import UsageError, did_you_mean
 from drivax.learning.config import TrainConfig
-from drivax.plugins import nearest
 
 #: Which recorded steps are learned from.
 Usable = Bool[np.ndarray, "N T"]
@@ -63,7 +62,7 @@ class LongtailConfig:
     def __post_init__(self) -> None:
         for name in self.agents:
             if name not in AGENTS:
-                raise UsageError(f"there is no agent {name!r}", cure=nearest(name, list(AGENTS)))
+                raise UsageError(f"there is no agent {name!r}", cure=did_you_mean(name, list(AGENTS)))
         if missing := [name for name in FIRST if name not in self.agents]:
             raise UsageError(f"a study without {missing[0]}", cure="everything is compared with it; add it")
         if self.seeds < 2 or self.validations < 4:

@@ -12,8 +12,7 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
-from drivax.plugins import nearest
+from drivax.errors import UsageError, did_you_mean
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ROUTE_COS, ROUTE_SIN, ScenarioBank
 from drivax.scenario.schema import Flag
@@ -89,7 +88,7 @@ class Features:
             place = f"observation.features.{field.name}"
             for number, name in enumerate(chosen):
                 if name not in known:
-                    raise UsageError(f"{place} has no {name!r}", cure=nearest(name, known))
+                    raise UsageError(f"{place} has no {name!r}", cure=did_you_mean(name, known))
                 if name in chosen[:number]:
                     raise UsageError(f"{place} names {name!r} twice", cure="name it once")
             object.__setattr__(self, field.name, tuple(name for name in known if name in chosen))

@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
-from drivax.plugins import nearest
+from drivax.errors import UsageError, did_you_mean
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import (
     LIGHT_ARC,
@@ -146,7 +145,9 @@ class ObservationConfig:
             UsageError: There is none of that name.
         """
         if name not in PRESETS:
-            raise UsageError(f"there is no observation preset {name!r}", cure=nearest(name, list(PRESETS)))
+            raise UsageError(
+                f"there is no observation preset {name!r}", cure=did_you_mean(name, list(PRESETS))
+            )
         return PRESETS[name]
 
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.tracking.run_folder import write_text
+from drivax.files import write_text
 
 ABOUT = "about.json"
 _ARRAYS = "arrays"

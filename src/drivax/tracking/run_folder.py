@@ -11,11 +11,9 @@ import json
 import os
 import platform
 import shlex
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -24,6 +22,7 @@ from typing import Any, TypeVar
 
 from drivax import settings
 from drivax.errors import DataError, UsageError
+from drivax.files import replace_folder, write_text
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.zoo import is_policy, policy_folder
 
@@ -71,7 +70,7 @@ class RunFolder:
         path = Path(path)
         refuse_existing(path, overwrite, notes.get("kind"))
         info = describe_run(data) | notes
-        with replacing(path) as partial:
+        with replace_folder(path) as partial:
             write_text(partial / CONFIG_FILE, settings.dump(config))
             write_text(partial / RUN_FILE, json.dumps(info, indent=1) + "\n")
         return cls(path, info)
@@ -226,32 +225,6 @@ def git_state(folder: Path) -> dict[str, Any] | None:
         return {"commit": git("rev-parse", "HEAD"), "changed": bool(changed)}
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def write_text(file: Path, text: str) -> None:
-    """Write a text file so that it is either the old one or the whole new one."""
-    partial = file.with_name(f".{file.name}.partial-{os.getpid()}")
-    with partial.open("w", encoding="utf-8") as out:
-        out.write(text)
-        out.flush()
-        os.fsync(out.fileno())
-    partial.replace(file)
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A new folder that takes the place of ``path`` when all is written; an error changes nothing there."""
-    partial, old = (path.parent / f".{path.name}.{what}-{os.getpid()}" for what in ("partial", "old"))
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        if path.exists():
-            path.rename(old)
-        partial.rename(path)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def refuse_existing(path: Path, overwrite: bool, kind: str | None = None) -> None:

@@ -59,9 +59,9 @@ def colours() -> str:
     return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
 
 
-def asset(name: str, package: str = "drivax.show") -> str:
-    """Text of a file that comes with a package."""
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")
+def asset(name: str) -> str:
+    """Return the text of a file in ``assets``."""
+    return resources.files("drivax.report.pages").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def refuse_page(out: Path, overwrite: bool) -> None:

@@ -89,9 +89,9 @@ def _page(scenarios: Sequence[Scenario], title: str, beside: Sequence[str]) -> s
         title,
         f"<p class=lead><b>{len(scenarios)}</b> recorded drives; {judged}.</p>",
         [_browser(scenarios, beside)],
-        asset("browser.css", "drivax.viewer"),
+        asset("browser.css"),
         player_data(packed),
-        [*player_scripts(), asset("browser.js", "drivax.viewer")],
+        [*player_scripts(), asset("browser.js")],
     )
 
 

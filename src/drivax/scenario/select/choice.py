@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from drivax.errors import DataError, DrivaxError, UsageError
-from drivax.plugins import nearest
+from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean
 from drivax.scenario.select.filters import Selection, tag_words
 
 #: So many names that are not in a set are told; how many others there are follows.
@@ -123,6 +122,6 @@ def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
             words = {
                 word for entry in data.entries for word in tag_words(entry, one.name.removeprefix("tag."))
             }
-            cure = nearest(str(one.values[0]), sorted(words)) if words else "loosen it"
+            cure = did_you_mean(str(one.values[0]), sorted(words)) if words else "loosen it"
             return DataError(f"no scenario is selected by {one.text!r}", file=data.path, cure=cure)
     return DataError("no scenario is selected", file=data.path, cure="loosen the filters, or name others")
