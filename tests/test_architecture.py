@@ -12,7 +12,7 @@ import pytest
 
 #: Rooms that are pure functions on arrays: nothing but these, the standard library and rooms below.
 PURE_ROOMS = ("geometry", "scenario", "simulator", "metrics", "tasks", "rl")
-PURE_PACKAGES = {"numpy", "jax", "jaxtyping"}
+PURE_PACKAGES = {"numpy", "jax", "jaxtyping", "lazy_loader"}
 #: Modules of pure rooms that read or write files.
 EDGES = {"scenario/store.py", "scenario/manifest.py"}
 #: Functions that are one long table.
