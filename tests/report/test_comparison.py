@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import comparable, mismatch
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.report.comparison import difference
@@ -67,8 +67,8 @@ def test_worse_is_said_where_less_is_better(evaluations):
 def test_only_the_same_scenarios_and_traffic_are_compared(evaluations):
     expert, _, policy = evaluations
     assert comparable(expert, policy)
-    other = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
-    moved = dataclasses.replace(expert, about={**expert.about, "data": {"hash": "0000", "path": "x"}})
+    other = dataclasses.replace(expert, info={**expert.info, "traffic": "idm"})
+    moved = dataclasses.replace(expert, info={**expert.info, "data": {"hash": "0000", "path": "x"}})
     assert not comparable(other, policy) and not comparable(moved, policy)
     assert mismatch(other, policy) == (
         "drove in different traffic (idm and log)", "evaluate both with the same --traffic",
@@ -99,13 +99,15 @@ def test_outcomes_and_choice(evaluations):
 
 def test_a_run_that_lacks_a_scenario_or_is_not_comparable_is_left_out(evaluations):
     expert, constant, policy = evaluations
-    trajectories = dataclasses.replace(
-        constant.trajectories, rows={k: v for k, v in constant.trajectories.rows.items() if k[0] != "hand-01"}
+    rows = [row for row, name in enumerate(constant.keys["scenario_id"]) if name != "hand-01"]
+    constant = dataclasses.replace(
+        constant,
+        keys={name: tuple(column[row] for row in rows) for name, column in constant.keys.items()},
+        metrics={name: values[rows] for name, values in constant.metrics.items()},
     )
-    constant = dataclasses.replace(constant, trajectories=trajectories)
-    expert = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
+    expert = dataclasses.replace(expert, info={**expert.info, "traffic": "idm"})
     rows = {choice.scenario_id: choice.rows for choice in choose([expert, constant, policy], 8)}
-    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 3, 3)
+    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 2, 3)
 
 
 def test_glossary():

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.results import Results, interval_of
-from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, comparable
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey, interval_of
+from drivax.evaluation.pairing import Pairs, comparable
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
 from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
@@ -99,16 +99,15 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
     return paired_bootstrap(mine, theirs, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
-def paired_differences(one: Results, other: Results, metric: str) -> Interval:
-    """:func:`paired_difference` of evaluations that have just been made.
+def paired_differences(one: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
+    """:func:`paired_difference` of evaluations on the same scenarios.
 
     Raises:
-        UsageError: If they did not drive the same scenarios.
+        UsageError: They are not the same.
     """
-    tables = EpisodeTable.of(one), EpisodeTable.of(other)
-    if len({frozenset(table.scenarios) for table in tables}) > 1:
-        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
-    return paired_difference(*tables, metric)
+    if set(one.scenarios) != set(other.scenarios):
+        raise UsageError("evaluations on different scenarios", cure="evaluate both on one set")
+    return paired_difference(one, other, metric)
 
 
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
@@ -185,7 +184,7 @@ def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
 
 
 def _trained_on(run: EpisodeTable) -> Sequence[Mapping[str, Any]]:
-    return run.about.get("trained_on") or ()
+    return run.info.get("trained_on") or ()
 
 
 def _set_key(entry: Mapping[str, Any]) -> str:
@@ -199,12 +198,12 @@ def _set_name(entry: Mapping[str, Any]) -> str:
 
 def _planner_key(run: EpisodeTable) -> str:
     """Who drove: what the command called it, or else the planner's name."""
-    return str(run.settings.get("planner") or run.about.get("planner", run.name))
+    return str(run.settings.get("planner") or run.planner)
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     """A name for each planner by its key: its own, or where two share that, as much of their paths as it takes."""
-    own = {_planner_key(run): str(run.about.get("planner", run.name)) for run in runs}
+    own = {_planner_key(run): str(run.planner) for run in runs}
     named = {}
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from drivax.evaluation.stored import ScenarioKey
+from drivax.evaluation.episode_table import ScenarioKey
 from drivax.evaluation.tables import (
     READINGS,
     STRATA,
@@ -45,7 +45,7 @@ def collision_section(runs: Sequence[Evaluation]) -> str:
         for words, reading in READINGS.values()
     )
     total = ", ".join(
-        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {run.episodes}"
+        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
         for run in runs
         if run.name in table.columns
     )

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.report.loaded_runs import Evaluation
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).
@@ -70,7 +71,7 @@ def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]
         known = 1.0 if np.isnan(score) else score
         return rank[outcome(run, row)], known, -done[scenarios[row]], scenarios[row][1], row
 
-    return sorted(range(run.episodes), key=key)
+    return sorted(range(len(run)), key=key)
 
 
 def choose(runs: Sequence[Evaluation], count: int) -> list[Choice]:
@@ -121,11 +122,10 @@ def _places(runs: Sequence[Evaluation]) -> list[tuple[int | None, ...]]:
 
 
 def _first_rows(run: Evaluation) -> dict[tuple[str, str], int]:
-    """(data set, scenario id) -> first episode of that scenario whose trajectory is stored."""
+    """(data set, scenario id) -> first episode of that scenario."""
     rows: dict[tuple[str, str], int] = {}
-    for row, (key, dataset) in enumerate(zip(run.occurrences, run.keys["dataset"], strict=True)):
-        if key in run.trajectories.rows:
-            rows.setdefault((dataset, key[0]), row)
+    for row, key in enumerate(run.scenarios):
+        rows.setdefault(key, row)
     return rows
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.evaluation.stored import ScenarioKey, open_driven_set
+from drivax.evaluation.episode_table import ScenarioKey
 from drivax.evaluation.traffic_trajectories import unpacked
 from drivax.report.charts.motion import COMMANDED
 from drivax.report.episode_selection import Choice, outcome
@@ -32,7 +32,7 @@ class DrivenSet:
     """
 
     def __init__(self, run: Evaluation, data: Path | None = None) -> None:
-        self.scenarios: ScenarioSet = open_driven_set(run, data)
+        self.scenarios: ScenarioSet = run.open_set(data)
         self._rows = {
             (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
         }
@@ -66,20 +66,20 @@ def drives_of(runs: Sequence[Evaluation], choice: Choice, scenario: Scenario) ->
 
 def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
     stored = run.trajectories
-    place = stored.rows[run.occurrences[row]]
-    steps, start = int(scenario.steps), int(stored.start[place])
+    steps, start = int(scenario.steps), int(stored.start[row])
     ego = np.full((steps, 4), np.nan)
     ego[:start] = logged_drive(scenario)[:start]
-    driven = stored.ego[place, : steps - start]
+    driven = stored.ego[row, : steps - start]
     ego[start : start + len(driven)] = driven
-    events = {name: int(at[place]) for name, at in stored.events.items()}
-    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
-    action, asked = np.full((steps, COMMANDED), np.nan), stored.action[place, : steps - start, :COMMANDED]
+    events = {name: int(at[row]) for name, at in stored.events.items()}
+    crashed = {(crash.dataset, crash.scenario_id): crash.step for crash in run.crashes}
+    events["crashed"] = crashed.get(run.scenarios[row], -1)
+    action, asked = np.full((steps, COMMANDED), np.nan), stored.action[row, : steps - start, :COMMANDED]
     action[start : start + len(asked), : asked.shape[1]] = asked
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(driven)] = unpacked(stored.others[place, : steps - start])
+        others[start : start + len(driven)] = unpacked(stored.others[row, : steps - start])
     return Drive(run.name, ego, start, events, outcome(run, row), action, others)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.results import ADDED
+from drivax.evaluation.episode_table import ADDED
 from drivax.evaluation.tables import Cell, Table, collisions_table, differences_table, results_table
 from drivax.metrics.catalogue import METRICS, SETS
 from drivax.report.breakdowns import strata_tables, transfer_tables

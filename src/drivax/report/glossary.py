@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from drivax.evaluation.results import ADDED, NOT_SUMMARISED, RATES
+from drivax.evaluation.episode_table import ADDED, NOT_SUMMARISED, RATES
 from drivax.metrics.catalogue import METRICS
 from drivax.report.loaded_runs import Evaluation
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from drivax.evaluation.stored import mismatch
+from drivax.evaluation.pairing import mismatch
 from drivax.evaluation.tables import Row, Table, summarise
 from drivax.report.comparison import Difference, difference
 from drivax.report.glossary import ARROWS, Note, note
@@ -128,7 +128,7 @@ def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
 
 def _planner(run: Evaluation) -> str:
     name = escape(run.name).replace("_", "_<wbr>")
-    return f"<th scope=row>{name}<small>{run.episodes} episodes, {escape(run.traffic)} traffic</small></th>"
+    return f"<th scope=row>{name}<small>{len(run)} episodes, {escape(run.traffic)} traffic</small></th>"
 
 
 def _heading(metric: str, entry: Note, scope: str = "col") -> str:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from drivax.evaluation.results import RATES
-from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.episode_table import RATES, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import UNKNOWN
 from drivax.report.breakdowns import Tags
 from drivax.report.comparison import metric_names
@@ -83,6 +83,7 @@ def _run(
     outcomes = [outcome(run, row) for row in rows]
     words = list(dict.fromkeys(outcomes))
     scenarios = run.scenarios
+    crashes = {(crash.dataset, crash.scenario_id): (crash.step, crash.error) for crash in run.crashes}
     return {
         "name": run.name,
         "playable": comparable(run, runs[-1]),
@@ -90,9 +91,7 @@ def _run(
         "outcomes": words,
         "outcome": [words.index(word) for word in outcomes],
         "errors": {
-            str(place): run.crashes[scenarios[row]]
-            for place, row in enumerate(rows)
-            if scenarios[row] in run.crashes
+            str(place): crashes[scenarios[row]] for place, row in enumerate(rows) if scenarios[row] in crashes
         },
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.stored import ScenarioKey, comparable, mismatch
+from drivax.evaluation.episode_table import ScenarioKey
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import CONFIDENCE, summarise
 from drivax.report.breakdowns import Tags, collision_section, strata_section, transfer_section
 from drivax.report.charts.curves import curve_sections
@@ -109,7 +110,7 @@ def _lead(runs: Sequence[Evaluation]) -> str:
     found = {name: summarise(policy, name) for name in words}
     name = next((name for name in words if found[name].mean is not None), None)
     if name is None:
-        return f"<p class=lead><b>{escape(policy.name)}</b> drove {policy.episodes} episodes of {where}.</p>"
+        return f"<p class=lead><b>{escape(policy.name)}</b> drove {len(policy)} episodes of {where}.</p>"
     interval = found[name]
     share = number(interval.mean, "rate") + percent("rate")
     return (
@@ -223,7 +224,7 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
     """Where the numbers come from: commands, data, versions and the whole of every ``run.json``."""
     rows = []
     for run in runs:
-        about = run.about
+        about = run.info
         data = run.data if isinstance(run, Evaluation) else {}
         versions = about.get("versions")
         facts = {
@@ -236,7 +237,7 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
         cells = "".join(f"<td>{escape(text) or '–'}</td>" for text in facts.values())
         rows.append(f"<tr><th scope=row>{escape(run.name)}</th>{cells}</tr>")
     whole = "".join(
-        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.about), indent=1, ensure_ascii=False))}</pre>"
+        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.info), indent=1, ensure_ascii=False))}</pre>"
         for run in runs
     )
     head = "<thead><tr><th>run</th><th>command</th><th>data</th><th>versions</th></tr></thead>"
