@@ -274,8 +274,8 @@ def test_what_cannot_be_compared_is_refused(change, words):
     ("change", "words"),
     [
         ({"primary": "vmaxscore"}, "has no metric 'vmaxscore'; did you mean 'vmax_score'?"),
-        ({"secondary": ("steps",)}, "no mean of steps"),
-        ({"primary": "vmax_score_partial"}, "made up differently"),
+        ({"secondary": ("steps",)}, "steps is a code or count without a mean"),
+        ({"primary": "vmax_score_partial"}, "combines different inputs"),
         ({"primary": "ade"}, "neither better high nor low"),
         ({"split": "stratified"}, "--data"),
         ({"split": "random", "ratio": 0.999}, "leave an arm empty"),

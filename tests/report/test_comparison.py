@@ -71,7 +71,7 @@ def test_only_the_same_scenarios_and_traffic_are_compared(evaluations):
     moved = dataclasses.replace(expert, info={**expert.info, "data": {"hash": "0000", "path": "x"}})
     assert not comparable(other, policy) and not comparable(moved, policy)
     assert mismatch(other, policy) == (
-        "drove in different traffic (idm and log)", "evaluate both with the same --traffic",
+        "differ in traffic (idm and log)", "evaluate both with the same --traffic",
     )  # fmt: skip
     (expert.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
     expert, policy = (dataclasses.replace(run) for run in (expert, policy))

@@ -94,12 +94,10 @@ class Comparison:
     decision: Decision
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what cannot be said is null."""
-        found = asdict(self) | {
-            "plan": settings.plain(self.plan),
-            "folders": [folder and str(folder) for folder in self.folders],
-        }
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+        """Plain values for JSON; null where undefined."""
+        folders = [None if folder is None else str(folder) for folder in self.folders]
+        values = asdict(self) | {"plan": settings.plain(self.plan), "folders": folders}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -124,8 +122,8 @@ class _Side:
 
     @property
     def name(self) -> str:
-        seeds = len(self.tables) > 1 and self.folder is not None
-        return self.folder.name if seeds else self.tables[0].name
+        folder = self.folder
+        return self.tables[0].name if folder is None or len(self.tables) == 1 else folder.name
 
     @property
     def recordings(self) -> int:

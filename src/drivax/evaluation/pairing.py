@@ -46,10 +46,10 @@ def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
     hashes = [str(run.data.get("hash") or "") for run in (a, b)]
     if all(hashes) and hashes[0] != hashes[1]:
         sets = f"{hashes[0][:12]} and {hashes[1][:12]}"
-        return f"were evaluated on different scenario sets ({sets})", "evaluate both with the same --data"
+        return f"differ in scenario set ({sets})", "evaluate both with the same --data"
     if a.traffic != b.traffic:
         traffic = f"{a.traffic} and {b.traffic}"
-        return f"were evaluated in different traffic ({traffic})", "evaluate both with the same --traffic"
+        return f"differ in traffic ({traffic})", "evaluate both with the same --traffic"
     for name in _STARTS:
         values = [run.settings.get(name) for run in (a, b)]
         if None not in values and values[0] != values[1]:

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, UInt32
 
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.actions import action_jerk, until_crash
@@ -135,7 +135,7 @@ def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> i
 
 
 def _banks(
-    scenarios: Sequence[Scenario], identity: Int[np.ndarray[Any, Any], " n"], size: int, sizes: Sizes
+    scenarios: Sequence[Scenario], identity: UInt32[np.ndarray, " n"], size: int, sizes: Sizes
 ) -> Iterator[ScenarioBank]:
     """Banks of ``size`` scenarios, each with the identities that they have in the whole."""
     for first in range(0, len(scenarios), size):
