@@ -12,11 +12,11 @@ from rich.console import Console
 
 from drivax.errors import UsageError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
-from drivax.report.observation_tables import observation_overview, observation_table
+from drivax.report.inspection_tables import observation_overview, observation_table
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig
 
-from .test_scene import pixels, share
+from .test_still import pixels, share
 
 pytest.importorskip("matplotlib")
 
@@ -121,7 +121,7 @@ def statistics(**more):
 
 def printed(table):
     out = io.StringIO()
-    Console(file=out, width=100).print(table)
+    Console(file=out, width=100).print(table.rich())
     return [line.split() for line in out.getvalue().splitlines()]
 
 
