@@ -62,7 +62,8 @@ def test_csv_has_one_line_per_number_with_all_digits():
 
 def test_markdown_has_one_cell_per_column():
     assert TABLE.markdown().splitlines() == [
-        "Mean.", "", "| metric | a | b\\|c |", "| --- | ---: | ---: |", "| success ↑ | 50.0 % (25.0–75.0) n 4 | – n 0 |",
+        "Mean.", "",
+        "| metric | a | b\\|c |", "| --- | ---: | ---: |", "| success ↑ | 50.0 % (25.0–75.0) n 4 | – n 0 |",
         "| speed \\[m/s\\] | 1.50 (all equal) n 2 | – |",
     ]  # fmt: skip
 

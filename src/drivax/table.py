@@ -106,8 +106,8 @@ class Table:
             align = "left" if column.label or column.left else "right"
             style = "bold" if column.label and not headed else ""
             grid.add_column(
-                column.heading, justify=align, no_wrap=column.label, max_width=column.most, overflow="fold",
-                style=style,
+                column.heading, justify=align, no_wrap=column.label, max_width=column.most,
+                overflow="ellipsis" if column.label else "fold", style=style,
             )  # fmt: skip
         for table in (self, *below):
             if table is not self:

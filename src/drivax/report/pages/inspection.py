@@ -58,8 +58,8 @@ def _lead(inspections: Sequence[Inspection]) -> str:
 def _overview(inspections: Sequence[Inspection]) -> str:
     return (
         f"<section><h2>In numbers</h2>{content_table(inspections).html()}<p><small>Numbers of a scenario are means "
-        "over the scenarios that have them, counted in the source before cropping and capping. Windows of one recording "
-        "may overlap; the duration counts each in full.</small></p></section>"
+        "over the scenarios that have them, counted in the source before cropping and capping. Windows of one "
+        "recording may overlap; the duration counts each in full.</small></p></section>"
     )
 
 
