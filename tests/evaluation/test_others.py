@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import shapely
-from drivax.report.pictures.episode import with_traffic_of
 from shapely import affinity
 
 import drivax
 from drivax.cli import main
 from drivax.evaluation.traffic_trajectories import packed, unpacked
 from drivax.report.episode_selection import ranked
+from drivax.report.pictures.drawing import with_traffic_of
 from drivax.report.rollouts import EvaluatedSet, rollouts_of
 from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet
