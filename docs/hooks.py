@@ -15,7 +15,14 @@ _PACKAGE = _DOCS.parent / "src" / "drivax"
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
-    index = ["# API reference", "", _docstring(_PACKAGE / "__init__.py"), "", "| package | content |", "|---|---|"]
+    index = [
+        "# API reference",
+        "",
+        _docstring(_PACKAGE / "__init__.py"),
+        "",
+        "| package | content |",
+        "|---|---|",
+    ]
     for stub in sorted(_PACKAGE.rglob("__init__.pyi")):
         package = ".".join(stub.parent.relative_to(_PACKAGE.parent).parts)
         uri = f"reference/{package}.md"
@@ -26,7 +33,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         index.append(f"| [`{package}`]({package}.md) | {summary.splitlines()[0]} |")
     files.append(File.generated(config, "reference/index.md", content="\n".join(index) + "\n"))
     for name, folder, title in (("decisions", "decisions", "Decisions"), ("log", "log", "Experiment log")):
-        rows = [f"- [{_title(page)}](../{folder}/{page.name})" for page in sorted((_DOCS / folder).glob("*.md"))]
+        rows = [
+            f"- [{_title(page)}](../{folder}/{page.name})" for page in sorted((_DOCS / folder).glob("*.md"))
+        ]
         content = "\n".join([f"# {title}", "", *rows]) + "\n"
         files.append(File.generated(config, f"project/{name}.md", content=content))
     return files

@@ -160,19 +160,19 @@ def test_encoders_in_yaml():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("encoder: {kind: lqq}", r"^encoder: there is no kind 'lqq'; did you mean 'lq'"),
+        ("encoder: {kind: lqq}", r"^encoder: unknown kind 'lqq'; did you mean 'lq'"),
         (
             "encoder: {kind: cnn}",
-            r"^encoder: there is no kind 'cnn'; use one of mlp, lq, lqh, mtr, wayformer, entity",
+            r"^encoder: unknown kind 'cnn'; use one of mlp, lq, lqh, mtr, wayformer, entity",
         ),
-        ("encoder: {kind: lq, size: tiny}", r"^encoder\.size: 'tiny' is none of published, small"),
-        ("encoder: {kind: mtr, latents: 8}", r"^encoder\.latents: there is no such setting"),
+        ("encoder: {kind: lq, size: tiny}", r"^encoder\.size: 'tiny' is not one of published, small"),
+        ("encoder: {kind: mtr, latents: 8}", r"^encoder\.latents: unknown setting"),
         ("encoder: {kind: lq, width: 10}", r"^encoder: width 10 is no multiple of 4 heads"),
         (
             "encoder: {kind: wayformer, fusion: soon}",
-            r"^encoder\.fusion: 'soon' is none of early, late, hier",
+            r"^encoder\.fusion: 'soon' is not one of early, late, hier",
         ),
-        ("distribution: normal", r"^distribution: 'normal' is none of gaussian, beta, grid"),
+        ("distribution: normal", r"^distribution: 'normal' is not one of gaussian, beta, grid"),
         ("first_scale: 0", r"^first_scale is 0; use more than 0"),
     ],
 )
