@@ -125,7 +125,7 @@ def test_scalars_by_the_core_rules(text: str, value: object):
         ("resume: 1", r"^resume: 1 is not true or false"),
         ("resume: 'yes'", r"^resume: 'yes' is not true or false"),
         ("seed: x", r"^seed: 'x' is not a whole number"),
-        ("data: [a]", r"^data: \['a'\] not a text file"),
+        ("data: [a]", r"^data: \['a'\] is not text"),
         ("network: 3", r"^network: 3 is not a section of settings \(hidden, activation, optimizer\)"),
         ("network: {hidden: 256}", r"^network\.hidden: 256 is not a list"),
         ("network: {hidden: '256'}", r"^network\.hidden: '256' is not a list"),
@@ -250,9 +250,9 @@ def test_files(tmp_path: Path):
     file.write_bytes(b"\xff\xfe\x00a")
     with pytest.raises(UsageError, match="not a text file"):
         settings.load(Training, file)
-    with pytest.raises(UsageError, match=r"none\.yaml: does not exist"):
+    with pytest.raises(UsageError, match=r"none\.yaml: file not found"):
         settings.load(Training, str(tmp_path / "none.yaml"))
-    with pytest.raises(UsageError, match="is a folder"):
+    with pytest.raises(UsageError, match="not a configuration file but a folder"):
         settings.load(Training, tmp_path)
     file.write_text("")
     assert settings.load(Training, str(file)) == Training()
