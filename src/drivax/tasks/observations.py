@@ -45,7 +45,7 @@ from drivax.tasks.features import (
     route_curvature,
     shown_curvature,
 )
-from drivax.tasks.own import own_name, refuse_taken
+from drivax.tasks.own import check_unique, name_of
 from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
 from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Frames, View
 
@@ -77,7 +77,7 @@ class OwnGroup:
     name: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", own_name(self.feature, self.name))
+        object.__setattr__(self, "name", name_of(self.feature, self.name))
         if self.name.endswith("_mask"):
             raise ValueError(f"a group cannot be called {self.name!r}; masks are named so")
 
@@ -125,7 +125,7 @@ class ObservationConfig:
     own: tuple[OwnGroup, ...] = ()
 
     def __post_init__(self) -> None:
-        refuse_taken("observation.own", [group.name for group in self.own], GROUPS)
+        check_unique("observation.own", [group.name for group in self.own], GROUPS)
         counts = {name: getattr(self, name) for name in ("agents", "road", "lights", "route")}
         for name, count in counts.items():
             if count < 0:

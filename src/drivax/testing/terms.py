@@ -15,7 +15,7 @@ from drivax.metrics.scores import Value
 from drivax.metrics.steps import Moment
 from drivax.plugins import find_named
 from drivax.simulator.types import FACTS, ON_REQUEST
-from drivax.tasks.own import own_name
+from drivax.tasks.own import name_of
 from drivax.tasks.rewards import Term
 from drivax.testing import worlds
 from drivax.testing.contract import (
@@ -47,7 +47,7 @@ def check_reward(term: Term | str) -> None:
     """
     found: Any = find_named(term) if isinstance(term, str) else term
     found = found() if isinstance(found, type) else found
-    what = f"reward term {own_name(found)!r}"
+    what = f"reward term {name_of(found)!r}"
 
     def value(moment: Moments) -> Any:
         return found(moment.before, moment.found.facts, moment.found.surroundings)
