@@ -209,15 +209,15 @@ algorithm: {kind: ppo, network: {encoder: {kind: "own_terms:MeanConfig", width: 
 
 
 def test_custom_terms_and_groups_are_named():
-    with pytest.raises(ValueError, match=r"rewards\.own has 'collision', a name that is taken"):
+    with pytest.raises(ValueError, match=r"rewards\.own: name 'collision' is taken"):
         RewardConfig(own=(OwnTerm(own_terms.hurry, 1.0, "collision"),))
-    with pytest.raises(ValueError, match=r"rewards\.own has 'hurry', a name that is taken"):
+    with pytest.raises(ValueError, match=r"rewards\.own: name 'hurry' is taken"):
         RewardConfig(own=(OwnTerm(own_terms.hurry, 1.0), OwnTerm(own_terms.hurry, 2.0)))
-    with pytest.raises(ValueError, match=r"observation\.own has 'agents', a name that is taken"):
+    with pytest.raises(ValueError, match=r"observation\.own: name 'agents' is taken"):
         ObservationConfig(own=(OwnGroup(own_terms.goal, "agents"),))
     with pytest.raises(ValueError, match="cannot be called 'a_mask'"):
         OwnGroup(own_terms.goal, "a_mask")
-    with pytest.raises(ValueError, match="'<lambda>' is no name; give it one"):
+    with pytest.raises(ValueError, match="'<lambda>' is not a name; pass one"):
         OwnTerm(lambda before, now, around: now.speed_mps, 1.0)
     assert OwnTerm(own_terms.Crowded(), 1.0).name == "crowded"
 
