@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import norm
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -73,7 +73,7 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
         frame=frame,
         left_out=_left_out(touching, frame.valid),
         along_m=_along_route(bank, index, motion[:, :2]),
-        ground_m=frame.z[:, 0] - bank.agent_box[index, 0, SizeColumn.HEIGHT] / 2,
+        ground_m=frame.z[:, 0] - bank.height_m(index, 0) / 2,
     )
 
 

@@ -16,7 +16,6 @@ from drivax.metrics.episode import episode_metrics, first_steps
 from drivax.metrics.scores import Value
 from drivax.planners.planner import Planner
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
@@ -144,6 +143,6 @@ def advanced(
         logged = logged_motion(bank, state.scene, 1)
         return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
     scene, sound = state.scene, jnp.isfinite(action).all()
-    length_m = bank.agent_box[scene.index, scene.slot, SizeColumn.LENGTH]
+    length_m = bank.length_m(scene.index, scene.slot)
     nothing = simulator.task.first_action(scene.history, length_m)
     return simulator.step(bank, state, jnp.where(sound, action, nothing))[0], carry, sound

@@ -101,7 +101,7 @@ class PlannerTraffic:
             key = jax.random.fold_in(key, one.step)
             seen = self.task.observe(bank, found.scene, frames, frame)
             asked, _ = bank.driver.act((), bank, state, found, seen, jax.random.fold_in(key, one.slot))
-            motion, length = one.history[-1], bank.agent_box[one.index, one.slot, SizeColumn.LENGTH]
+            motion, length = one.history[-1], bank.length_m(one.index, one.slot)
             action = self.task.actuated(motion, asked, one.action)
             motion = self.task.motion(motion, action, length)
             history = jnp.concatenate([one.history[1:], motion[None]])

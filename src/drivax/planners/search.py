@@ -20,7 +20,7 @@ from drivax.planners.prediction import (
     at,
     prediction_times,
 )
-from drivax.scenario.bank.columns import RouteColumn, SizeColumn
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
@@ -261,7 +261,7 @@ def _bad_ground(
 ) -> tuple[Array, Array]:
     """Whether the car would leave the road within 3 s, and whether a line leads out of the lanes that go its way."""
     scene = situation.scene
-    ground = scene.z - bank.agent_box[scene.index, scene.slot, SizeColumn.HEIGHT] / 2
+    ground = scene.z - bank.height_m(scene.index, scene.slot) / 2
 
     def beyond(at: Array) -> Array:
         box = jnp.concatenate([at, me[LENGTH:]])

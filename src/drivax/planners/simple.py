@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless
-from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.types import Scene, SimState, Situation
@@ -33,9 +33,7 @@ def logged_motion(bank: ScenarioBank, scene: Scene, ahead: int) -> Float[Array, 
 def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Float[Array, " D"]:
     """The action that follows the log from here; not clipped, so that ``actions.clipped`` can say what would be."""
     ahead, beyond = logged_motion(bank, scene, 1), logged_motion(bank, scene, 2)
-    return actions.expert(
-        scene.history[-1], ahead, beyond, bank.agent_box[scene.index, scene.slot, SizeColumn.LENGTH]
-    )
+    return actions.expert(scene.history[-1], ahead, beyond, bank.length_m(scene.index, scene.slot))
 
 
 @record
@@ -83,7 +81,7 @@ class ConstantVelocity(Memoryless):
     ) -> tuple[Float[Array, " D"], Any]:
         """No acceleration, no curvature."""
         scene, zero = state.scene, jnp.zeros(())
-        length_m = bank.agent_box[scene.index, scene.slot, SizeColumn.LENGTH]
+        length_m = bank.length_m(scene.index, scene.slot)
         return self.actions.action(scene.history[-1], zero, zero, length_m), carry
 
 

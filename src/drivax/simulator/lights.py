@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.scenario.bank.columns import LightRow, SizeColumn
+from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import light_crossing
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import LightState
@@ -26,8 +26,8 @@ def _fronts(scene: Scene, length_m: Float[Array, ""]) -> Float[Array, "16 2"]:
 
 def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
     """The memory that a scene's recent motion implies, as if it had been driven."""
-    length = bank.agent_box[scene.index, scene.slot, SizeColumn.LENGTH]
-    ground = scene.z - bank.agent_box[scene.index, scene.slot, SizeColumn.HEIGHT] / 2
+    length = bank.length_m(scene.index, scene.slot)
+    ground = scene.z - bank.height_m(scene.index, scene.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
     fronts = _fronts(scene, length)
     for age in range(HISTORY - 1, -1, -1):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.passages import lane_passage
 from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
@@ -80,11 +80,7 @@ def measure(
     around = surroundings(bank, scene, frame)
     lanes, route, me, ground = around.lanes, around.route, frame.box[scene.slot], _ground(bank, scene, frame)
     beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
-    z = jnp.where(
-        lanes.near,
-        lanes.z + bank.agent_box[scene.index, scene.slot, SizeColumn.HEIGHT] / 2,
-        frame.z[scene.slot],
-    )
+    z = jnp.where(lanes.near, lanes.z + bank.height_m(scene.index, scene.slot) / 2, frame.z[scene.slot])
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
     codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
@@ -144,7 +140,7 @@ def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings
 
 def _ground(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
     """Height of the ground under the driven agent, m."""
-    return frame.z[scene.slot] - bank.agent_box[scene.index, scene.slot, SizeColumn.HEIGHT] / 2
+    return frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
 
 
 def _moved(scene: Scene) -> Float[Array, ""]:

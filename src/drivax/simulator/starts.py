@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
     around_lanes,
@@ -165,7 +165,7 @@ def _acceptable(
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
     scene = Scene(index, step, slot, history, jnp.zeros(2), zero, z, ())
     frame = frame_of(bank, index, step, agents, alone(scene), 0)
-    box, ground = frame.box[slot], z - bank.agent_box[index, slot, SizeColumn.HEIGHT] / 2
+    box, ground = frame.box[slot], z - bank.height_m(index, slot) / 2
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
     beyond = offroad_distance(bank, index, box[:2], points, near, ground).max()

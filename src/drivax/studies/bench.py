@@ -26,7 +26,6 @@ from drivax.learning.policy_traffic import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import Wanted
 from drivax.planners.idm import IdmPlanner
-from drivax.scenario.bank.columns import SizeColumn
 from drivax.scenario.bank.exhaustive import without_grid
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -300,7 +299,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return jnp.stack([x, y, jnp.cos(heading), jnp.sin(heading), size[0], size[1]])
 
     def ground(bank: ScenarioBank, state: SimState) -> Array:
-        return state.scene.z - bank.agent_box[state.scene.index, state.scene.slot, SizeColumn.HEIGHT] / 2
+        return state.scene.z - bank.height_m(state.scene.index, state.scene.slot) / 2
 
     def edges(bank: ScenarioBank, state: SimState) -> Any:
         me = box(bank, state)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.vectors import norm
-from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, SizeColumn
+from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
@@ -87,7 +87,7 @@ def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, "
     place = view.point(now.box[:, :2])
     others = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
     leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
-    half = bank.agent_box[scene.index, scene.slot, SizeColumn.LENGTH] / 2
+    half = bank.length_m(scene.index, scene.slot) / 2
     gap = jnp.where(
         leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
     )
@@ -133,7 +133,7 @@ def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, 
     Lines further than 50 m, or passed by the bumper, are not there; the distance is then 1.
     """
     ahead = bank.light_line[scene.index, LightRow.ARC] - scene.route_m
-    gap = ahead - bank.agent_box[scene.index, scene.slot, SizeColumn.LENGTH] / 2
+    gap = ahead - bank.length_m(scene.index, scene.slot) / 2
     state = frames(0).lights
     real = bank.light_line[scene.index, LightRow.ARC] < NEVER_M
     there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
-from drivax.scenario.bank.columns import RoadLayer
+from drivax.scenario.bank.columns import RoadLayer, SizeColumn
 from drivax.scenario.bank.identity import identities
 from drivax.scenario.bank.sizes import Sizes, last_used
 from drivax.scenario.build.lane_codes import corridor_lanes, lane_codes
@@ -118,6 +118,14 @@ class ScenarioBank:
     def nbytes(self) -> int:
         """Bytes that the bank takes on the device."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+    def length_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+        """Length of an agent, m."""
+        return self.agent_box[index, slot, SizeColumn.LENGTH]
+
+    def height_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+        """Height of an agent, m."""
+        return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
         """Some of the scenarios as a bank; the driver is everyone's."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import around_lanes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -110,7 +110,7 @@ def with_given(
     def heights(index: Array, slot: Array, line: Float[Array, "T 4"]) -> Float[Array, " T"]:
         at = jnp.maximum(slot, 0)
         seen = jnp.argmax(bank.agents[index, :, at, AgentColumn.VALID] > 0)
-        half = bank.agent_box[index, at, SizeColumn.HEIGHT] / 2
+        half = bank.height_m(index, at) / 2
 
         def climb(ground: Array, pose: Array) -> tuple[Array, Array]:
             heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
@@ -149,7 +149,7 @@ def motions_of_actions(
     def drive(index: Array, slot: Array, acts: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
         at = jnp.maximum(slot, 0)
         past = logged_history(bank, index, begin, at)
-        size = bank.agent_box[index, at, SizeColumn.LENGTH]
+        size = bank.length_m(index, at)
 
         def one(motion: Array, action: Array) -> tuple[Array, Array]:
             after = move(motion, action, size)
