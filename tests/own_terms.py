@@ -55,7 +55,7 @@ def walkers(bank, scene, frames):
 
 
 def _gap(moment):
-    frame = moment.found.surroundings.frame
+    frame = moment.situation.surroundings.frame
     offset = frame.box[1:, :2] - frame.box[0, :2]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(offset * offset, axis=-1), 1e-6))
     return jnp.min(jnp.where(frame.valid[1:], distance, 1e3)), frame.valid[1:].any()
@@ -64,16 +64,16 @@ def _gap(moment):
 nearest_other = Metric(
     unit="m",
     better="high",
-    text="smallest distance between centres",
-    of=StepValue("nearest_other", "m", _gap, frozenset()),
+    definition="smallest distance between centres",
+    step_value=StepValue("nearest_other", "m", _gap, frozenset()),
     operator="min",
 )
 crashed = nearest_other
 lane_changes = Metric(
     unit="-",
     better="-",
-    text="lane changes",
-    of=StepValue(
+    definition="lane changes",
+    step_value=StepValue(
         "lane_changed",
         "-",
         lambda m: (m.facts.lane_changed.astype(jnp.float32), True),

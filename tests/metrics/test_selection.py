@@ -16,7 +16,7 @@ from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
 from drivax.metrics.catalogue import METRICS, SETS
 from drivax.metrics.episode import episode_add, episode_metrics, episode_start, first_steps
-from drivax.metrics.selection import catalogue, selected
+from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
 from drivax.simulator import situation
 from drivax.simulator.simulator import Simulator
@@ -77,28 +77,28 @@ def test_sets_are_of_the_catalogue():
     assert SETS["none"] == () and SETS["full"] == tuple(METRICS)
     assert set(SETS["training"]) < set(METRICS)
     for name, metric in METRICS.items():
-        assert set(metric.inputs) <= set(METRICS) and metric.text and metric.unit, name
-    assert {value.name for value in selected("full").values} == set(STEP_VALUES)
+        assert set(metric.inputs) <= set(METRICS) and metric.definition and metric.unit, name
+    assert {value.name for value in select_metrics("full").step_values()} == set(STEP_VALUES)
 
 
 def test_a_list_names_sets_and_metrics_and_brings_what_they_need():
-    wanted = selected(("training", "comfortable", "min_ttc", "min_ttc"))
+    wanted = select_metrics(("training", "comfortable", "min_ttc", "min_ttc"))
     assert wanted.names == (*SETS["training"], "comfortable", "min_ttc")
     assert "comfort" in dict(wanted.metrics) and "comfort" not in wanted.names
     order = [name for name, _ in wanted.metrics]
     for name, metric in wanted.metrics:
         assert all(order.index(needed) < order.index(name) for needed in metric.inputs)
-    assert selected(("min_ttc",)).reads == {"ttc_s", "ttc_defined"}
-    assert selected("none").reads == frozenset() and selected("full").reads == FACTS
-    assert list(catalogue(("min_ttc", "ade"))) == ["min_ttc", "ade"]
-    assert selected(("full", "own_terms:lane_changes")).reads == FACTS | {"lane_changed"}
+    assert select_metrics(("min_ttc",)).reads == {"ttc_s", "ttc_defined"}
+    assert select_metrics("none").reads == frozenset() and select_metrics("full").reads == FACTS
+    assert list(metric_specs(("min_ttc", "ade"))) == ["min_ttc", "ade"]
+    assert select_metrics(("full", "own_terms:lane_changes")).reads == FACTS | {"lane_changed"}
 
 
 def test_misspelt_names_get_one_line():
     for wanted in ("trainin", ("training", "min_tcc")):
         with pytest.raises(UsageError, match="did you mean"):
             Task(metrics=wanted)
-    with pytest.raises(UsageError, match=r"task.*: there is no metric 'ful'.*'full'"):
+    with pytest.raises(UsageError, match=r"task.*: unknown metric 'ful'.*'full'"):
         settings.load(TrainConfig, {"task": {"metrics": "ful"}})
 
 
@@ -200,7 +200,7 @@ def test_operators_and_that_a_selection_changes_no_value(traced):
         assert events[name] == 11 + np.argmax(getattr(facts, name)), name
     for wanted in ("training", LEAN):
         lean, lean_events = episode(wanted, found, empty)
-        assert set(lean) == set(selected(wanted).names)
+        assert set(lean) == set(select_metrics(wanted).names)
         for name, value in lean.items():
             np.testing.assert_allclose(value.value, full[name].value, rtol=1e-6, err_msg=name)
             assert value.defined == full[name].defined, name
@@ -230,7 +230,7 @@ def test_a_selection_changes_no_value_in_simulation():
 
 def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
     for metrics in ("none", ("training", "min_ttc")):
-        assert selected(judging(Task(metrics=metrics)).metrics).names == tuple(METRICS)
+        assert select_metrics(judging(Task(metrics=metrics)).metrics).names == tuple(METRICS)
 
 
 def test_no_metric_is_defined_before_the_first_step(traced):

@@ -90,7 +90,7 @@ def test_right_metrics(name):
 
 
 def metric(read, reads=frozenset(), **more):
-    return Metric("m", "low", "a wrong one", of=StepValue("wrong", "m", read, reads), operator="max", **more)
+    return Metric("m", "low", "a wrong one", step_value=StepValue("wrong", "m", read, reads), operator="max", **more)
 
 
 def test_wrong_metrics():
@@ -106,7 +106,7 @@ def test_wrong_metrics():
     refused(
         check_metric, Metric("m", "low", "text", compute=lambda e, v, k: v.value), "does not compute a Value"
     )
-    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or text")
+    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or definition")
 
 
 @pytest.mark.slow

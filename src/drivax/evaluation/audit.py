@@ -107,7 +107,7 @@ class _Watch:
     def episode_start(self) -> None:
         """Nothing."""
 
-    def episode_add(self, episode: Any, found: Situation, start: Array, final: Array) -> None:
+    def episode_add(self, episode: Any, situation: Situation, start: Array, final: Array) -> None:
         """Nothing."""
 
 

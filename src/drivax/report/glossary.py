@@ -9,6 +9,7 @@ from typing import Literal
 
 from drivax.evaluation.results import ADDED, NOT_SUMMARISED, RATES
 from drivax.metrics.catalogue import METRICS
+from drivax.metrics.catalogue import headline as headline_columns
 from drivax.report.loaded_runs import Evaluation
 
 Direction = Literal["up", "down", "none"]
@@ -32,34 +33,8 @@ class Note:
     explanation: str
 
 
-#: Headings that differ from the metric's name.
-_LABELS = MappingProxyType(
-    {
-        "success_moving": "success, moving",
-        "accuracy_at_fault": "accuracy, own faults",
-        "at_fault_collision": "at-fault collision",
-        "offroad": "off-road",
-        "left_map": "left the map",
-        "progress_ratio": "progress",
-        "progress": "progress along the route",
-        "reached_goal": "goal reached",
-        "ttc_ok": "TTC ok",
-        "wrong_way_worst": "wrong way within 1 s",
-        "min_ttc": "least TTC",
-        "average_ttc": "mean TTC",
-        "vmax_score": "V-Max score",
-        "nuplan_score": "nuPlan score",
-        "vmax_score_partial": "partial V-Max score",
-        "nuplan_score_partial": "partial nuPlan score",
-        "ade": "ADE",
-        "fde": "FDE",
-    }
-)
 #: The columns of the first table.
-HEADLINE = (
-    "success", "success_moving", "accuracy", "collision", "at_fault_collision", "offroad", "red_light",
-    "progress_ratio", "ttc_ok", "comfortable", "vmax_score", "nuplan_score",
-)  # fmt: skip
+HEADLINE = headline_columns(METRICS)
 #: Codes and counts, of which no mean is shown.
 CODES = frozenset(NOT_SUMMARISED)
 ARROWS = MappingProxyType({"up": "↑", "down": "↓", "none": ""})
@@ -74,15 +49,15 @@ def note(name: str, runs: Sequence[Evaluation] = ()) -> Note:
         runs: Evaluations, which say what metrics of the user's own are; one that nobody knows gets its own name and no
             direction.
     """
-    label = _LABELS.get(name, name.replace("_", " "))
     ours = METRICS.get(name) or ADDED.get(name)
     metric = ours or next((r.own_metrics[name] for r in runs if name in r.own_metrics), None)
+    label = (metric.label if metric else None) or name.replace("_", " ")
     if metric is None:
         return Note(label, "none", "", "")
     plain = metric.unit == "-"
     unit = "rate" if name in RATES else "share" if plain else metric.unit
     heading = label if plain else f"{label} [{metric.unit.replace('s2', 's²').replace('s3', 's³')}]"
-    text = metric.text[:1].upper() + metric.text[1:]
+    text = metric.definition[:1].upper() + metric.definition[1:]
     return Note(heading, _DIRECTIONS[metric.better], unit, f"{text}.")
 
 

@@ -24,7 +24,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.learning.policy_traffic import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
-from drivax.metrics.selection import Wanted
+from drivax.metrics.selection import MetricNames
 from drivax.planners.idm import IdmPlanner
 from drivax.scenario.bank.exhaustive import without_grid
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
@@ -118,7 +118,7 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
     """
     config = config or BenchConfig()
 
-    def program(metrics: Wanted, batch: int) -> Program:
+    def program(metrics: MetricNames, batch: int) -> Program:
         task = replace(config.task, metrics=metrics)
         return compiled(bank, replace(config, batch=batch, task=task))
 

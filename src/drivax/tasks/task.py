@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.episode import Episode, episode_add, episode_start
-from drivax.metrics.selection import Wanted, selected
+from drivax.metrics.selection import MetricNames, select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.types import Facts, Frame, Scene, Situation, Surroundings
 from drivax.tasks.actions import ActionSpace, Physical
@@ -39,16 +39,16 @@ class Task:
     rewards: RewardConfig = field(default_factory=RewardConfig)
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
     to_the_end: bool = False
-    metrics: Wanted = "full"
+    metrics: MetricNames = "full"
 
     def __post_init__(self) -> None:
-        selected(self.metrics)
+        select_metrics(self.metrics)
 
     @property
     def reads(self) -> frozenset[str]:
         """Facts that rewards, ends and metrics look at."""
         ends = frozenset() if self.to_the_end else frozenset({*self.ends, "left_map"})
-        return selected(self.metrics).reads | self.rewards.reads | ends
+        return select_metrics(self.metrics).reads | self.rewards.reads | ends
 
     def motion(
         self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
@@ -92,7 +92,7 @@ class Task:
         return episode_start(self.metrics)
 
     def episode_add(
-        self, episode: Any, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+        self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Episode:
-        """Accumulators after the step that led to ``found``."""
-        return episode_add(episode, found, start, final)
+        """Accumulators after the step that led to ``situation``."""
+        return episode_add(episode, situation, start, final)
