@@ -15,7 +15,7 @@ from drivax.evaluation.rollout import judging
 from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
 from drivax.metrics.catalogue import METRICS, SETS
-from drivax.metrics.episode import episode_add, episode_metrics, episode_start, first_steps
+from drivax.metrics.episode import episode_add, episode_metrics, episode_start, event_steps
 from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
 from drivax.simulator import situation
@@ -28,7 +28,7 @@ BANK = bank_of(straight_road([car(speed=10.0), car(30.0), car(0, 3.7, 0, 9)], li
 
 
 #: Work that only some metrics need.
-COSTLY = ("time_to_collision", "judge_contacts", "judge_lights", "judge_comfort")
+COSTLY = ("time_to_collision", "classify_contacts", "check_lights", "check_comfort")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def traced():
             patch.setattr(module, name, heard)
 
         for name in COSTLY:
-            listen(steps if name == "judge_comfort" else situation, name)
+            listen(steps if name == "check_comfort" else situation, name)
         for wanted in ("none", "training", "full", ("at_fault_collision",)):
             called.clear()
             simulator = Simulator(Task(metrics=wanted))
@@ -116,9 +116,9 @@ def test_configuration_files_choose_a_set():
 
 
 def test_what_is_not_selected_is_not_computed(traced):
-    assert traced["none"].called == traced["training"].called == {"judge_lights"}
+    assert traced["none"].called == traced["training"].called == {"check_lights"}
     assert traced["full"].called == set(COSTLY)
-    assert traced[("at_fault_collision",)].called == {"judge_lights", "judge_contacts"}
+    assert traced[("at_fault_collision",)].called == {"check_lights", "classify_contacts"}
     assert traced["none"].operations < traced["training"].operations < 0.85 * traced["full"].operations
 
 
@@ -150,22 +150,22 @@ def random_situations(count=60):
     found = jax.tree.map(filled, shape)
     kinds = jnp.asarray(rng.choice([0, 0, 0, 2, 3], count), found.facts.collision_type.dtype)
     facts = replace(found.facts, collision_type=kinds, limit_mps=found.facts.limit_mps - 0.5)
-    return replace(found, facts=facts, scene=replace(found.scene, step=jnp.arange(11, 11 + count)))
+    return replace(found, facts=facts, context=replace(found.context, step=jnp.arange(11, 11 + count)))
 
 
 def episode(wanted, found, empty):
     """Metrics and first events of measured steps."""
-    last = 10 + found.scene.step.shape[0]
+    last = 10 + found.context.step.shape[0]
 
     @jax.jit
     def run(found):
         def one(episode, now):
-            return episode_add(episode, now, jnp.asarray(10), now.scene.step == last), None
+            return episode_add(episode, now, jnp.asarray(10), now.context.step == last), None
 
         summed = jax.lax.scan(one, episode_start(wanted), found)[0]
-        scene = jax.tree.map(lambda leaf: leaf[-1], found.scene)
-        state = replace(empty, scene=scene, episode=summed, start=jnp.asarray(10))
-        return episode_metrics(BANK, state), first_steps(summed)
+        context = jax.tree.map(lambda leaf: leaf[-1], found.context)
+        state = replace(empty, context=context, episode=summed, start=jnp.asarray(10))
+        return episode_metrics(BANK, state), event_steps(summed)
 
     return jax.tree.map(np.asarray, run(found))
 

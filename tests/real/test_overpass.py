@@ -63,8 +63,8 @@ def test_the_height_of_a_car_is_that_of_its_road(driven):
 
     def one(state, _):
         action = jnp.zeros(2)
-        state, _ = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        return state, state.scene.z
+        state, _ = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        return state, state.context.z
 
     @jax.jit
     @jax.vmap

@@ -9,17 +9,17 @@ import numpy as np
 from drivax.errors import UsageError
 from drivax.report.pictures.still import draw_scenario
 from drivax.scenario.schema import Scenario
-from drivax.simulator.types import Scene
+from drivax.simulator.types import AgentContext
 
 
-def path_of(scene: Scene, before: Any = None) -> Any:
+def path_of(context: AgentContext, before: Any = None) -> Any:
     """Motions from the first step of the log to the present one ``[step + 1, 4]``; NaN where nobody knows.
 
     Args:
-        scene: The present scene.
+        context: The present context.
         before: The path one step ago; None where an episode begins.
     """
-    history, step = np.asarray(scene.history), int(scene.step)
+    history, step = np.asarray(context.history), int(context.step)
     if before is not None:
         return np.concatenate([before, history[-1:]])
     known = history[-min(step + 1, len(history)) :]

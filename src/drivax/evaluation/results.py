@@ -24,7 +24,9 @@ ADDED = {
         "-", "low", "the planner raised an error, or its action was not finite: a failed episode", kind="rate"
     ),
     "action_jerk": Column(
-        "-", "low", "standard deviation of the change of the action from step to step; 0.82 for random actions"
+        "-",
+        "low",
+        "standard deviation of the change of the action from step to step; 0.82 for random actions",
     ),
 }
 _COLUMNS: dict[str, Column] = {**METRICS, **ADDED}

@@ -1,4 +1,4 @@
-"""The specification of every episode metric: one entry of ``METRICS`` says all that a table, a report or a plan asks."""
+"""Specification of every episode metric: unit, direction, operator, label, definition and requirements."""
 
 from __future__ import annotations
 
@@ -290,6 +290,8 @@ METRICS: dict[str, Metric] = {
     "steps": _computed(_steps, (), "-", "steps driven", summarised=False),
 }
 # fmt: on
+#: Metrics without a mean.
+CODES = ("collision_type",)
 #: Metrics whose first step is stored as well.
 EVENTS = ("collision", "offroad", "red_light")
 #: What a training loop logs: needs neither fault, time to collision, comfort nor limits.

@@ -104,7 +104,7 @@ def episode_add(episode: Episode, found: Situation, start: Int[Array, ""], final
         high=jnp.maximum(episode.high, high),
         last=jnp.where(last_counts, last, episode.last),
         first=jnp.where(waiting, first, episode.first),
-        event_step=jnp.where(begins, found.scene.step.astype(jnp.int16), episode.event_step),
+        event_step=jnp.where(begins, found.context.step.astype(jnp.int16), episode.event_step),
         second=second,
         worst=jnp.maximum(episode.worst, second.sum(axis=1)),
         selection=selection,
@@ -149,8 +149,8 @@ def _stacked(scalars: Sequence[Array], kind: type) -> Array:
 
 def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
     """The selected metrics of the episode that ``state`` ended, by name; undefined ones have the value 0."""
-    scene, episode = state.scene, state.episode
-    end = EpisodeEnd(bank, scene.index, state.start, scene.step - state.start)
+    context, episode = state.context, state.episode
+    end = EpisodeEnd(bank, context.index, state.start, context.step - state.start)
     result: dict[str, Value] = {}
     for name, metric in episode.selection.metrics:
         value = _accumulated(episode, metric)
@@ -164,8 +164,8 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
 def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
     """Whether the scenario has what a metric needs. The route is ego's; other slots have none."""
     wanted = jnp.uint32(int(needs))
-    held = (bank.flags[state.scene.index] & wanted) == wanted
-    return held & ((Flag.ROUTE not in needs) | (state.scene.slot == 0))
+    held = (bank.flags[state.context.index] & wanted) == wanted
+    return held & ((Flag.ROUTE not in needs) | (state.context.slot == 0))
 
 
 def _accumulated(episode: Episode, metric: Metric) -> Value:

@@ -65,7 +65,9 @@ def select_metrics(names: MetricNames) -> MetricSelection:
     metrics: dict[str, Metric] = {}
     for name in requested:
         _add_with_inputs(name, METRICS | own, metrics)
-    reads = frozenset[str]().union(*(m.step_value.reads for m in metrics.values() if m.step_value is not None))
+    reads = frozenset[str]().union(
+        *(m.step_value.reads for m in metrics.values() if m.step_value is not None)
+    )
     if set(METRICS) <= set(requested):
         reads |= FACTS
     return MetricSelection(tuple(requested), tuple(metrics.items()), reads)

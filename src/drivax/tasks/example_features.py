@@ -1,7 +1,7 @@
 """Features that are no part of the groups of ``tasks.observations``: examples of groups of one's own, ready to use.
 
 In YAML ``observation: {own: [{feature: drivax.tasks.example_features:lane_curvature}]}``, from Python
-``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, scene and frames; ``frames(k)`` is
+``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, context and frames; ``frames(k)`` is
 everyone k steps ago as ego perceives them.
 """
 
@@ -18,7 +18,7 @@ from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import LightState
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters
-from drivax.simulator.types import MOTION_SPEED, Scene
+from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
 from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
 
@@ -34,14 +34,14 @@ _SLOWEST_MPS = 1.0
 
 
 def relative_velocity(
-    bank: ScenarioBank, scene: Scene, frames: Frames
+    bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 2"], Bool[Array, " K"]]:
     """Velocity of the eight nearest others relative to ego's, ego frame, in units of 15 m/s.
 
     The rows are those of the group ``agents``, as far as they go.
     """
-    now, view, ego = frames(0), View.of(scene), scene.history[-1]
-    there = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    now, view, ego = frames(0), View.of(context), context.history[-1]
+    there = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     distance = jnp.where(there, norm(now.box[:, :2] - view.xy), jnp.inf)
     rank = jnp.arange(_OTHERS)
     order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
@@ -49,49 +49,51 @@ def relative_velocity(
     return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
 
 
-def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Curvature of the lane that ego is on, in units of 0.1 1/m (left positive), and whether it is on one.
 
     It is that of the piece of lane within 2.5 m and 60 degrees that fits place and heading best, a metre weighing as
     much as 15 degrees. No route is needed. Bridges are not told apart from what is under them.
     """
-    view = View.of(scene)
-    rows, layer = bank.road[scene.index], bank.road_at[scene.index, 2]
+    view = View.of(context)
+    rows, layer = bank.road[context.index], bank.road_at[context.index, 2]
     middle, direction = view.point(rows[:, RoadColumn.XY]), view.vector(rows[:, RoadColumn.DIRECTION])
     half = rows[:, RoadColumn.LENGTH] / 2
     along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
     apart = norm(middle + along[:, None] * direction)
     fits = (layer == RoadLayer.LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
     best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
-    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[scene.index, best]), 0.0)
+    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[context.index, best]), 0.0)
     return jnp.stack([curvature, fits[best].astype(jnp.float32)])
 
 
 def recommended_speed(
-    bank: ScenarioBank, scene: Scene, frames: Frames
+    bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
     """Speed for the curvature k of the route at ten points 5 m apart: ``clip(30 - 25 |k|, 5, 30)``, in 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
-    _, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    curvature = features.route_curvature(bank, scene.index, scene.route_m + offsets)
-    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(bank, scene)
+    _, there = route_ahead(bank, context.index, context.route_m, offsets)
+    curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
+    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(
+        bank, context
+    )
 
 
-def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Seconds to the leader's bumper at ego's speed, of ten at most, as a share of ten; and whether there is a leader.
 
     The leader is the nearest agent whose centre lies in the stripe of 3 m width straight ahead of ego. An ego slower
     than 1 m/s counts as driving 1 m/s. Without a leader the share is 1.
     """
-    now, view = frames(0), View.of(scene)
+    now, view = frames(0), View.of(context)
     place = view.point(now.box[:, :2])
-    others = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
-    half = bank.length_m(scene.index, scene.slot) / 2
+    half = bank.length_m(context.index, context.slot) / 2
     gap = jnp.where(
         leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
     )
-    time = jnp.min(gap) / jnp.maximum(scene.history[-1, 3], _SLOWEST_MPS)
+    time = jnp.min(gap) / jnp.maximum(context.history[-1, 3], _SLOWEST_MPS)
     share = jnp.minimum(time / _LONGEST_S, 1.0)
     return jnp.stack([share, leading.any().astype(jnp.float32)])
 
@@ -101,15 +103,15 @@ def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Ar
     return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
 
 
-def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 6"]:
+def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
     """What a car-following driver looks at along the route, and what the IDM would do with it.
 
     Gap to the leader or a light that asks to stop (90 m at most, in 50 m); speed towards it and its own (15 m/s);
     whether there is one; the speed that the limit and the curves ahead allow (15 m/s); the acceleration of the
     Intelligent Driver Model with its default parameters (6 m/s2). Without a leader both of its speeds are 0.
     """
-    speed = scene.history[-1, MOTION_SPEED]
-    seen = ahead(bank, scene, frames(0), _IDM.min_gap_m)
+    speed = context.history[-1, MOTION_SPEED]
+    seen = ahead(bank, context, frames(0), _IDM.min_gap_m)
     leads = seen.gap < _FARTHEST_M
     speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads
     return jnp.concatenate(
@@ -127,16 +129,16 @@ def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Arr
     )
 
 
-def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 3"]:
+def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
     """The next stop line on the route: distance from the front bumper in 50 m, whether it is red, whether there is one.
 
     Lines further than 50 m, or passed by the bumper, are not there; the distance is then 1.
     """
-    ahead = bank.light_line[scene.index, LightRow.ARC] - scene.route_m
-    gap = ahead - bank.length_m(scene.index, scene.slot) / 2
+    ahead = bank.light_line[context.index, LightRow.ARC] - context.route_m
+    gap = ahead - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
-    real = bank.light_line[scene.index, LightRow.ARC] < NEVER_M
-    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
+    real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
+    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
     next_one = jnp.argmin(jnp.where(there, gap, jnp.inf))
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     distance = jnp.where(there.any(), gap[next_one] / POSITION_M, 1.0)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.metrics.episode import Episode, episode_add, episode_start
 from drivax.metrics.selection import MetricNames, select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.types import Facts, Frame, Scene, Situation, Surroundings
+from drivax.simulator.types import AgentContext, Facts, Frame, Situation, Surroundings
 from drivax.tasks.actions import ActionSpace, Physical
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
@@ -67,20 +67,20 @@ class Task:
         return self.actions.first(history, length)
 
     def observe(
-        self, bank: ScenarioBank, scene: Scene, agents: Callable[[int], Frame], frame: Frame
+        self, bank: ScenarioBank, context: AgentContext, agents: Callable[[int], Frame], frame: Frame
     ) -> Observation:
-        """The observation of a scene; ``agents`` gives everyone's frame some steps back."""
-        return observe(self.observation, bank, scene, lambda back: agents(back) if back else frame)
+        """The observation of a context; ``agents`` gives everyone's frame some steps back."""
+        return observe(self.observation, bank, context, lambda back: agents(back) if back else frame)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Weighted terms by name."""
         return self.rewards.weigh(before, now, around)
 
     def ended(
-        self, bank: ScenarioBank, scene: Scene, facts: Facts
+        self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Terminated by a failure; truncated where the log or the map ends."""
-        log_ends, terminated = scene.step >= bank.steps - 1, jnp.zeros((), bool)
+        log_ends, terminated = context.step >= bank.steps - 1, jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends
         for name in self.ends:
