@@ -14,7 +14,7 @@ import pytest
 PURE_ROOMS = ("geometry", "scenario", "simulator", "metrics", "tasks", "rl")
 PURE_PACKAGES = {"numpy", "jax", "jaxtyping", "lazy_loader"}
 #: Modules of pure rooms that read or write files.
-EDGES = {"scenario/store.py", "scenario/manifest.py"}
+EDGES = {"scenario/store.py"}
 #: Functions that are one long table.
 TABLES = {"scenario/schema.py: scenario_fields"}
 REGISTRIES = ("pypi." + "org", "files.python" + "hosted", "download.py" + "torch", "registry.npm" + "js")
@@ -55,7 +55,7 @@ def test_pure_rooms(package: Path, room: str):
             allowed = top in PURE_PACKAGES | {"drivax", "__future__"} or top in sys.stdlib_module_names
             assert allowed, f"{file.relative_to(package)} imports {name}"
             assert not name.startswith(
-                ("drivax.tracking", "drivax.scenario.store", "drivax.scenario.manifest")
+                ("drivax.tracking", "drivax.scenario.store", "drivax.scenario.store")
             ), f"{file.relative_to(package)} imports {name}"
 
 

@@ -216,7 +216,7 @@ def test_wrong_calls_get_one_line(words, said, status, sets, inspect):
 
 def test_a_sample_is_spread_evenly(sets, monkeypatch):
     from drivax.report import inspection
-    from drivax.scenario.select.filters import Selection
+    from drivax.scenario.select.selection import Selection
 
     one = Inspection.open(sets[0], Selection())
     assert [scenario.id for scenario in one.sample()] == ["s0", "s1", "s2", "s3"]

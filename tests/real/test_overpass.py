@@ -12,7 +12,8 @@ from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows, with_ego
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task

@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, rotate
 from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank

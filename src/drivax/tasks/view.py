@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.angles import rotate
+from drivax.geometry.vectors import rotate
 from drivax.scenario.record import record
 from drivax.simulator.types import Frame, Scene
 
