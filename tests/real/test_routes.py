@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.benchmark_scripts import load_script
 
+from benchmark_scripts import load_script
 from drivax.datasets.reader import BadRecord
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording, windows, with_ego

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmark_scripts import load_script
 from drivax.scenario.build.assemble import assemble
 
-from ..benchmark_scripts import load_script
 from .recordings import driving, make_recording, make_tracks
 
 routes = load_script("routes")
