@@ -17,7 +17,8 @@ from drivax.learning.environment import Environment
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Discrete
@@ -135,7 +136,7 @@ def test_new_episodes_begin_as_logged(experience, bank):
 
 
 def test_episodes_begin_at_the_steps_asked_for(bank):
-    late = replace(bank, agents=bank.agents.at[1, :3, 0, AGENT_VALID].set(0.0))
+    late = replace(bank, agents=bank.agents.at[1, :3, 0, AgentColumn.VALID].set(0.0))
     index, step, _ = _draw(late, jax.random.key(2), 64, 0, 0)
     np.testing.assert_array_equal(step, np.where(index == 1, 10, 0))
     step = _draw(bank, jax.random.key(2), 256, 0, LATEST)[1]
@@ -173,7 +174,13 @@ def test_demonstrations_follow_the_log(bank, driving):
     rows = np.asarray(bank.agents)[index[:, None], step[:, None] + np.arange(2), 0]
     speed = (rows[..., 5:7] * rows[..., 3:5]).sum(-1).clip(0)
     motion = np.stack(
-        [rows[..., 0], rows[..., 1], np.arctan2(rows[..., AGENT_SIN], rows[..., AGENT_COS]), speed], axis=-1
+        [
+            rows[..., 0],
+            rows[..., 1],
+            np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS]),
+            speed,
+        ],
+        axis=-1,
     )
     reached = jax.vmap(bicycle)(motion[:, 0], 6.0 * action[:, 0], 0.3 * action[:, 1])
     off = np.linalg.norm(reached[:, :2] - motion[:, 1, :2], axis=-1)

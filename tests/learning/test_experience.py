@@ -15,7 +15,8 @@ from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, Recorded, transitions
 from drivax.learning.loop import usable_steps
 from drivax.planners.simple import Expert, logged_motion
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -33,7 +34,7 @@ def bank(data):
     ego, box = bank.agents[0, 15, 0], bank.agent_box[0, 0]
     agents = bank.agents.at[0, :, 1].set(ego)
     # In the last, the log loses ego.
-    agents = agents.at[2, 70:, 0, AGENT_VALID].set(0.0)
+    agents = agents.at[2, 70:, 0, AgentColumn.VALID].set(0.0)
     # In the second, it looks aside for a moment.
     agents = agents.at[1, JUMP, 0, 3:5].set(-agents[1, JUMP, 0, 4:2:-1])
     return replace(bank, agents=agents, agent_box=bank.agent_box.at[0, 1].set(box))

@@ -10,7 +10,8 @@ import pytest
 from drivax.datasets.formats import detect
 from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble, windows, with_ego
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
@@ -70,8 +71,11 @@ def test_vehicle_height_follows_its_road(driven):
     def heights(index):
         return jax.lax.scan(one, simulator.reset(bank, index), None, 80)[1]
 
-    found, logged = np.asarray(heights(jnp.arange(len(driven)))), np.asarray(bank.agents[:, 11:, 0, AGENT_Z])
-    there = np.asarray(bank.agents[:, 11:, 0, AGENT_VALID]) > 0
+    found, logged = (
+        np.asarray(heights(jnp.arange(len(driven)))),
+        np.asarray(bank.agents[:, 11:, 0, AgentColumn.Z]),
+    )
+    there = np.asarray(bank.agents[:, 11:, 0, AgentColumn.VALID]) > 0
     apart = np.abs(found - logged)[there]
     # Recorded boxes float by centimetres over the road that was recorded with them.
     assert np.quantile(apart, 0.99) < 0.5 and np.median(apart) < 0.1

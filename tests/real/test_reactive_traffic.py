@@ -9,7 +9,8 @@ import pytest
 
 from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.reader import BadRecord
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.traffic.reactive import DRIVES, REPLAYS
 from traffic_oracle import TRAFFIC, compare, meetings, runs_of
 from traffic_oracle import Path as Line
@@ -49,7 +50,7 @@ def test_paths_follow_logs_and_vehicles_follow_paths(bank, runs):
     for index, (frames, traffic) in enumerate(runs):
         for row in np.flatnonzero((traffic.phase == DRIVES).any(0)):
             slot, path = int(bank.paths.slot[index, row]), Line(bank.paths, index, row)
-            seen = agents[index, :, slot, AGENT_VALID] > 0
+            seen = agents[index, :, slot, AgentColumn.VALID] > 0
             x, y, _, _ = path.at(np.asarray(bank.paths.log_arc[index, seen, row]))
             away += np.hypot(x - agents[index, seen, slot, 0], y - agents[index, seen, slot, 1]).tolist()
             moves += (np.hypot(*agents[index, seen, slot, 5:7].T) > 1.0).tolist()

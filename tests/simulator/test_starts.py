@@ -11,7 +11,7 @@ from drivax.errors import UsageError
 from drivax.geometry.boxes import corners, overlap
 from drivax.learning.config import TrainConfig
 from drivax.planners.simple import ConstantVelocity, Expert
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.build.assemble import assemble
 from drivax.settings import dump, load, parse_yaml
 from drivax.simulator.contact import Contact
@@ -160,7 +160,9 @@ def test_an_episode_begins_at_any_step_as_logged():
     simulator = Simulator(Task(metrics=("ade", "progress"), ends=()))
     states = jax.jit(jax.vmap(lambda step: simulator.reset(bank, 0, step)))(jnp.arange(90))
     row = bank.agents[0, :90, 0]
-    logged = jnp.stack([row[:, 0], row[:, 1], jnp.arctan2(row[:, AGENT_SIN], row[:, AGENT_COS])], -1)
+    logged = jnp.stack(
+        [row[:, 0], row[:, 1], jnp.arctan2(row[:, AgentColumn.SIN], row[:, AgentColumn.COS])], -1
+    )
     np.testing.assert_allclose(states.scene.history[:, -1, :3], logged, atol=1e-6)
     np.testing.assert_allclose(states.facts.log_divergence_m, 0.0, atol=1e-6)
     np.testing.assert_allclose(np.diff(states.facts.progress_m), 0.6, atol=1e-2)

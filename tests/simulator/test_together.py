@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.bank.scenario_bank import AGENT_VALID
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.together import is_driven, slots_of
 from drivax.simulator.traffic.reactive import IdmTraffic
@@ -63,7 +63,7 @@ def braking(bank):
 def test_slots_are_those_of_the_mask_that_are_there(bank):
     cars = [car(0, 0, 0, 5), car(20, 0, 0, 5), car(40, 0, 0, 5, steps=range(30, 91)), car(60, 0, 0, 5)]
     here = bank_of(straight_road(cars))
-    there = np.flatnonzero(np.asarray(here.agents[0, 10, :, AGENT_VALID]) > 0)
+    there = np.flatnonzero(np.asarray(here.agents[0, 10, :, AgentColumn.VALID]) > 0)
     assert there.size == 3
     mask = jnp.ones(16, bool)
     assert slots_of(here, 0, mask, 5).tolist() == [*there, 16, 16]

@@ -11,8 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import norm
 from drivax.planners.simple import logged_motion
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import project_on_route
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.contact import overlaps
 from drivax.simulator.traffic.log import alone, frame_of
@@ -55,7 +56,7 @@ class Logged:
 def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
     """The log of one scenario."""
     rows = bank.agents[index, :, 0]
-    valid, steps = rows[:, AGENT_VALID] > 0, jnp.arange(bank.steps)
+    valid, steps = rows[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
     known = jnp.maximum(jax.lax.cummax(jnp.where(valid, steps, -1)), jnp.argmax(valid))
     scenes = jax.vmap(lambda step: _scene(bank, index, step))(known)
     motion = jax.vmap(lambda scene: logged_motion(bank, scene, 0))(scenes)
@@ -67,18 +68,18 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
     return Logged(
         scene=scenes,
         motion=motion,
-        velocity=rows[known, 5:7],
+        velocity=rows[known, AgentColumn.VELOCITY],
         valid=valid,
         frame=frame,
         left_out=_left_out(touching, frame.valid),
         along_m=_along_route(bank, index, motion[:, :2]),
-        ground_m=frame.z[:, 0] - bank.agent_box[index, 0, 2] / 2,
+        ground_m=frame.z[:, 0] - bank.height_m(index, 0) / 2,
     )
 
 
 def _scene(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> Scene:
     history = jnp.zeros((HISTORY, 4)) if motion is None else jnp.broadcast_to(motion, (HISTORY, 4))
-    z, zero = bank.agents[index, step, 0, AGENT_Z], jnp.zeros(())
+    z, zero = bank.agents[index, step, 0, AgentColumn.Z], jnp.zeros(())
     return Scene(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, ())
 
 

@@ -143,6 +143,6 @@ def advanced(
         logged = logged_motion(bank, state.scene, 1)
         return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
     scene, sound = state.scene, jnp.isfinite(action).all()
-    length_m = bank.agent_box[scene.index, scene.slot, 0]
+    length_m = bank.length_m(scene.index, scene.slot)
     nothing = simulator.task.first_action(scene.history, length_m)
     return simulator.step(bank, state, jnp.where(sound, action, nothing))[0], carry, sound

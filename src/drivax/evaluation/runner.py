@@ -27,8 +27,9 @@ from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import catalogue
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.sizes import Sizes
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
@@ -108,7 +109,7 @@ def evaluate_in(
         )
     trial = _Trial.of(simulator, planner, start_step, seed, bank.steps)
     _refuse_without_future(scenarios, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
-    trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) > 0)
+    trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0)
     with raised() as errors, telling_out_of_memory(len(bank)):
         episodes = trial.drive_all(bank, progress)
     return trial.results(episodes, scenarios, np.asarray(bank.identity), errors)

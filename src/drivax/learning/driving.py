@@ -18,7 +18,8 @@ from drivax.learning.sampler import Places
 from drivax.metrics.catalogue import CODES
 from drivax.metrics.episode import episode_metrics
 from drivax.planners.simple import expert_action, logged_motion
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
@@ -217,14 +218,14 @@ def _draw(
     index = jax.random.randint(index_key, (count,), 0, len(bank))
     step = jax.random.randint(step_key, (count,), earliest, latest + 1)
     # The ego is always there at the current step.
-    step = jnp.where(bank.agents[index, step, 0, AGENT_VALID] > 0, step, CURRENT_STEP)
+    step = jnp.where(bank.agents[index, step, 0, AgentColumn.VALID] > 0, step, CURRENT_STEP)
     keys = jax.random.split(jax.random.fold_in(step_key, 1), count)  # not computed where starts are logged
     return index, step, keys
 
 
 def _told(bank: ScenarioBank) -> Bool[Array, "N T"]:
     """Steps from the current one on at which the log tells what the expert did: ego is there, and for two steps on."""
-    there = bank.agents[:, :, 0, AGENT_VALID] > 0
+    there = bank.agents[:, :, 0, AgentColumn.VALID] > 0
     goes_on = jnp.pad(there[:, :-2] & there[:, 1:-1] & there[:, 2:], ((0, 0), (0, 2)))
     return goes_on & (jnp.arange(bank.steps) >= CURRENT_STEP)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
@@ -47,7 +48,7 @@ class IdmPlanner(Memoryless):
         ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
         left_m = bank.route_points[scene.index, 0] - 1 - scene.route_m
         ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
-        target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, :2] - me[:2]
+        target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, RouteColumn.XY] - me[:2]
         acceleration = seen.acceleration(speed, self.parameters)
         action = self.actions.action(motion, acceleration, pursuit(me, target), me[4])
         return self.actions.actuated(motion, action, scene.action), carry

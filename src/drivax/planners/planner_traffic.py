@@ -11,7 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from drivax.errors import UsageError
 from drivax.planners.planner import Memoryless, Planner
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.contact import Contact
@@ -100,7 +101,7 @@ class PlannerTraffic:
             key = jax.random.fold_in(key, one.step)
             seen = self.task.observe(bank, found.scene, frames, frame)
             asked, _ = bank.driver.act((), bank, state, found, seen, jax.random.fold_in(key, one.slot))
-            motion, length = one.history[-1], bank.agent_box[one.index, one.slot, 0]
+            motion, length = one.history[-1], bank.length_m(one.index, one.slot)
             action = self.task.actuated(motion, asked, one.action)
             motion = self.task.motion(motion, action, length)
             history = jnp.concatenate([one.history[1:], motion[None]])
@@ -123,12 +124,16 @@ class PlannerTraffic:
         """Slots of the vehicles that are driven, the nearest to ego first, filled up with nobody's."""
         rows = bank.agents[index]
         here = rows[step]
-        moved = ((rows[..., :2] - here[:, :2]) ** 2).sum(axis=-1)
-        later = (rows[..., AGENT_VALID] > 0) & (jnp.arange(bank.steps) > step)[:, None]
+        moved = ((rows[..., AgentColumn.XY] - here[:, AgentColumn.XY]) ** 2).sum(axis=-1)
+        later = (rows[..., AgentColumn.VALID] > 0) & (jnp.arange(bank.steps) > step)[:, None]
         slots = jnp.arange(here.shape[0])
-        chosen = (here[:, AGENT_VALID] > 0) & (slots > 0) & (later & (moved > _TRAVELS_M**2)).any(axis=0)
-        chosen &= bank.agent_box[index, : here.shape[0], 3] == int(AgentKind.VEHICLE)
-        distance = jnp.where(chosen, ((here[:, :2] - here[0, :2]) ** 2).sum(axis=-1), jnp.inf)
+        chosen = (
+            (here[:, AgentColumn.VALID] > 0) & (slots > 0) & (later & (moved > _TRAVELS_M**2)).any(axis=0)
+        )
+        chosen &= bank.agent_box[index, : here.shape[0], SizeColumn.KIND] == int(AgentKind.VEHICLE)
+        distance = jnp.where(
+            chosen, ((here[:, AgentColumn.XY] - here[0, AgentColumn.XY]) ** 2).sum(axis=-1), jnp.inf
+        )
         order = jnp.argsort(distance)[: self.count]
         order = jnp.pad(order, (0, self.count - order.shape[0]), constant_values=here.shape[0])
         far = jnp.isinf(distance.at[order].get(mode="fill", fill_value=jnp.inf))

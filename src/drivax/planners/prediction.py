@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import LEVEL_M, lane_course
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.ahead import project
@@ -62,18 +63,18 @@ class Trend:
         """From the log's rows of the present step and of half a second ago; parked agents keep still."""
         now = bank.agents[scene.index, scene.step]
         before = bank.agents[scene.index, jnp.maximum(scene.step - _PAST, 0)]
-        known = (now[:, AGENT_VALID] > 0) & (before[:, AGENT_VALID] > 0) & (scene.step >= _PAST)
-        turn = _turn(before[:, AGENT_COS : AGENT_SIN + 1], now[:, AGENT_COS : AGENT_SIN + 1])
-        faster = _length(now[:, 5:7]) - _length(before[:, 5:7])
+        known = (now[:, AgentColumn.VALID] > 0) & (before[:, AgentColumn.VALID] > 0) & (scene.step >= _PAST)
+        turn = _turn(before[:, AgentColumn.HEADING], now[:, AgentColumn.HEADING])
+        faster = _length(now[:, AgentColumn.VELOCITY]) - _length(before[:, AgentColumn.VELOCITY])
         parked = bank.agent_box.shape[1] - len(now)
 
         def whole(moving: Array) -> Array:
             return jnp.pad(moving, ((0, parked), *((0, 0),) * (moving.ndim - 1)))
 
         return cls(
-            whole(now[:, AGENT_COS : AGENT_SIN + 1]),
-            whole(_length(now[:, 5:7])),
-            whole(now[:, AGENT_VALID] > 0),
+            whole(now[:, AgentColumn.HEADING]),
+            whole(_length(now[:, AgentColumn.VELOCITY])),
+            whole(now[:, AgentColumn.VALID] > 0),
             whole(jnp.where(known, turn, 0.0) / (_PAST * DT_S)),
             whole(jnp.where(known, faster, 0.0) / (_PAST * DT_S)),
             whole(jnp.zeros(now.shape[0])),

@@ -20,6 +20,7 @@ from drivax.planners.prediction import (
     at,
     prediction_times,
 )
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, left_of_edges, route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
@@ -183,7 +184,7 @@ def _line(
     A cubic whose largest lateral acceleration, 6 d / T^2 for a shift by d within T, is 3.5 m/s2.
     """
     beside, shift = aside
-    cos, sin = path[:, 3], path[:, 4]
+    cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     forward, left = me[COS] * cos[0] + me[SIN] * sin[0], me[SIN] * cos[0] - me[COS] * sin[0]
     slope = jnp.clip(left / jnp.maximum(forward, 0.3), -0.5, 0.5)
     takes_s = jnp.clip(jnp.sqrt(6.0 * jnp.abs(shift - beside) / _ASIDE_MPS2), 1.0, 2.5)
@@ -193,8 +194,8 @@ def _line(
     slopes = (shift - beside) * 6.0 * u * (1.0 - u) / length + slope * (1.0 - u) * (1.0 - 3.0 * u)
     norm = jnp.sqrt(1.0 + slopes * slopes)
     turned = jnp.stack([(cos - sin * slopes) / norm, (sin + cos * slopes) / norm], axis=-1)
-    xy = path[:, :2] + d[:, None] * jnp.stack([-sin, cos], axis=-1)
-    return path.at[:, :2].set(xy).at[:, 3:5].set(turned)
+    xy = path[:, RouteColumn.XY] + d[:, None] * jnp.stack([-sin, cos], axis=-1)
+    return path.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(turned)
 
 
 def _corridor(
@@ -260,7 +261,7 @@ def _bad_ground(
 ) -> tuple[Array, Array]:
     """Whether the car would leave the road within 3 s, and whether a line leads out of the lanes that go its way."""
     scene = situation.scene
-    ground = scene.z - bank.agent_box[scene.index, scene.slot, 2] / 2
+    ground = scene.z - bank.height_m(scene.index, scene.slot) / 2
 
     def beyond(at: Array) -> Array:
         box = jnp.concatenate([at, me[LENGTH:]])

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drivax.planners.planner import Memoryless
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.simulator.types import Scene, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical
@@ -22,17 +23,17 @@ def logged_motion(bank: ScenarioBank, scene: Scene, ahead: int) -> Float[Array, 
     """
     at = scene.step + ahead
     row = bank.agents[scene.index, jnp.minimum(at, bank.steps - 1), scene.slot]
-    speed = jnp.maximum(jnp.sum(row[5:7] * row[3:5]), 0.0)
+    speed = jnp.maximum(jnp.sum(row[AgentColumn.VELOCITY] * row[AgentColumn.HEADING]), 0.0)
     beyond = jnp.maximum(at - (bank.steps - 1), 0) * 0.1
-    xy = row[:2] + beyond * row[5:7]
-    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(row[AGENT_SIN], row[AGENT_COS]), speed])
-    return jnp.where(row[AGENT_VALID] > 0, motion, scene.history[-1])
+    xy = row[AgentColumn.XY] + beyond * row[AgentColumn.VELOCITY]
+    motion = jnp.stack([xy[0], xy[1], jnp.arctan2(row[AgentColumn.SIN], row[AgentColumn.COS]), speed])
+    return jnp.where(row[AgentColumn.VALID] > 0, motion, scene.history[-1])
 
 
 def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Float[Array, " D"]:
     """The action that follows the log from here; not clipped, so that ``actions.clipped`` can say what would be."""
     ahead, beyond = logged_motion(bank, scene, 1), logged_motion(bank, scene, 2)
-    return actions.expert(scene.history[-1], ahead, beyond, bank.agent_box[scene.index, scene.slot, 0])
+    return actions.expert(scene.history[-1], ahead, beyond, bank.length_m(scene.index, scene.slot))
 
 
 @record
@@ -80,7 +81,7 @@ class ConstantVelocity(Memoryless):
     ) -> tuple[Float[Array, " D"], Any]:
         """No acceleration, no curvature."""
         scene, zero = state.scene, jnp.zeros(())
-        length_m = bank.agent_box[scene.index, scene.slot, 0]
+        length_m = bank.length_m(scene.index, scene.slot)
         return self.actions.action(scene.history[-1], zero, zero, length_m), carry
 
 

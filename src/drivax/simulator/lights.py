@@ -5,15 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import light_crossing
-from drivax.scenario.bank.scenario_bank import (
-    LIGHT_ARC,
-    LIGHT_EXIT_COS,
-    LIGHT_EXIT_SIN,
-    LIGHT_RIGHT,
-    NEVER_M,
-    ScenarioBank,
-)
+from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import LightState
 from drivax.simulator.types import HISTORY, MOTION_SPEED, LightMemory, Scene
 
@@ -32,8 +26,8 @@ def _fronts(scene: Scene, length_m: Float[Array, ""]) -> Float[Array, "16 2"]:
 
 def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
     """The memory that a scene's recent motion implies, as if it had been driven."""
-    length = bank.agent_box[scene.index, scene.slot, 0]
-    ground = scene.z - bank.agent_box[scene.index, scene.slot, 2] / 2
+    length = bank.length_m(scene.index, scene.slot)
+    ground = scene.z - bank.height_m(scene.index, scene.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
     fronts = _fronts(scene, length)
     for age in range(HISTORY - 1, -1, -1):
@@ -67,14 +61,14 @@ def judge_lights(
     # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
     arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
     line = bank.light_line[scene.index]
-    is_red &= ~((line[LIGHT_RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
-    ran = (crossed & is_red & (line[LIGHT_ARC] < NEVER_M)).any() & on_route
+    is_red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
+    ran = (crossed & is_red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
 
     begins = crossed & ~on_route
     age = jnp.where(begins, jnp.where(is_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
     # What is still open when the log ends is judged then.
     due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (scene.step >= last))
-    fit = jnp.where(due, line[LIGHT_EXIT_COS] * me[2] + line[LIGHT_EXIT_SIN] * me[3], -2.0)
+    fit = jnp.where(due, line[LightRow.EXIT_COS] * me[2] + line[LightRow.EXIT_SIN] * me[3], -2.0)
     ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
     age = jnp.where(due, 0, age)
     stands = (scene.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)

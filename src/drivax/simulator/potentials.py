@@ -111,7 +111,7 @@ def fault_potential(
         frame: Everyone in it (``Simulator.frame``).
         margin_m: As above.
     """
-    ground = frame.z[scene.slot] - bank.agent_box[scene.index, scene.slot, 2] / 2
+    ground = frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
     away = offroad_potential(bank, scene.index, frame.box[scene.slot], ground, margin_m)
     return away + collision_potential(frame, scene.slot, margin_m).sum()
 

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.scenario.bank.scenario_bank import AGENT_Z, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.contact import Contact
 from drivax.simulator.lights import nothing_crossed, remember_lights
@@ -63,16 +64,16 @@ class Simulator:
             step=step,
             slot=slot,
             history=history,
-            action=self.task.first_action(history, bank.agent_box[index, slot, 0]),
+            action=self.task.first_action(history, bank.length_m(index, slot)),
             route_m=route_m,
-            z=bank.agents[index, step, slot, AGENT_Z],
+            z=bank.agents[index, step, slot, AgentColumn.Z],
             traffic=self.traffic.start(bank, index, step),
         )
         if isinstance(self.start, LogStart):
             return scene
         agents = self.traffic.agents(bank, scene, 0)
         history, route_m = self.start.begin(bank, index, step, slot, agents, key)
-        action = self.task.first_action(history, bank.agent_box[index, slot, 0])
+        action = self.task.first_action(history, bank.length_m(index, slot))
         return replace(scene, history=history, route_m=route_m, action=action)
 
     def beginning(
@@ -227,7 +228,7 @@ class Simulator:
         """The agent moves one step, in traffic that has moved."""
         if motion is None:
             action = self.task.actuated(scene.history[-1], action, scene.action)
-            motion = self.task.motion(scene.history[-1], action, bank.agent_box[scene.index, scene.slot, 0])
+            motion = self.task.motion(scene.history[-1], action, bank.length_m(scene.index, scene.slot))
         return replace(
             scene,
             step=scene.step + 1,

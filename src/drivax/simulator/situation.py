@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import norm
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.passages import lane_passage
 from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
@@ -22,7 +23,7 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
     project_on_route,
 )
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import (
     STOPPED_MPS,
@@ -79,7 +80,7 @@ def measure(
     around = surroundings(bank, scene, frame)
     lanes, route, me, ground = around.lanes, around.route, frame.box[scene.slot], _ground(bank, scene, frame)
     beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
-    z = jnp.where(lanes.near, lanes.z + bank.agent_box[scene.index, scene.slot, 2] / 2, frame.z[scene.slot])
+    z = jnp.where(lanes.near, lanes.z + bank.height_m(scene.index, scene.slot) / 2, frame.z[scene.slot])
     scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
     codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
     routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
@@ -101,7 +102,7 @@ def measure(
         speed_mps=now[MOTION_SPEED],
         limit_mps=lanes.limit,
         routed=routed,
-        logged=logged[AGENT_VALID] > 0,
+        logged=logged[AgentColumn.VALID] > 0,
         ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
@@ -109,7 +110,7 @@ def measure(
         progress_m=scene.route_m,
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
-        log_divergence_m=norm(now[:2] - logged[:2]),
+        log_divergence_m=norm(now[:2] - logged[AgentColumn.XY]),
         goal_distance_m=norm(now[:2] - bank.goal[scene.index]),
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
@@ -139,7 +140,7 @@ def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings
 
 def _ground(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
     """Height of the ground under the driven agent, m."""
-    return frame.z[scene.slot] - bank.agent_box[scene.index, scene.slot, 2] / 2
+    return frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
 
 
 def _moved(scene: Scene) -> Float[Array, ""]:
@@ -188,7 +189,7 @@ def _requested(
         found["gap_m"] = nearest_gap(frame, scene.slot, codes == Contact.IGNORED)
     if "lag_m" in reads:
         me, logged = frame.box[scene.slot], bank.agents[scene.index, scene.step, scene.slot]
-        found["lag_m"] = jnp.sum((logged[:2] - me[:2]) * me[2:4])
+        found["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
     if reads & _PASSAGES:
         ground, me = _ground(bank, scene, frame), frame.box[scene.slot]
         if strand is None:

@@ -299,7 +299,7 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return jnp.stack([x, y, jnp.cos(heading), jnp.sin(heading), size[0], size[1]])
 
     def ground(bank: ScenarioBank, state: SimState) -> Array:
-        return state.scene.z - bank.agent_box[state.scene.index, state.scene.slot, 2] / 2
+        return state.scene.z - bank.height_m(state.scene.index, state.scene.slot) / 2
 
     def edges(bank: ScenarioBank, state: SimState) -> Any:
         me = box(bank, state)

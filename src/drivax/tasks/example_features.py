@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.vectors import norm
+from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import LIGHT_ARC, NEVER_M, ROAD_LANE, ScenarioBank
+from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import LightState
 from drivax.simulator.ahead import ahead
@@ -56,11 +57,11 @@ def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Ar
     """
     view = View.of(scene)
     rows, layer = bank.road[scene.index], bank.road_at[scene.index, 2]
-    middle, direction = view.point(rows[:, :2]), view.vector(rows[:, 2:4])
-    half = rows[:, 4] / 2
+    middle, direction = view.point(rows[:, RoadColumn.XY]), view.vector(rows[:, RoadColumn.DIRECTION])
+    half = rows[:, RoadColumn.LENGTH] / 2
     along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
     apart = norm(middle + along[:, None] * direction)
-    fits = (layer == ROAD_LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
+    fits = (layer == RoadLayer.LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
     best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
     curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[scene.index, best]), 0.0)
     return jnp.stack([curvature, fits[best].astype(jnp.float32)])
@@ -86,7 +87,7 @@ def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, "
     place = view.point(now.box[:, :2])
     others = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
     leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
-    half = bank.agent_box[scene.index, scene.slot, 0] / 2
+    half = bank.length_m(scene.index, scene.slot) / 2
     gap = jnp.where(
         leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
     )
@@ -131,10 +132,10 @@ def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, 
 
     Lines further than 50 m, or passed by the bumper, are not there; the distance is then 1.
     """
-    ahead = bank.light_line[scene.index, LIGHT_ARC] - scene.route_m
-    gap = ahead - bank.agent_box[scene.index, scene.slot, 0] / 2
+    ahead = bank.light_line[scene.index, LightRow.ARC] - scene.route_m
+    gap = ahead - bank.length_m(scene.index, scene.slot) / 2
     state = frames(0).lights
-    real = bank.light_line[scene.index, LIGHT_ARC] < NEVER_M
+    real = bank.light_line[scene.index, LightRow.ARC] < NEVER_M
     there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
     next_one = jnp.argmin(jnp.where(there, gap, jnp.inf))
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)

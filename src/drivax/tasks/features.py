@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import ROUTE_COS, ROUTE_SIN, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Flag
 from drivax.simulator.types import Scene
 from drivax.tasks.view import PIECE_M, POSITION_M
@@ -164,7 +165,7 @@ def route_curvature(
     zero = jnp.zeros(())
     one, _ = route_ahead(bank, index, zero, before)
     other, _ = route_ahead(bank, index, zero, behind)
-    (c0, s0), (c1, s1) = ((rows[:, ROUTE_COS], rows[:, ROUTE_SIN]) for rows in (one, other))
+    (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (one, other))
     apart = behind - before
     # Without a route its rows are zero, of which there is no angle.
     turn = jnp.where(

@@ -16,21 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
+from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import (
-    LIGHT_ARC,
-    LIGHT_COS,
-    LIGHT_SIN,
-    LIGHT_X,
-    LIGHT_Y,
-    NEVER_M,
-    ROAD_AREA,
-    ROAD_EDGE,
-    ROAD_LANE,
-    ROAD_NONE,
-    ROUTE_LIMIT,
-    ScenarioBank,
-)
+from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, LightState
 from drivax.simulator.types import HISTORY, Scene
 from drivax.tasks.features import (
@@ -213,7 +201,7 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
 def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
     past = scene.history[HISTORY - config.steps :]
     turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
-    size = bank.agent_box[scene.index, scene.slot, :2] / SIZE_M
+    size = bank.agent_box[scene.index, scene.slot, SizeColumn.FOOTPRINT] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: turned[:, ::-1],
@@ -223,7 +211,7 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View
     static = {
         "length": lambda: size[:1],
         "width": lambda: size[1:],
-        "height": lambda: bank.agent_box[scene.index, scene.slot, 2:3] / SIZE_M,
+        "height": lambda: bank.agent_box[scene.index, scene.slot, SizeColumn.HEIGHT][..., None] / SIZE_M,
         "last_action": lambda: scene.action,
     }
     result = {}
@@ -275,7 +263,7 @@ def _agents(
     parts = {
         "length": lambda: size[:, :1],
         "width": lambda: size[:, 1:],
-        "height": lambda: bank.agent_box[scene.index, chosen, 2:3] / SIZE_M,
+        "height": lambda: bank.agent_box[scene.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
         "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
     static = joined(chosen_features, parts, (config.agents,))
@@ -304,8 +292,12 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
     dx, dy = x - view.xy[0], y - view.xy[1]
     ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
-    inside &= (jnp.abs(left) < config.road_side_m) & (layer != ROAD_NONE)
-    layers = ((config.lanes, ROAD_LANE), (config.edges, ROAD_EDGE), (config.crosswalks, ROAD_AREA))
+    inside &= (jnp.abs(left) < config.road_side_m) & (layer != RoadLayer.NONE)
+    layers = (
+        (config.lanes, RoadLayer.LANE),
+        (config.edges, RoadLayer.EDGE),
+        (config.crosswalks, RoadLayer.AREA),
+    )
     for hidden in [kind for shown, kind in layers if not shown]:
         inside &= layer != hidden
     # Compact without sorting: the running count says where each row inside goes.
@@ -313,11 +305,13 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
     place = jnp.where(inside, running - 1, config.road)
     take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
     rows = bank.road[scene.index, take]
-    parts = [view.point(rows[:, :2]) / POSITION_M, view.vector(rows[:, 2:4])]
-    types = (rows[:, 5:6] == jnp.asarray([ROAD_LANE, ROAD_EDGE, ROAD_AREA])).astype(jnp.float32)
-    limit = rows[:, 6:7]
+    parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
+    types = (
+        rows[:, RoadColumn.LAYER, None] == jnp.asarray([RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA])
+    ).astype(jnp.float32)
+    limit = rows[:, RoadColumn.LIMIT, None]
     parts += [
-        rows[:, 4:5] / PIECE_M,
+        rows[:, RoadColumn.LENGTH, None] / PIECE_M,
         types,
         jnp.maximum(limit, 0.0) / SPEED_MPS,
         (limit > 0).astype(jnp.float32),
@@ -348,16 +342,16 @@ def _lights(
     config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, state: Int[Array, " L"]
 ) -> Observation:
     line = bank.light_line[scene.index]
-    dx, dy = line[LIGHT_X] - view.xy[0], line[LIGHT_Y] - view.xy[1]
+    dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
-    seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
-    perception, on_route = config.perception, line[LIGHT_ARC] < NEVER_M
+    seen = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
+    perception, on_route = config.perception, line[LightRow.ARC] < NEVER_M
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
 
     def place() -> Float[Array, "K 2"]:
-        middle = view.point(line[LIGHT_X : LIGHT_Y + 1, chosen].T)
+        middle = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
             middle = middle + moved_lights(perception, bank, scene, state.shape[0])[chosen]
         return middle / POSITION_M
@@ -382,15 +376,15 @@ def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vi
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
     rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
     there &= has_route(bank, scene)
-    limit = rows[:, ROUTE_LIMIT : ROUTE_LIMIT + 1]
+    limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
         return route_curvature(bank, scene.index, scene.route_m + offsets)[:, None]
 
     goal = bank.goal[scene.index]
     parts = {
-        "position": lambda: view.point(rows[:, :2]) / POSITION_M,
-        "heading": lambda: view.vector(rows[:, 3:5])[:, ::-1],
+        "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
+        "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],
         "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
         "curvature": lambda: shown_curvature(curvature()),
         "recommended_speed": lambda: recommended_speed(curvature()) / SPEED_MPS,

@@ -23,8 +23,9 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
 from drivax.geometry.vectors import norm
+from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
-from drivax.scenario.bank.scenario_bank import LIGHT_X, LIGHT_Y, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import HISTORY, Frame, Scene
 
@@ -114,7 +115,7 @@ def _sensed(config: Perception, bank: ScenarioBank, scene: Scene, frame: Frame, 
     box = jnp.concatenate([place, frame.box[:, 2:]], axis=-1)
     lights = frame.lights
     if config.of_lights:
-        line = bank.light_line[scene.index, LIGHT_X : LIGHT_Y + 1]
+        line = bank.light_line[scene.index, LightRow.XY]
         lights = jnp.where(lights_seen(config, bank, scene, norm(line.T - eye[:2]), back), lights, -1)
     return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid), lights=lights)
 

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array
 
 from drivax.geometry.angles import wrap
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank, as_words
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank, as_words
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.recording import Recording
@@ -216,8 +217,8 @@ def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
 
 def littered(bank: ScenarioBank) -> ScenarioBank:
     """The same scenarios; rows of agents that are not there hold garbage."""
-    there = bank.agents[..., AGENT_VALID] > 0
-    agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AGENT_VALID].set(there)
+    there = bank.agents[..., AgentColumn.VALID] > 0
+    agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AgentColumn.VALID].set(there)
     ever = (bank.parked_when > 0).any(axis=1)[..., None]
     return replace(bank, agents=agents, parked=jnp.where(ever, bank.parked, GARBAGE))
 
@@ -225,7 +226,7 @@ def littered(bank: ScenarioBank) -> ScenarioBank:
 def deserted(bank: ScenarioBank) -> ScenarioBank:
     """The same roads with nobody on them but ego."""
     others = jnp.arange(bank.agents.shape[2]) > 0
-    agents = bank.agents.at[..., AGENT_VALID].multiply(~others)
+    agents = bank.agents.at[..., AgentColumn.VALID].multiply(~others)
     return replace(bank, agents=agents, parked_when=jnp.zeros_like(bank.parked_when))
 
 
@@ -235,8 +236,8 @@ def forgotten(bank: ScenarioBank, step: int) -> ScenarioBank:
     Others go somewhere else, lights turn, and the log's own path is gone. Route and goal remain: they are told to ego.
     """
     later = jnp.arange(bank.steps) > step
-    moved = bank.agents.at[..., :2].add(13.0).at[..., 5:7].multiply(-1.0)
-    moved = moved.at[..., AGENT_VALID].set(1.0 - bank.agents[..., AGENT_VALID])
+    moved = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
+    moved = moved.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
     return replace(
         bank,
         agents=jnp.where(later[None, :, None, None], moved, bank.agents),

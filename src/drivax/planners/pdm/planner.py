@@ -136,7 +136,7 @@ class PdmPlanner:
         moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _PAST * DT_S
         turned = wrap(now[MOTION_HEADING] - before[MOTION_HEADING])
         curvature = jnp.where(moved_m > _STILL_M, turned / jnp.maximum(moved_m, _STILL_M), 0.0)
-        steering = jnp.arctan(curvature * self._wheelbase(bank.agent_box[scene.index, scene.slot, 0]))
+        steering = jnp.arctan(curvature * self._wheelbase(bank.length_m(scene.index, scene.slot)))
         most = self.config.tracking.most_steering
         return Memory(
             touched=jnp.zeros(bank.agent_box.shape[1], bool),
@@ -191,7 +191,7 @@ class PdmPlanner:
         cars = jax.vmap(lambda one: tracked(car, one, wheelbase, config.tracking))(reference)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
-        ground_z = frame.z[scene.slot] - bank.agent_box[scene.index, scene.slot, 2] / 2
+        ground_z = frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
         ground = grounds(bank, scene.index, cars.motion, size, z, on_route, every)

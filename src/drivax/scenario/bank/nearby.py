@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.scenario.bank.columns import EdgeRow
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 
 
@@ -51,7 +52,7 @@ def to_segments(
     rows: Float[Array, "F K"] | Sequence[Float[Array, " K"]], points: Float[Array, "P 2"]
 ) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
     """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
-    ax, ay, bx, by = rows[0], rows[1], rows[2], rows[3]
+    ax, ay, bx, by = (rows[k] for k in (EdgeRow.X_A, EdgeRow.Y_A, EdgeRow.X_B, EdgeRow.Y_B))
     ux, uy = bx - ax, by - ay
     wx, wy = points[:, 0:1] - ax, points[:, 1:2] - ay
     squared = jnp.maximum(ux * ux + uy * uy, 1e-9)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from drivax.errors import DataError
 from drivax.geometry.angles import wrap
+from drivax.scenario.bank.columns import RoadLayer, SizeColumn
 from drivax.scenario.bank.identity import identities
 from drivax.scenario.bank.sizes import Sizes, last_used
 from drivax.scenario.build.lane_codes import corridor_lanes, lane_codes
@@ -29,18 +30,10 @@ DEFAULT_LANE_WIDTH_M = 3.7
 #: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
 CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
 
-AGENT_X, AGENT_Y, AGENT_Z, AGENT_COS, AGENT_SIN, AGENT_VX, AGENT_VY, AGENT_VALID = range(8)
-ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range(7)
-#: A stop line: middle, direction of its lane there, half length, height, direction of the lane's end, whether that end
-#: is more than 45 deg to the right, arc length along route 0 where a lane of that leads over it (else very large).
-(
-    LIGHT_X, LIGHT_Y, LIGHT_COS, LIGHT_SIN, LIGHT_HALF, LIGHT_Z, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, LIGHT_ARC,
-) = range(10)  # fmt: skip
+#: Arc length of stop lines that are not on the route.
 NEVER_M = 1e6
 #: Steps in a word of ``parked_when``.
 WORD = 32
-#: Layers of observed pieces of road; rows that hold none are on no layer.
-ROAD_LANE, ROAD_EDGE, ROAD_AREA, ROAD_NONE = range(4)
 
 
 @record
@@ -51,23 +44,22 @@ class ScenarioBank:
     as many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
 
     Attributes:
-        agents: x, y, z, cos, sin, vx, vy, valid of moving agents; slot 0 is ego.
-        agent_box: Length, width, height, kind of everyone.
-        parked: Rows like those of ``agents``, for the slots of parked ones.
-        parked_when: When each of them is there: bit ``t % 32`` of word ``t // 32``; never for slots of moving agents.
-        light_line: Stop lines, see ``LIGHT_X`` to ``LIGHT_ARC``.
-        edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
-        lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
-            added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
-        lane_codes: Strand, neighbours and end of every lane of the graph (``scenario.build.lane_codes``).
+        agents: Moving agents, :class:`AgentColumn`; slot 0 is ego.
+        agent_box: Size and kind of all agents, :class:`SizeColumn`.
+        parked: Parked agents in their slots, :class:`AgentColumn`.
+        parked_when: Steps at which parked agents are observed: bit ``t % 32`` of word ``t // 32``.
+        light_line: Stop lines, :class:`LightRow`.
+        edges: Road-edge segments (drivable side on the left) sorted by grid cell, :class:`EdgeRow`.
+        lanes: Car-lane segments sorted by grid cell, :class:`LaneRow`.
+        lane_codes: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.build.sides.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
-        routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
+        routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
         log_progress: Arc length of the logged ego along route 0.
         log_ahead: Distance that the logged ego still drives.
-        road: Observation pieces in order of rank: x, y, direction, length, layer (``ROAD_LANE``, ...), limit (-1).
-        road_at: What decides which of them are seen: x, y, layer.
+        road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
+        road_at: x, y and layer of the same pieces.
         road_curvature: Turn of each piece per metre, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
         identity: What chance in a scenario follows from, whatever row it has (``scenario.bank.identity``).
@@ -126,6 +118,14 @@ class ScenarioBank:
     def nbytes(self) -> int:
         """Bytes that the bank takes on the device."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+    def length_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+        """Length of an agent, m."""
+        return self.agent_box[index, slot, SizeColumn.LENGTH]
+
+    def height_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+        """Height of an agent, m."""
+        return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
         """Some of the scenarios as a bank; the driver is everyone's."""
@@ -342,7 +342,7 @@ def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.nda
     )
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
     there = np.arange(used) < rows[:, None]
-    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), ROAD_NONE)
+    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), RoadLayer.NONE)
     columns = [xy, direction, length[..., None], layer[..., None], limit[..., None]]
     return {
         "road": np.concatenate(columns, -1, dtype=np.float32),

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
+from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
@@ -115,7 +116,9 @@ class IdmTraffic:
         (here, profile), speed = path_poses(paths, scene.index, now.arc[at]), now.speed[at, :, None]
         direction, there = here[:, 2:], now.there[at, :, None].astype(jnp.float32)
         height = profile[:, PROFILE_Z : PROFILE_Z + 1]
-        driven = jnp.concatenate([here[:, :2], height, direction, direction * speed, there], axis=-1)
+        driven = jnp.concatenate(
+            [here[:, AgentColumn.XY], height, direction, direction * speed, there], axis=-1
+        )
         slot = paths.slot[scene.index].astype(jnp.int32)
         reacts = (now.phase != REPLAYS) & (step > now.begin)
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
@@ -148,7 +151,7 @@ class IdmTraffic:
 
     def _class(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> Int[Array, " R"]:
         """Which of the drivers each vehicle is; -1 where none."""
-        kind = bank.agent_box[index, jnp.maximum(slot, 0), 3].astype(jnp.int32)
+        kind = bank.agent_box[index, jnp.maximum(slot, 0), SizeColumn.KIND].astype(jnp.int32)
         number = jnp.full(kind.shape, -1)
         for place, (name, _) in enumerate(self.drivers):
             number = jnp.where(kind == name, place, number)
@@ -179,7 +182,7 @@ def _movers(bank: ScenarioBank, scene: Scene, slot: Int[Array, " R"]) -> tuple[M
     now = scene.traffic
     arc, speed = now.arc[-1], now.speed[-1]
     here, profile = path_poses(bank.paths, scene.index, arc)
-    size = bank.agent_box[scene.index, jnp.maximum(slot, 0), :2]
+    size = bank.agent_box[scene.index, jnp.maximum(slot, 0), SizeColumn.FOOTPRINT]
     box, z = jnp.concatenate([here, size], axis=-1), profile[:, PROFILE_Z]
     return Movers(box, z, arc, speed, slot, now.ignored.astype(jnp.int32)), profile[:, PROFILE_SPEED]
 
