@@ -228,7 +228,7 @@ def test_presets_by_name_in_yaml():
     [
         (
             "{preset: minimum}",
-            "task.observation: there is no observation preset 'minimum'; did you mean 'minimal'?",
+            "task.observation: unknown observation preset 'minimum'; did you mean 'minimal'?",
         ),
         (
             "{features: {agents: [positon]}}",
