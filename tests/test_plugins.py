@@ -215,7 +215,7 @@ def test_custom_terms_and_groups_are_named():
         RewardConfig(own=(OwnTerm(own_terms.hurry, 1.0), OwnTerm(own_terms.hurry, 2.0)))
     with pytest.raises(ValueError, match=r"observation\.own: name 'agents' is taken"):
         ObservationConfig(own=(OwnGroup(own_terms.goal, "agents"),))
-    with pytest.raises(ValueError, match="cannot be called 'a_mask'"):
+    with pytest.raises(ValueError, match="cannot be named 'a_mask'"):
         OwnGroup(own_terms.goal, "a_mask")
     with pytest.raises(ValueError, match="'<lambda>' is not a name; pass one"):
         OwnTerm(lambda before, now, around: now.speed_mps, 1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import pytest
 from hypothesis import given
@@ -148,7 +148,7 @@ def test_mistakes_are_named_with_their_path(text: str, message: str):
     assert error.value.status == 2
 
 
-def test_missing_setting_and_the_records_own_check():
+def test_missing_settings_and_failed_checks_are_named():
     with pytest.raises(UsageError, match="'steps' is missing"):
         settings.load(Needy, {})
     with pytest.raises(UsageError, match="steps are negative; use 0 or more"):
@@ -181,7 +181,7 @@ def test_kind_names():
     assert settings.kind_of(TD3BC) == "td3_bc"
 
 
-def test_a_section_is_completed_from_the_default_of_its_owner():
+def test_missing_keys_keep_the_enclosing_defaults():
     """Network's optimizer has lr 1e-3 where a bare Adam has 3e-4; naming clip alone must not change lr."""
     assert load("network: {optimizer: {clip: 1}}").network.optimizer == Adam(lr=1e-3, clip=1.0)
     assert load("", "--network.optimizer.clip=1").network.optimizer == Adam(lr=1e-3, clip=1.0)
@@ -204,7 +204,7 @@ def test_overrides():
     assert load("", "--limit", "5").limit == 5
 
 
-def test_another_kind_drops_the_settings_of_the_former():
+def test_another_kind_drops_previous_settings():
     text = "optimizer: {kind: adam, clip: 1}"
     assert load(text, "--optimizer.kind", "sgd", "--optimizer.momentum", "0.5").optimizer == Sgd(momentum=0.5)
     assert load(text, "--optimizer.kind", "adam").optimizer == Adam(clip=1.0)
@@ -227,7 +227,7 @@ def test_mistaken_overrides(override: str, message: str):
         load("", override)
 
 
-def test_overrides_leave_the_mapping_alone():
+def test_overrides_do_not_change_the_mapping():
     values = {"network": {"hidden": [1]}}
     settings.load(Training, values, ["--network.hidden=[2]"])
     assert values == {"network": {"hidden": [1]}}
@@ -318,13 +318,13 @@ def test_dump_is_readable():
     assert text.index("steps") < text.index("name") < text.index("network")
 
 
-def test_a_folder_may_bear_the_name_of_a_preset(tmp_path, monkeypatch):
+def test_folder_may_share_the_name_of_a_preset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo").mkdir()
     assert settings.load(dict, "demo")["total_steps"] > 0
 
 
-def test_a_record_may_start_from_a_preset_of_its_own():
+def test_record_may_start_from_its_own_preset():
     def house(text: str, *overrides: str) -> House:
         return settings.load(House, settings.parse_yaml(text), overrides)
 
@@ -339,3 +339,19 @@ def test_a_record_may_start_from_a_preset_of_its_own():
     assert "preset" not in settings.dump(changed)
     with pytest.raises(UsageError, match=r"^rooms: there is no size 'huge'; use large$"):
         house("rooms: {preset: huge}")
+
+
+@dataclass(frozen=True)
+class Section:
+    context: int = 1
+    renamed: ClassVar[dict[str, str]] = {"beside": "context"}
+
+
+@dataclass(frozen=True)
+class Whole:
+    section: Section = field(default_factory=lambda: Section(5))
+
+
+def test_former_keys_are_renamed():
+    assert settings.load(Whole, {"section": {"beside": 3}}) == Whole(Section(3))
+    assert settings.load(Whole, {"section": {"context": 4}}) == Whole(Section(4))

@@ -12,7 +12,8 @@ from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows, with_ego
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
@@ -47,7 +48,7 @@ def driven(real_data):
 
 
 @pytest.mark.slow
-def test_only_heights_keep_the_levels_apart(driven):
+def test_levels_are_separated_by_height(driven):
     real = audit([assemble(with_ego(window, row)) for window, row in driven])
     flat = audit([assemble(with_ego(flattened(window), row)) for window, row in driven])
     assert len(real) >= 20 and not any(finding["log_collides"] for finding in real)
@@ -56,7 +57,7 @@ def test_only_heights_keep_the_levels_apart(driven):
 
 
 @pytest.mark.slow
-def test_the_height_of_a_car_is_that_of_its_road(driven):
+def test_vehicle_height_follows_its_road(driven):
     """Looked up in the map step by step, the height of every replayed car stays with the logged one."""
     bank = ScenarioBank.from_scenarios([assemble(with_ego(window, row)) for window, row in driven])
     simulator = Simulator(Task(metrics="none", ends=()))

@@ -12,7 +12,8 @@ from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import CAR_LANE_KINDS, AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.rewards import RewardConfig

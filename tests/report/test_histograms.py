@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivax.errors import UsageError
 from drivax.report.inspection import Inspection
 from drivax.report.pages.inspection import BINS, bins, histogram, write_histograms
-from drivax.scenario.select.filters import Selection
+from drivax.scenario.select.selection import Selection
 
 NUMBERS = st.one_of(
     st.lists(st.integers(0, 100_000), min_size=1, max_size=60),

@@ -93,7 +93,7 @@ def test_rotation_and_shift_change_nothing():
     np.testing.assert_allclose(ordered[0][:, :2], ordered[1][:, :2], atol=5e-3)
 
 
-def test_everything_is_finite_when_nobody_else_is_there():
+def test_observation_is_finite_without_other_agents():
     seen = look(bank_of(straight_road([car(0, 0, 0, 0)])), "maximal")
     assert all(bool(jnp.isfinite(value).all()) for value in jax.tree.leaves(seen))
     assert not np.asarray(seen["agents_mask"]).any()
@@ -111,7 +111,7 @@ def test_groups_may_have_no_rows():
     }  # fmt: skip
 
 
-def test_a_replayed_scene_is_seen_as_it_was_live():
+def test_replayed_observation_equals_live_observation():
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 1, 0.3, 6)]))
     simulator = Simulator(Task(metrics="none"))
     state = jax.jit(simulator.reset)(bank, 0)

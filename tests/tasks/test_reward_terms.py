@@ -166,7 +166,7 @@ def test_margins_widen_collisions():
     assert [float(terms["close"]) for terms in found.values()] == pytest.approx([-0.1, -0.1, 0])
 
 
-def test_scale_brings_a_step_into_another_range():
+def test_scale_multiplies_all_terms():
     """The worst step of ``published`` is -3.3 and the best 0.4, by the weights; scaled they are in [-1, 1]."""
     failures = dict.fromkeys(("collision", "offroad", "red_light", "off_route"), True)
     worst = facts(**failures, speed_mps=20.0, jerk_mps3=20.0, progress_m=19.0)

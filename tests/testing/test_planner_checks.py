@@ -62,12 +62,12 @@ def test_forms_are_checked_before_anything_runs():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["constant_velocity", "idm", "pdm", "search"])
-def test_ours_pass(name):
+def test_built_in_planners_pass(name):
     check_planner(name)
 
 
 @pytest.mark.slow
-def test_experts_pass_as_privileged_ones():
+def test_experts_pass_as_privileged_planners():
     check_planner("expert_actions", privileged=True)
 
 
@@ -80,5 +80,5 @@ def test_experts_pass_as_privileged_ones():
         "future": "the log goes on in another way",
     }.items(),
 )  # fmt: skip
-def test_wrong_planners(fault, words):
+def test_invalid_planners_fail(fault, words):
     refused(Wrong(fault=fault), words)

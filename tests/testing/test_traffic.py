@@ -20,7 +20,7 @@ def test_log_replay_passes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["idm", "own_terms:Drift"])
-def test_reactive_and_own_traffic_pass(name):
+def test_reactive_and_custom_traffic_pass(name):
     check_traffic(name)
 
 
@@ -73,7 +73,7 @@ class Wrong(own_terms.Drift):
         "padding": "more empty slots", "litter": "rows hold something else", "turn": "turned and shifted",
     }.items(),
 )  # fmt: skip
-def test_wrong_traffic(fault, words):
+def test_invalid_traffic_fails(fault, words):
     with pytest.raises(BrokenContract) as error:
         check_traffic(Wrong(fault=fault))
     assert re.search(words, str(error.value)) and "\n" not in str(error.value), str(error.value)

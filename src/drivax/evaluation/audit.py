@@ -1,7 +1,7 @@
 """The audit: a log replayed through the metrics. Whatever the expert does wrong is a defect of map or converter.
 
-Steps at which the log does not know the ego are judged by nobody; :data:`~drivax.scenario.select.filters.FINDINGS` says
-what each finding means.
+Steps at which the log does not know the ego are judged by nobody; :data:`~drivax.scenario.select.selection.FINDINGS`
+says what each finding means.
 """
 
 from __future__ import annotations

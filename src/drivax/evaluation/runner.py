@@ -28,9 +28,7 @@ from drivax.metrics.selection import metric_specs
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
-from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError
 from drivax.scenario.schema import DT_S, Scenario
-from drivax.scenario.select.filters import FINDINGS, Selection, tag_words
+from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
 
 Array = np.ndarray[Any, Any]
@@ -138,7 +138,7 @@ class Inspection:
         return {name: (counts[name], places[name]) for name in sorted(counts)}
 
     def findings(self) -> list[str]:
-        """Names of what the audit says of some scenario, in the order of ``scenario.select.filters.FINDINGS``."""
+        """Names of what the audit says of some scenario, in the order of ``scenario.select.selection.FINDINGS``."""
         found = {name for e in self.entries for name, value in e["audit"].items() if value is not None}
         return [*(name for name in FINDINGS if name in found), *sorted(found - set(FINDINGS))]
 

@@ -4,7 +4,7 @@ A configuration record holds scalars, strings, literals, paths, tuples, other re
 carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
 presets (a class method ``preset(name)``) the key ``preset`` names one to start from. An unknown key or a value of the
 wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. YAML follows the 1.2
-core rules: ``3e-4`` is a number and ``no`` is a string.
+core rules: ``3e-4`` is a number and ``no`` is a string. A class variable ``renamed`` maps former keys to present ones.
 """
 
 from __future__ import annotations

@@ -236,6 +236,8 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
             raise _refuse(
                 value, f"a section of settings ({', '.join(f.name for f in dataclasses.fields(cls))})"
             )
+        renamed = getattr(cls, "renamed", {})
+        value = {renamed.get(key, key): item for key, item in value.items()}
         if _names_preset(cls, value):
             base = cls.preset(str(value["preset"]))
             rest = {name: given for name, given in value.items() if name != "preset"}

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, wrap
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.passages import lane_passage
 from drivax.scenario.bank.queries import (

@@ -26,7 +26,6 @@ from drivax.learning.policy_traffic import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import MetricNames
 from drivax.planners.idm import IdmPlanner
-from drivax.scenario.bank.exhaustive import without_grid
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
@@ -285,6 +284,17 @@ def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states
 
 
 Part = Callable[[ScenarioBank, SimState], Any]
+
+
+def without_grid(bank: ScenarioBank) -> ScenarioBank:
+    """The same bank with a grid of one cell, which is read whole: every query measures every segment once."""
+    n = len(bank)
+    return replace(
+        bank,
+        grid_edge=jnp.stack([jnp.zeros_like(bank.grid_edge[:, 0]), bank.grid_edge[:, -1]], axis=1),
+        grid_lane=jnp.stack([jnp.zeros_like(bank.grid_lane[:, 0]), bank.grid_lane[:, -1]], axis=1),
+        grid_side=jnp.zeros((n, 1), bank.grid_side.dtype),
+    )
 
 
 def _parts(simulator: Simulator) -> Mapping[str, Part]:

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import LENGTH, WIDTH
+from drivax.geometry.vectors import wrap
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unrolled

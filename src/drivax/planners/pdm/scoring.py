@@ -11,9 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import LENGTH, corners
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import (
     JERK_MAGNITUDE_MPS3,
     JERK_MPS3,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.metrics.comfort import (
     JERK_MPS3,
     LATERAL_MPS2,

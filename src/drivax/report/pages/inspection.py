@@ -16,7 +16,7 @@ from drivax.report.inspection import QUANTITIES, Inspection, speeds
 from drivax.report.inspection_tables import content_rows, short
 from drivax.report.pages.page import page, publish, refuse_page
 from drivax.report.pictures.palette import Stroke, stroke
-from drivax.scenario.select.filters import FINDINGS
+from drivax.scenario.select.selection import FINDINGS
 
 Values = Float[np.ndarray[Any, Any], "_"]
 _WIDTH, _HEIGHT = 380, 210

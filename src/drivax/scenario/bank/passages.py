@@ -1,6 +1,6 @@
 """From which lane to which a car passes: lane changes and merges, step by step.
 
-A car is on a strand of lanes (``scenario.build.lane_codes``) until its centre is 0.3 m nearer to the middle of
+A car is on a strand of lanes (``scenario.bank.strands``) until its centre is 0.3 m nearer to the middle of
 another than
 the line between them, so that one that drives along the line does not change lanes with every step.
 """

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
+from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import AgentColumn, LaneRow, SizeColumn
 from drivax.scenario.bank.queries import LANE_CUTOFF_M, LEVEL_M
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
