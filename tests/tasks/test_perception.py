@@ -226,7 +226,7 @@ def test_unseen_lights_are_hidden_from_custom_groups():
 
 @pytest.mark.slow
 def test_replayed_perception_equals_live_perception(bank, seen):
-    """A stored scene, observed alone and in another program, as it was seen in the batch."""
+    """A stored context, observed alone and in another program, as it was seen in the batch."""
     simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
     context = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["context"])
     for name, value in jax.jit(simulator.observe)(bank, context).items():

@@ -136,8 +136,8 @@ WRONG_FEATURES = {
 
 @pytest.mark.parametrize("words", some(WRONG_FEATURES, "the log's future changes"))
 def test_invalid_features_fail(words):
-    def feature(bank, scene, frames):
-        return WRONG_FEATURES[words](bank, scene, frames)
+    def feature(bank, context, frames):
+        return WRONG_FEATURES[words](bank, context, frames)
 
     refused(check_feature, feature, words)
 

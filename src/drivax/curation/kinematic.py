@@ -32,7 +32,7 @@ from drivax.curation.logged import LOG_ROUTE, Logged
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import wrap
-from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, filter_operator
+from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, savgol_matrix
 from drivax.scenario.bank.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S

@@ -49,7 +49,7 @@ def relative_velocity(
     return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
 
 
-def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Return the curvature of ego's lane in units of 0.1 1/m (left positive), and whether ego is on a lane.
 
     The lane piece within 2.5 m and 60 degrees that fits position and heading best counts; a metre weighs as much as 15
@@ -79,7 +79,7 @@ def recommended_speed(
     )
 
 
-def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Return the time gap to the leader's bumper over 10 s, at most 1, and whether there is a leader.
 
     The leader is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Speeds below 1 m/s
@@ -103,7 +103,7 @@ def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Ar
     return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
 
 
-def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 6"]:
+def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
     """Return the inputs of a car-following driver along the route, and the IDM acceleration.
 
     Gap to the leader or a light to stop at (at most 90 m, in 50 m); approach speed and speed of the leader (15 m/s);
@@ -129,7 +129,7 @@ def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Arr
     )
 
 
-def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 3"]:
+def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
     """Return the next stop line on the route: distance from the front bumper in 50 m, whether red, whether any.
 
     Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
@@ -137,8 +137,8 @@ def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, 
     ahead = bank.light_line[context.index, LightRow.ARC] - context.route_m
     gap = ahead - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
-    real = bank.light_line[scene.index, LightRow.ARC] < NEVER_M
-    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
+    real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
+    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
     nearest = jnp.argmin(jnp.where(there, gap, jnp.inf))
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     distance = jnp.where(there.any(), gap[nearest] / POSITION_M, 1.0)

@@ -148,9 +148,9 @@ def shown_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.clip(curvature / CURVATURE_PM, -_MOST_CURVED, _MOST_CURVED)
 
 
-def has_route(bank: ScenarioBank, scene: Scene) -> Bool[Array, ""]:
+def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
     """Whether the driven agent has a route on lanes; without one the bank holds the log's path, which is privileged."""
-    return ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
+    return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
 
 
 def route_curvature(

@@ -55,7 +55,7 @@ class OwnGroup:
     """A user's observation group.
 
     Attributes:
-        feature: From bank, scene and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
+        feature: From bank, context and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
             boolean mask ``[...]`` of the valid rows; ``testing.check_feature`` checks it.
         name: Name of the group; the function's own by default.
     """
@@ -68,9 +68,9 @@ class OwnGroup:
         if self.name.endswith("_mask"):
             raise ValueError(f"a group cannot be named {self.name!r}: the suffix is reserved for masks")
 
-    def observe(self, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
+    def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames) -> Observation:
         """Return the group, and its mask if it has one."""
-        rows = self.feature(bank, scene, frames)
+        rows = self.feature(bank, context, frames)
         return _masked(self.name, *rows) if isinstance(rows, tuple) else {self.name: rows}
 
 
@@ -160,13 +160,15 @@ PRESETS = MappingProxyType(
 )
 
 
-def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
+def observe(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, frames: Frames
+) -> Observation:
     """Return the observation of a context.
 
     Args:
         config: Groups, sizes and features.
         bank: The scenarios.
-        scene: The context of the observing agent.
+        context: The context of the observing agent.
         frames: Frame of all agents some steps ago.
 
     Returns:
@@ -268,18 +270,20 @@ def _agents(
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
-def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+def _shown_road(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
+) -> Observation:
     """Return the road group: pieces cut, with noise, in the selected columns."""
     selected, noisy = config.features.road, config.perception.noise_m > 0
     pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
-    group = _road(pieces, bank, scene, view)
+    group = _road(pieces, bank, context, view)
     if config.road_cut == 1 and selected == Features().road and not noisy:
         return group
     rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
         rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, bank, scene, config.road) / POSITION_M)
+        rows = rows.at[:, :2].add(moved_road(config.perception, bank, context, config.road) / POSITION_M)
     columns = columns_of("road", selected) + ([rows.shape[-1] - 1] if "curvature" in selected else [])
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 

@@ -81,7 +81,7 @@ def perceived(
     Args:
         config: The errors.
         bank: The scenarios.
-        scene: The context of ego.
+        context: The context of ego.
         frames: True frame of all agents some steps ago.
 
     Returns:
@@ -149,18 +149,22 @@ def lights_seen(
     back: int = 0,
 ) -> Bool[Array, " L"]:
     """Return which stop lines were seen ``back`` steps ago, at these distances."""
-    key = jax.random.fold_in(_key(config, bank, scene, back), _DROPPED_LIGHTS)
+    key = jax.random.fold_in(_key(config, bank, context, back), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)
 
 
-def moved_lights(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
+def moved_lights(
+    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+) -> Float[Array, "count 2"]:
     """Return position errors of lights in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_LIGHTS), count)
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_LIGHTS), count)
 
 
-def moved_road(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
+def moved_road(
+    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+) -> Float[Array, "count 2"]:
     """Return position errors of road pieces in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_ROAD), count)
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_ROAD), count)
 
 
 def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:

@@ -70,7 +70,7 @@ class Task:
         self, bank: ScenarioBank, context: AgentContext, agents: Callable[[int], Frame], frame: Frame
     ) -> Observation:
         """Return the observation of a context; ``agents`` returns the frame of all agents some steps ago."""
-        return observe(self.observation, bank, scene, lambda back: agents(back) if back else frame)
+        return observe(self.observation, bank, context, lambda back: agents(back) if back else frame)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Return weighted reward terms by name."""
@@ -80,7 +80,7 @@ class Task:
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return terminated (by a failure) and truncated (at the end of log or map)."""
-        log_ends, terminated = scene.step >= bank.steps - 1, jnp.zeros((), bool)
+        log_ends, terminated = context.step >= bank.steps - 1, jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends
         for name in self.ends:
@@ -94,5 +94,5 @@ class Task:
     def episode_add(
         self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Episode:
-        """Return the accumulators after the step to ``found``."""
-        return episode_add(episode, found, start, final)
+        """Return the accumulators after the step to ``situation``."""
+        return episode_add(episode, situation, start, final)

@@ -26,9 +26,9 @@ class View:
     sin: Float[Array, ""]
 
     @classmethod
-    def of(cls, scene: Scene) -> View:
+    def of(cls, context: AgentContext) -> View:
         """Return the frame of the driven agent now."""
-        now = scene.history[-1]
+        now = context.history[-1]
         return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
 
     def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
