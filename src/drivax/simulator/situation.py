@@ -58,32 +58,27 @@ _PASSAGES = frozenset({"strand", "lane_changed", "merged"})
 
 
 def measure(
-    bank: ScenarioBank, context: AgentContext,
-    frame: Frame, previous: Frame, contacts: Int[Array, " S"], lights: LightMemory,
-    reads: frozenset[str] = FACTS, strand: Any = None,
+    bank: ScenarioBank, context: AgentContext, frame: Frame, previous: Frame,
+    contacts: Int[Array, " S"], lights: LightMemory, reads: frozenset[str] = FACTS, strand: Any = None,
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
-    """Measures the driven agent of a context.
+    """Measure the driven agent.
 
     Args:
         bank: The scenarios.
-        context: The context, with the ``route_m`` and ``z`` of the step before.
-        frame: Everyone now.
-        previous: Everyone one step ago.
+        context: The agent, with the ``route_m`` and ``z`` of the step before.
+        frame: All agents now.
+        previous: All agents one step ago.
         contacts: Contact codes of the step before.
-        lights: What is remembered about stop lines.
-        reads: Names of the facts that are wanted; the others are None, and what only they need is not computed.
-        strand: The fact of that name of the step before; None where an episode begins.
+        lights: Light memory of the step before.
+        reads: Facts to measure; the others are None, and what only they need is not computed.
+        strand: The fact of that name of the step before; None where an episode starts.
 
     Returns:
-        The situation (its context's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
+        The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
     """
     around = surroundings(bank, context, frame)
-    lanes, route, me, ground = (
-        around.lanes,
-        around.route,
-        frame.box[context.slot],
-        _ground(bank, context, frame),
-    )
+    lanes, route, me = around.lanes, around.route, frame.box[context.slot]
+    ground = _ground(bank, context, frame)
     beyond, left_map, offroad = _off_the_road(bank, context.index, me, ground, lanes)
     z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
     context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
