@@ -64,12 +64,9 @@ def measure(
     """Measure the driven agent.
 
     Args:
-        bank: The scenarios.
-        context: The agent, with the ``route_m`` and ``z`` of the step before.
-        frame: All agents now.
-        previous: All agents one step ago.
-        contacts: Contact codes of the step before.
-        lights: Light memory of the step before.
+        bank, context: The agent, with the ``route_m`` and ``z`` of the step before.
+        frame, previous: All agents now and one step ago.
+        contacts, lights: Contact codes and light memory of the step before.
         reads: Facts to measure; the others are None, and what only they need is not computed.
         strand: The fact of that name of the step before; None where an episode starts.
 
