@@ -63,12 +63,10 @@ def measure(
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measure the driven agent.
 
-    Args:
-        bank, context: The agent, with the ``route_m`` and ``z`` of the step before.
-        frame, previous: All agents now and one step ago.
-        contacts, lights: Contact codes and light memory of the step before.
-        reads: Facts to measure; the others are None, and what only they need is not computed.
-        strand: The fact of that name of the step before; None where an episode starts.
+    ``context`` has the ``route_m`` and ``z`` of the step before, ``contacts`` and ``lights`` are of the step before too,
+    ``frame`` and ``previous`` are all agents now and one step ago, and ``strand`` is the fact of that name of the step
+    before (None where an episode starts). Facts that ``reads`` does not name are None, and what only they need is not
+    computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
