@@ -63,7 +63,7 @@ def measure(
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measure the driven agent.
 
-    ``context`` has the ``route_m`` and ``z`` of the step before, ``contacts`` and ``lights`` are of the step before too,
+    ``context`` has the ``route_m`` and ``z`` of the step before, ``contacts`` and ``lights`` too,
     ``frame`` and ``previous`` are all agents now and one step ago, and ``strand`` is the fact of that name of the step
     before (None where an episode starts). Facts that ``reads`` does not name are None, and what only they need is not
     computed.
