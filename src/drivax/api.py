@@ -17,10 +17,9 @@ from drivax.learning.policy_traffic import find_traffic
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.schema import Scenario
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
@@ -62,7 +61,7 @@ def load(
     Args:
         data: Folder of a scenario set, or scenarios.
         limit: Only the first so many of those that the others leave.
-        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.select.choice``).
+        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.select.selection``).
         scenarios: Only those of a set that are named by their ids, or in files with one id per line.
 
     Raises:
@@ -71,7 +70,7 @@ def load(
     """
     if isinstance(data, str | Path):
         stored = ScenarioSet.open(data)
-        kept = [stored[row] for row in chosen(stored, filters, scenarios, limit)]
+        kept = [stored[row] for row in select_scenarios(stored, filters, scenarios, limit)]
         # Checksums are tested where a scenario is loaded; this only looks at what each record uses.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:

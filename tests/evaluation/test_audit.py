@@ -11,10 +11,10 @@ from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import BATCH, audit
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import Light
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Light, windows
 from drivax.scenario.schema import CURRENT_STEP, Flag, LightState
-from drivax.scenario.select.filters import FINDINGS
+from drivax.scenario.select.selection import FINDINGS
 from drivax.synthetic.world import generate_recording
 from scenes import GREEN, RED, car, straight_road
 

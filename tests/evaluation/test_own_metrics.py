@@ -9,8 +9,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.tables import planners_table
-from drivax.metrics.selection import selected
+from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import make_planner
 from drivax.report.pages.report import explanations
 from drivax.report.runs import read_runs
@@ -51,8 +50,8 @@ def test_own_metrics_spoil_no_column():
 
 def test_what_is_no_metric_is_refused():
     for name, words in (
-        ("own_terms:hurry", "'own_terms:hurry' is no metric"),
+        ("own_terms:hurry", "'own_terms:hurry' is not a metric"),
         ("own_terms:nearest", "did you mean 'nearest_other'"),
     ):
         with pytest.raises(UsageError, match=words):
-            selected(("full", name))
+            select_metrics(("full", name))

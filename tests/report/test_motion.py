@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import savgol_filter
 
-from drivax.metrics.comfort import judge_trip
+from drivax.metrics.comfort import check_trip_comfort
 from drivax.report.charts.motion import COMMANDS, SIGNALS, signals
 from drivax.report.pictures.drawing import Rollout
 from drivax.report.pictures.player_data import pack_episode
@@ -41,7 +41,7 @@ def test_signals_are_scipys_filter_of_the_motion():
 
 def test_lateral_acceleration_is_that_of_the_comfort_metric():
     path = wavy().astype(np.float32)
-    judged = np.asarray(judge_trip(jnp.asarray(path)).lateral_mps2)
+    judged = np.asarray(check_trip_comfort(jnp.asarray(path)).lateral_mps2)
     np.testing.assert_allclose(np.abs(signals(path)["lateral"][9:]), judged[1:], atol=2e-3)
 
 

@@ -97,7 +97,7 @@ def test_progress_and_own_metrics_are_exported_and_others_on_request(runs, tmp_p
         by_tag = (tmp_path / "t" / "by-difficulty.md").read_text()
         assert ("ADE" in by_tag) == bool(metrics)
     write_tables(runs, tmp_path / "t", overwrite=True, metrics=("full",))
-    assert "least TTC" in (tmp_path / "t" / "results.md").read_text()
+    assert "minimum TTC" in (tmp_path / "t" / "results.md").read_text()
     with pytest.raises(UsageError, match=r"mean of 'adee'.*did you mean 'ade'"):
         write_tables(runs, tmp_path / "t", overwrite=True, metrics=("adee",))
 

@@ -147,7 +147,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
         state, observation = begin(worlds.simulator, worlds.bank, self._row)
         self._state = state
-        self._path = _path_of(state.scene)
+        self._path = path_of(state.context)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -164,7 +164,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         state, observation, ending = advance(worlds.simulator, worlds.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:
-            self._path = _path_of(state.scene, self._path)
+            self._path = path_of(state.context, self._path)
         reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
         info: dict[str, Any] = {"scenario_id": worlds.ids[self._row]}
         if terminated or truncated:
@@ -295,11 +295,11 @@ class VectorDrivingEnv(VectorEnv):
         """Keeps the driven paths where they are drawn."""
         if self.render_mode is None or self._state is None:
             return
-        scenes = [jax.tree.map(lambda leaf, n=n: leaf[n], self._state.scene) for n in range(self.num_envs)]
+        scenes = [jax.tree.map(lambda leaf, n=n: leaf[n], self._state.context) for n in range(self.num_envs)]
         old = self._paths or [None] * self.num_envs
         self._paths = [
-            _path_of(scene, None if new else path)
-            for scene, path, new in zip(scenes, old, begins, strict=True)
+            path_of(context, None if new else path)
+            for context, path, new in zip(scenes, old, begins, strict=True)
         ]
 
 

@@ -60,7 +60,7 @@ def run(args: Inspect) -> int:
     """Test the sets, then print them as tables or as JSON, or write a page."""
     from drivax.errors import UsageError
     from drivax.report.inspection import Inspection, described
-    from drivax.scenario.select.filters import Selection
+    from drivax.scenario.select.selection import Selection
 
     if not args.sets:
         raise UsageError("no scenario set is named", cure="write drivax inspect SET")

@@ -10,11 +10,11 @@ from typing import Any
 from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate_scenarios
 from drivax.files import replace_folder
-from drivax.metrics.selection import selected
+from drivax.metrics.selection import select_metrics
 from drivax.planners.planner import Planner
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import Sizes
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
@@ -41,7 +41,7 @@ class EvaluationConfig:
     Attributes:
         planner, traffic: What they are called.
         noisy_start, start_step: How episodes begin, and at which step of the log.
-        filter, scenarios, limit: Which scenarios were driven (``scenario.select.choice``).
+        filter, scenarios, limit: Which scenarios were driven (``scenario.select.selection``).
         seed: Of all chance.
         metrics: What was asked for beside the headline; metrics of the user's own are measured beside all of ours.
         sample: Whether a trained policy drew its actions.
@@ -84,7 +84,7 @@ def run_evaluation(
         sizes: What the whole set uses, if that is known already.
         overwrite: Replace an existing run folder.
     """
-    scenarios = [data[row] for row in chosen(data, config.filter, config.scenarios, config.limit)]
+    scenarios = [data[row] for row in select_scenarios(data, config.filter, config.scenarios, config.limit)]
     refuse_existing(Path(out), overwrite, "evaluation")
     start = NoisyStart() if config.noisy_start else LogStart()
     judged = with_metrics(task or Task(), config.metrics)
@@ -136,7 +136,9 @@ def format_metrics(summary: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
         summary: Of an evaluation.
         wanted: Sets, metrics, and those of the user's own (``metrics.selection``).
     """
-    found = {name: summary["metrics"][name] for name in selected(wanted).names if name in summary["metrics"]}
+    found = {
+        name: summary["metrics"][name] for name in select_metrics(wanted).names if name in summary["metrics"]
+    }
     width = max(map(len, ("metric", *found)))
     lines = [f"{'metric':<{width}}  {'mean':>9}  {'95 % interval':>20}  {'n':>7}"]
     for name, cells in found.items():

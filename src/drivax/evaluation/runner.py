@@ -24,12 +24,11 @@ from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_o
 from drivax.evaluation.results import ADDED, KEYS, Crash, Results, with_crashes
 from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
 from drivax.metrics.catalogue import METRICS, Metric
-from drivax.metrics.selection import catalogue
+from drivax.metrics.selection import metric_specs
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
-from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart
@@ -108,7 +107,7 @@ def evaluate_in(
         )
     trial = _Trial.of(simulator, planner, start_step, seed, bank.steps)
     _refuse_without_future(scenarios, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
-    trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AGENT_VALID]) > 0)
+    trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0)
     with raised() as errors, telling_out_of_memory(len(bank)):
         episodes = trial.drive_all(bank, progress)
     return trial.results(episodes, scenarios, np.asarray(bank.identity), errors)
@@ -199,7 +198,7 @@ class _Trial:
                 cure="use expert_actions",
             )
         judged = judging(task)
-        metrics = catalogue(judged.metrics)
+        metrics = metric_specs(judged.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
         return cls(replace(simulator, task=judged), planner, start_step, seed, metrics)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from drivax.errors import DataError
 from drivax.scenario.schema import DT_S, Scenario
-from drivax.scenario.select.filters import FINDINGS, Selection, tag_words
+from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
 
 Array = np.ndarray[Any, Any]

@@ -81,26 +81,26 @@ def load(**values):
     return settings.load(Holder, values)
 
 
-def test_what_a_dotted_name_is():
+def test_dotted_names_have_a_module_and_a_name():
     for name in ("a:b", "a.b:c", "a.b:C.d", "_a1:b2"):
         assert is_dotted(name)
     for name in ("a", "a.b", "a:", ":b", "a:b:c", "a b:c", "1a:b", "a/b:c", "", None, 3, "/tmp/a:b", "log"):
         assert not is_dotted(name)
 
 
-def test_found_and_written():
+def test_named_objects_round_trip():
     assert find_named("math:pi") == pytest.approx(3.14159, abs=1e-5)
     assert find_named(f"{HERE}:Square.area") is Square.area
     for thing in (ratio, Square, Square.area, len):
         assert find_named(dotted_name(thing)) is thing
     for thing in (lambda x: x, load.__get__(1)):
         with pytest.raises(
-            UsageError, match="has no name that a file could hold; define it at the top level"
+            UsageError, match="cannot be saved in a configuration; define it at the top level"
         ):
             dotted_name(thing)
 
 
-def test_a_value_of_ones_own():
+def test_dotted_values_become_objects():
     held = load(
         shape={"kind": f"{HERE}:Circle", "radius": 2},
         any_shape=f"{HERE}:BIG",
@@ -123,7 +123,7 @@ def test_a_value_of_ones_own():
         Holder(any_shape=Circle()),
     ],
 )
-def test_written_and_read_back(held):
+def test_records_with_dotted_values_round_trip(held):
     text = settings.dump(held)
     assert settings.load(Holder, settings.parse_yaml(text)) == held
     assert settings.dump(settings.load(Holder, settings.parse_yaml(text))) == text
@@ -139,11 +139,11 @@ def test_written_and_read_back(held):
         ({"measure": f"{HERE}:zzz"}, f"measure: '{HERE}:zzz': '{HERE}' has no 'zzz'; define zzz there"),
         (
             {"measure": "no_such_package.terms:f"},
-            "measure: 'no_such_package.terms:f': there is no module 'no_such_package'; install it, put its folder on "
-            "PYTHONPATH, or start in its folder",
+            "measure: 'no_such_package.terms:f': module 'no_such_package' not found; install it, add its folder to "
+            "PYTHONPATH, or run from its folder",
         ),
-        ({"measure": "ratio"}, "measure: 'ratio' is no dotted name; write package.module:name"),
-        ({"measure": f"{HERE}:BIG"}, f"measure: '{HERE}:BIG' cannot be called; name a function"),
+        ({"measure": "ratio"}, "measure: 'ratio' is not a dotted name; write package.module:name"),
+        ({"measure": f"{HERE}:BIG"}, f"measure: '{HERE}:BIG' is not callable; name a function"),
         (
             {"measure": f"{HERE}:alone"},
             f"measure: '{HERE}:alone' takes (one: 'int') -> 'float'; it is called with (int, int)",
@@ -151,24 +151,24 @@ def test_written_and_read_back(held):
         ({"any_shape": f"{HERE}:Power"}, f"any_shape: '{HERE}:Power' lacks 'sides'; see {HERE}.Shape"),
         (
             {"shape": {"kind": f"{HERE}:Circle", "radios": 1}},
-            "shape.radios: there is no such setting; did you mean",
+            "shape.radios: unknown setting; did you mean",
         ),
         (
             {"shape": {"kind": f"{HERE}:ratio", "radius": 1}},
-            f"shape: '{HERE}:ratio' has no settings; make it a frozen",
+            f"shape: '{HERE}:ratio' takes no settings; make it a frozen",
         ),
-        ({"shape": {"kind": "sqare"}}, "shape: there is no kind 'sqare'; did you mean 'square'?"),
-        ({"squares": [f"{HERE}:ratio"]}, f"squares[0]: '{HERE}:ratio' is no Square"),
+        ({"shape": {"kind": "sqare"}}, "shape: unknown kind 'sqare'; did you mean 'square'?"),
+        ({"squares": [f"{HERE}:ratio"]}, f"squares[0]: '{HERE}:ratio' is not a Square"),
     ],
 )
-def test_errors_name_the_key_the_name_and_the_cure(values, words):
+def test_errors_name_key_name_and_cure(values, words):
     with pytest.raises(UsageError) as error:
         load(**values)
     told = str(error.value)
     assert words in told and "\n" not in told, told
 
 
-def test_modules_of_the_present_folder(tmp_path, monkeypatch):
+def test_modules_in_the_current_folder_are_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "terms_at_hand.py").write_text("def f(a, b):\n    return a - b\n")
@@ -181,7 +181,7 @@ def test_modules_of_the_present_folder(tmp_path, monkeypatch):
     )
 
 
-def test_a_training_run_of_own_terms(tmp_path):
+def test_training_runs_with_custom_terms(tmp_path):
     text = """
 task:
   observation: {agents: 2, own: [{feature: "own_terms:goal"}, {feature: "own_terms:walkers", name: people}]}
@@ -208,21 +208,21 @@ algorithm: {kind: ppo, network: {encoder: {kind: "own_terms:MeanConfig", width: 
     assert settings.load(TrainConfig, settings.parse_yaml(settings.dump(other))) == other
 
 
-def test_names_of_terms_and_groups():
-    with pytest.raises(ValueError, match=r"rewards\.own has 'collision', a name that is taken"):
+def test_custom_terms_and_groups_are_named():
+    with pytest.raises(ValueError, match=r"rewards\.own: name 'collision' is taken"):
         RewardConfig(own=(OwnTerm(own_terms.hurry, 1.0, "collision"),))
-    with pytest.raises(ValueError, match=r"rewards\.own has 'hurry', a name that is taken"):
+    with pytest.raises(ValueError, match=r"rewards\.own: name 'hurry' is taken"):
         RewardConfig(own=(OwnTerm(own_terms.hurry, 1.0), OwnTerm(own_terms.hurry, 2.0)))
-    with pytest.raises(ValueError, match=r"observation\.own has 'agents', a name that is taken"):
+    with pytest.raises(ValueError, match=r"observation\.own: name 'agents' is taken"):
         ObservationConfig(own=(OwnGroup(own_terms.goal, "agents"),))
-    with pytest.raises(ValueError, match="cannot be called 'a_mask'"):
+    with pytest.raises(ValueError, match="cannot be named 'a_mask'"):
         OwnGroup(own_terms.goal, "a_mask")
-    with pytest.raises(ValueError, match="'<lambda>' is no name; give it one"):
+    with pytest.raises(ValueError, match="'<lambda>' is not a name; pass one"):
         OwnTerm(lambda before, now, around: now.speed_mps, 1.0)
     assert OwnTerm(own_terms.Crowded(), 1.0).name == "crowded"
 
 
-def test_planners_of_ones_own():
+def test_custom_planners_are_found():
     assert make_planner("own_terms:FullBrake") == own_terms.FullBrake()
     with pytest.raises(UsageError, match="'own_terms:MeanConfig' makes no planner; see"):
         make_planner("own_terms:MeanConfig")

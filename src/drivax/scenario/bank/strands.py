@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.columns import StrandColumn
 from drivax.scenario.schema import Scenario
 
 Array = np.ndarray[Any, Any]
 
-#: Columns of the table: the lane's strand, the strands of its neighbours to the left and to the right (same direction),
-#: the strand onto which its own one merges (-1 for none of them), and where it does.
-STRAND, STRAND_LEFT, STRAND_RIGHT, STRAND_ONTO, STRAND_END_X, STRAND_END_Y = range(6)
 #: Coordinates of an end that does not exist, m.
 NOWHERE_M = 1e6
 #: Lanes are looked at so far before their ends and behind their beginnings, m; headings right at the ends this far.
@@ -45,7 +43,7 @@ def lane_codes(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
     lane drop). Turns that join a lane at a junction do not merge.
     """
     table = np.full((len(scenario.lane_id), 6), -1.0, np.float32)
-    table[:, STRAND_END_X:] = NOWHERE_M
+    table[:, StrandColumn.END] = NOWHERE_M
     count = int((scenario.lane_length > 0).sum())
     if not count:
         return table
@@ -69,11 +67,11 @@ def lane_codes(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
         # What is not stored lies beyond the crop.
         goes_on = (beside >= 0) & ((successor[last[beside]] >= 0).any(axis=1) | ~(further <= _ON_M))
         onto = np.where(stops & goes_on, strand[beside], onto)
-        column = STRAND_LEFT if side == "lane_left" else STRAND_RIGHT
+        column = StrandColumn.LEFT if side == "lane_left" else StrandColumn.RIGHT
         table[:count, column] = np.where(beside >= 0, strand[beside], -1)
     onto = np.where(follows[last] < 0, onto[last], -1)
-    table[:count, STRAND], table[:count, STRAND_ONTO] = strand, onto
-    table[:count, STRAND_END_X:] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
+    table[:count, StrandColumn.STRAND], table[:count, StrandColumn.ONTO] = strand, onto
+    table[:count, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
     return table
 
 
