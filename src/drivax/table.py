@@ -258,7 +258,9 @@ def _attribute(name: str, value: str) -> str:
 
 def _html_cell(column: Column, cell: Cell) -> str:
     title = _attribute("title", cell.title)
-    notes = "".join(f"<small>{escape(text)}</small>" for text in (cell.bounds, cell.note) if text)
+    lines = [text for text in (cell.bounds, cell.note) if text]
+    lines = [", ".join(lines)] if cell.mark else lines
+    notes = "".join(f"<small>{escape(text)}</small>" for text in lines)
     if column.label:
         return f"<th scope=row{title}>{escape(cell.text)}{notes}</th>"
     link = "" if cell.link is None else _attribute("data-link", json.dumps(cell.link))

@@ -14,7 +14,7 @@ from drivax.errors import UsageError
 from drivax.report.charts.distributions import BINS, bins, histogram
 from drivax.report.inspection import Inspection
 from drivax.report.pages.inspection import write_histograms
-from drivax.scenario.select.filters import Selection
+from drivax.scenario.select.selection import Selection
 
 NUMBERS = st.one_of(
     st.lists(st.integers(0, 100_000), min_size=1, max_size=60),

@@ -32,7 +32,7 @@ from drivax.adapters.driving import (
 from drivax.errors import UsageError
 from drivax.report.pictures.still import draw_pixels
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import Scene, SimState
+from drivax.simulator.types import AgentContext, SimState
 from drivax.tasks.actions import DISCRETE, DirectState, Discrete
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
@@ -147,7 +147,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
         state, observation = begin(worlds.simulator, worlds.bank, self._row)
         self._state = state
-        self._path = path_of(state.context)
+        self._path = _path_of(state.context)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -164,7 +164,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         state, observation, ending = advance(worlds.simulator, worlds.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:
-            self._path = path_of(state.context, self._path)
+            self._path = _path_of(state.context, self._path)
         reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
         info: dict[str, Any] = {"scenario_id": worlds.ids[self._row]}
         if terminated or truncated:
@@ -298,7 +298,7 @@ class VectorDrivingEnv(VectorEnv):
         scenes = [jax.tree.map(lambda leaf, n=n: leaf[n], self._state.context) for n in range(self.num_envs)]
         old = self._paths or [None] * self.num_envs
         self._paths = [
-            path_of(context, None if new else path)
+            _path_of(context, None if new else path)
             for context, path, new in zip(scenes, old, begins, strict=True)
         ]
 
@@ -345,14 +345,14 @@ for _name, _task in TASKS.items():
     )
 
 
-def _path_of(scene: Scene, before: Any = None) -> Any:
+def _path_of(context: AgentContext, before: Any = None) -> Any:
     """Return ego's motion from the first step of the log to the present one ``[step + 1, 4]``; NaN where unknown.
 
     Args:
-        scene: The present scene.
+        context: The present context.
         before: The path one step ago; None where an episode starts.
     """
-    history, step = np.asarray(scene.history), int(scene.step)
+    history, step = np.asarray(context.history), int(context.step)
     if before is not None:
         return np.concatenate([before, history[-1:]])
     known = history[-min(step + 1, len(history)) :]

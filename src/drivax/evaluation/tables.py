@@ -14,6 +14,7 @@ from drivax.errors import UsageError
 from drivax.evaluation.results import ADDED, NOT_SUMMARISED, RATES, Results, interval_of
 from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, mismatch
 from drivax.metrics.catalogue import METRICS
+from drivax.metrics.catalogue import headline as headline_metrics
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
 from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
@@ -37,36 +38,8 @@ COLLISION_KINDS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
         CollisionType.STOPPED_OBJECT: ("standing object", "hit a standing agent: braking in time for a queue"),
     }
 )  # fmt: skip
-#: Columns of the first table.
-HEADLINE = (
-    "success", "success_moving", "accuracy", "collision", "at_fault_collision", "offroad", "red_light",
-    "progress_ratio", "ttc_ok", "comfortable", "vmax_score", "nuplan_score",
-)  # fmt: skip
 #: Codes and counts, which have no mean.
 CODES = frozenset(NOT_SUMMARISED)
-#: Labels that differ from the metric's name.
-_LABELS = MappingProxyType(
-    {
-        "success_moving": "success, moving",
-        "accuracy_at_fault": "accuracy, own faults",
-        "at_fault_collision": "at-fault collision",
-        "offroad": "off-road",
-        "left_map": "left the map",
-        "progress_ratio": "progress",
-        "progress": "progress along the route",
-        "reached_goal": "goal reached",
-        "ttc_ok": "TTC ok",
-        "wrong_way_worst": "wrong way within 1 s",
-        "min_ttc": "least TTC",
-        "average_ttc": "mean TTC",
-        "vmax_score": "V-Max score",
-        "nuplan_score": "nuPlan score",
-        "vmax_score_partial": "partial V-Max score",
-        "nuplan_score_partial": "partial nuPlan score",
-        "ade": "ADE",
-        "fde": "FDE",
-    }
-)
 _ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 
 
@@ -100,16 +73,16 @@ class MetricLabel:
 
 def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
     """Return how to show a metric; ``runs`` describe the user's own metrics."""
-    text = _LABELS.get(name, name.replace("_", " "))
     known = METRICS.get(name) or ADDED.get(name)
     metric = known or next((run.own_metrics[name] for run in runs if name in run.own_metrics), None)
+    text = (metric.label if metric else None) or name.replace("_", " ")
     if metric is None:
         return MetricLabel(text, "-", "", "")
     plain = metric.unit == "-"
     if not plain:
         text = f"{text} [{metric.unit.replace('s2', 's²').replace('s3', 's³')}]"
     unit = "rate" if name in RATES else "share" if plain else metric.unit
-    return MetricLabel(text, metric.better, unit, f"{metric.text[:1].upper()}{metric.text[1:]}.")
+    return MetricLabel(text, metric.better, unit, f"{metric.definition[:1].upper()}{metric.definition[1:]}.")
 
 
 def metric_names(runs: Sequence[EpisodeTable]) -> list[str]:
@@ -119,7 +92,7 @@ def metric_names(runs: Sequence[EpisodeTable]) -> list[str]:
 
 def headline(names: Sequence[str]) -> list[str]:
     """Return those metrics that belong in the first table, in its order."""
-    return [name for name in HEADLINE if name in names]
+    return [name for name in headline_metrics(METRICS) if name in names]
 
 
 def ordered(names: Sequence[str]) -> list[str]:

@@ -25,18 +25,19 @@ def comparison_text(comparison: Comparison) -> str:
     return "\n".join([*lines, *(f"  ({note})" for note in notes(comparison))])
 
 
-def comparison_tables(comparison: Comparison) -> list[Table]:
+def comparison_tables(comparison: Comparison, arms: tuple[str, str] = ("A", "B")) -> list[Table]:
     """Return the tables of the primary metric and, if there are any, of the secondary ones."""
-    tables = [_table(comparison, "primary metric", "p", [comparison.primary])]
-    if comparison.secondary:
-        tables.append(_table(comparison, "secondary metrics", "p (Holm)", list(comparison.secondary)))
+    tables = [_table(comparison, arms, "primary metric", "p", [comparison.primary])]
+    if secondary := list(comparison.secondary):
+        tables.append(_table(comparison, arms, "secondary metrics", "p (Holm)", secondary))
     return tables
 
 
-def _table(comparison: Comparison, name: str, p: str, metrics: list[MetricComparison]) -> Table:
-    a, b = comparison.names
+def _table(
+    comparison: Comparison, arms: tuple[str, str], name: str, p: str, metrics: list[MetricComparison]
+) -> Table:
     columns = (
-        Column(name, label=True), Column("A", title=a), Column("B", title=b), Column("A − B"),
+        Column(name, label=True), *map(Column, arms), Column("A − B"),
         Column("next to zero", picture=True), Column(effect_name(comparison)), Column(p), Column("n"), Column("better"),
     )  # fmt: skip
     return Table(name, columns, tuple(map(_row, metrics)))

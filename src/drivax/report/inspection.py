@@ -143,7 +143,7 @@ class Inspection:
         return {name: (counts[name], scenarios[name]) for name in sorted(counts)}
 
     def findings(self) -> list[str]:
-        """Return the names of the audit's findings, in the order of ``scenario.select.filters.FINDINGS``."""
+        """Return the names of the audit's findings, in the order of ``scenario.select.selection.FINDINGS``."""
         names = {name for e in self.entries for name, value in e["audit"].items() if value is not None}
         return [*(name for name in FINDINGS if name in names), *sorted(names - set(FINDINGS))]
 

@@ -47,7 +47,8 @@ def _lead(comparison: Comparison) -> str:
 
 def _metrics(comparison: Comparison) -> str:
     items = "".join(f"<li>{escape(note)}</li>" for note in notes(comparison))
-    tables = "".join(f"{table.html()}<br>" for table in comparison_tables(comparison))
+    a, b = comparison.names
+    tables = "".join(f"{table.html()}<br>" for table in comparison_tables(comparison, (f"A: {a}", f"B: {b}")))
     share = f"{100 * comparison.plan.confidence:.0f} %"
     kind = "d_z, the mean of the differences over their standard deviation"
     kind = kind if effect_name(comparison) == "d_z" else "d, with the pooled standard deviation"

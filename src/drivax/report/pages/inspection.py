@@ -13,7 +13,7 @@ from drivax.report.inspection import QUANTITIES, Inspection, speeds
 from drivax.report.inspection_tables import Counts, content_table, of_all, true_findings
 from drivax.report.pages.page import page
 from drivax.report.pictures.palette import stroke
-from drivax.scenario.select.filters import FINDINGS
+from drivax.scenario.select.selection import FINDINGS
 
 #: Tags with more values than this (ids, dates) are left out of the page.
 _MOST_VALUES = 16
