@@ -156,7 +156,7 @@ def test_seeds_in_one_folder(runs, plan, tmp_path, capsys):
         (["A", "TRAINING"], 1, "not evaluation"),
         (["A", "A"], 2, "the same run"),
         (["A", "B", "--primary", "succes"], 2, "did you mean 'success'?"),
-        (["A", "B", "--config", "MISSING.yaml"], 2, "does not exist"),
+        (["A", "B", "--config", "MISSING.yaml"], 2, "file not found"),
         (["A", "B", "--html", "FOLDER"], 2, "name a file to write"),
         (["--save", "FOLDER"], 2, "name a file to write"),
     ],

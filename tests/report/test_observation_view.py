@@ -136,5 +136,5 @@ def test_the_table():
     assert printed(observation_table(statistics(permuted=0)))[1] == ["ego"]
     text = observation_overview(statistics())
     assert (
-        text == "320 states of 40 episodes driven by shy, 3 with a collision; 7 entries are NaN or infinite"
+        text == "320 states of 40 episodes of shy, 3 with a collision; 7 entries are NaN or infinite"
     )
