@@ -135,6 +135,4 @@ def test_the_table():
     assert rows[3:] == [["mine"], ["0", "0", "7"]]
     assert printed(observation_table(statistics(permuted=0)))[1] == ["ego"]
     text = observation_overview(statistics())
-    assert (
-        text == "320 states of 40 episodes of shy, 3 with a collision; 7 entries are NaN or infinite"
-    )
+    assert text == "320 states of 40 episodes of shy, 3 with a collision; 7 entries are NaN or infinite"
