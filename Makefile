@@ -1,4 +1,4 @@
-# Two commands to know:  make demo   and   make test.  Each sets itself up when .venv is missing or out of date.
+# Two commands to know:  make demo   and   make test.  Each installs into .venv when it is missing or out of date.
 #
 #   make demo ACCELERATOR=cuda13     with the GPU build of JAX (cuda12, cuda13)
 #   make test PYTHON=python3.12      with another Python (3.11 to 3.13)
@@ -14,16 +14,15 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed$(ACCELERATOR)
 JAX := $(shell sed -n 's/^jax==//p' requirements.lock)
 
-# Tests run in several processes. Each takes a row of files that lie side by side, so that the tests of a file share
-# what it compiles.
+# Each process takes neighbouring files, because the tests of a file share compiled programs.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help demo test test-all lint bench setup clean
+.PHONY: help demo test test-all coverage lint docs bench setup hooks clean
 .DEFAULT_GOAL := help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
-	@echo "targets: demo  test  test-all  lint  bench  setup  clean"
+	@echo "targets: demo  test  test-all  coverage  lint  docs  bench  setup  hooks  clean"
 
 setup: $(STAMP)
 
@@ -50,12 +49,23 @@ test: $(STAMP)
 test-all: $(STAMP)
 	DRIVAX_OPTIMISED=1 $(PYTEST) $(ARGS)
 
+coverage: $(STAMP)
+	$(PYTEST) -m "not slow" --cov=drivax --cov-report=term:skip-covered $(ARGS)
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/python -m pytest -q -p no:cacheprovider tests/test_architecture.py -k "machine or large or lock or names"
+
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+hooks: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pre-commit
+	$(BIN)/pre-commit install
 
 clean:
 	rm -rf .cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist

@@ -39,34 +39,34 @@ speed_ratio = Metric(
     "-",
     "-",
     "mean speed as a share of the limit",
-    of=StepValue("speed_ratio", "-", _share_of_limit, frozenset({"speed_mps", "limit_mps"})),
+    step_value=StepValue("speed_ratio", "-", _share_of_limit, frozenset({"speed_mps", "limit_mps"})),
     operator="mean",
 )
 short_ttc = Metric(
     "-",
     "low",
     "share of driving with a time to collision below 1 s",
-    of=StepValue("short_ttc", "-", _short, frozenset({"ttc_s", "ttc_defined"})),
+    step_value=StepValue("short_ttc", "-", _short, frozenset({"ttc_s", "ttc_defined"})),
     operator="mean",
 )
 lane_changes = Metric(
     "-",
     "-",
     "lane changes in an episode",
-    of=StepValue("lane_changed", "-", _changed, frozenset({"lane_changed"})),
+    step_value=StepValue("lane_changed", "-", _changed, frozenset({"lane_changed"})),
     operator="sum",
 )
 max_acceleration = Metric(
     "m/s2",
     "-",
     "largest acceleration over 0.5 s",
-    of=StepValue("acceleration", "m/s2", _acceleration, _ALONG),
+    step_value=StepValue("acceleration", "m/s2", _acceleration, _ALONG),
     operator="max",
 )
 max_braking = Metric(
     "m/s2",
     "-",
     "largest deceleration over 0.5 s",
-    of=StepValue("braking", "m/s2", _braking, _ALONG),
+    step_value=StepValue("braking", "m/s2", _braking, _ALONG),
     operator="max",
 )

@@ -37,8 +37,7 @@ from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
 from drivax.curation.scores import ScoreTable
 from drivax.curation.scoring import BATCH, score_steps
 from drivax.curation.weights import WeightConfig, draws_of, weights_of
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.ranking import (
     auc_interval,

@@ -31,8 +31,8 @@ from drivax.evaluation.audit import BATCH, replay
 from drivax.geometry.boxes import corners
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows, with_ego
-from drivax.scenario.recording import Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Recording, windows, with_ego
 from drivax.scenario.schema import CURRENT_STEP, AgentKind, Flag, Scenario
 from drivax.synthetic.world import generate_recording
 from drivax.tracking.run_folder import versions

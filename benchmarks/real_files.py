@@ -25,7 +25,8 @@ from drivax.evaluation.runner import evaluate
 from drivax.learning.policy_traffic import find_traffic
 from drivax.report.episode_selection import outcome
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows
 from drivax.scenario.schema import Scenario
 from drivax.tracking.run_folder import versions
 

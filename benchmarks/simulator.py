@@ -137,7 +137,7 @@ def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
 
     def one(bank: ScenarioBank, state: Any, action: Any, over: Any, fresh: Any) -> Any:
         after, transition = simulator.step_or_begin(bank, state, action, over, fresh)
-        return transition, simulator.observe(bank, after.scene)
+        return transition, simulator.observe(bank, after.context)
 
     def step(bank: ScenarioBank, states: Any, actions: Any, over: Any, index: Any) -> Any:
         fresh = map_where(over, partial(simulator.beginning, bank), index)
@@ -148,7 +148,7 @@ def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), bank)
     jax.clear_caches()
     began = time.perf_counter()
-    jax.jit(step).lower(shapes, states, states.scene.action, over, index).compile()
+    jax.jit(step).lower(shapes, states, states.context.action, over, index).compile()
     return time.perf_counter() - began
 
 

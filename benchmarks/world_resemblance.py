@@ -25,8 +25,8 @@ from scipy.stats import ks_2samp
 from drivax.datasets.formats import reader_named, survey
 from drivax.errors import DrivaxError, UsageError
 from drivax.report.pictures.palette import BLUE, VERMILLION
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Recording, windows
 from drivax.scenario.schema import CAPACITIES, DT_S, STEPS, AgentKind, Scenario
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one

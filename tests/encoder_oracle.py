@@ -142,7 +142,7 @@ def mtr(groups, movers, around, own, p):
 
 
 def entity(groups, parts, p):
-    """``parts`` are the names of groups by part, ego, others, goal and beside."""
+    """``parts`` are the names of groups by part, ego, others, goal and context."""
 
     def entities(name):
         x, mask, series = rows_of(groups, name)
@@ -156,4 +156,4 @@ def entity(groups, parts, p):
     found = {part: mean(*entities) for part, entities in rows.items()}
     asks = found.get("ego", 0.0) + found.get("goal", 0.0)
     found["others"] = norm(attention(asks[None], *rows["others"], p["attention"])[0], p["norm"])
-    return np.concatenate([found[part] for part in ("ego", "others", "goal", "beside") if part in found])
+    return np.concatenate([found[part] for part in ("ego", "others", "goal", "context") if part in found])

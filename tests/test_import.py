@@ -17,7 +17,7 @@ FLAG = "--xla_cpu_enable_concurrency_optimized_scheduler"
         (f"{FLAG}=true", f"{FLAG}=true"),
     ],
 )
-def test_the_scheduler_that_hangs_is_off_unless_it_is_asked_for(given, after):
+def test_hanging_scheduler_is_disabled_by_default(given, after):
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     environment |= {"XLA_FLAGS": given} if given else {}
     program = "import os, sys, drivax; print(os.environ['XLA_FLAGS']); print('jax' in sys.modules)"

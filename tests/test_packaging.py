@@ -81,7 +81,7 @@ def test_metadata(wheel: Path):
     assert "drivax = drivax.cli:main" in archive.read(name.replace("METADATA", "entry_points.txt")).decode()
 
 
-def test_the_installed_package_works(environment: Path, tmp_path: Path):
+def test_installed_package_works(environment: Path, tmp_path: Path):
     where = run(environment, "python", "-c", "import drivax; print(drivax.__file__)", folder=tmp_path)
     assert str(environment) in where.stdout, where.stderr
     overview = run(environment, "drivax", "--help", folder=tmp_path)

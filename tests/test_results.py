@@ -33,7 +33,7 @@ def stored(repository):
     return lambda name: json.loads((folder / f"{name}.json").read_text())
 
 
-def test_pages_show_what_was_learned(script, stored):
+def test_algorithm_pages_show_stored_results(script, stored):
     tables = script("learning_tables")
     learning, training = stored("learning"), stored("training")
     pages = list(tables.pages())
@@ -47,14 +47,14 @@ def test_pages_show_what_was_learned(script, stored):
         assert tables.picture(name).is_file()
 
 
-def test_the_page_of_speed_shows_what_was_measured(script, stored):
+def test_speed_page_shows_stored_measurements(script, stored):
     simulator = script("simulator")
     table = simulator.table(stored("simulator"), stored("simulator_runs"))
     shown = f"{simulator.BEGIN}\n\n{table}\n\n{simulator.END}" in simulator.PAGE.read_text()
     assert shown, "run python benchmarks/simulator.py --table, and read what the page says about it"
 
 
-def test_the_page_of_speed_shows_how_long_evaluations_take(script, stored):
+def test_speed_page_shows_evaluation_times(script, stored):
     timing = script("evaluation")
     shown = (
         f"{timing.BEGIN}\n\n{timing.table(stored('evaluation'))}\n\n{timing.END}" in timing.PAGE.read_text()
@@ -62,13 +62,13 @@ def test_the_page_of_speed_shows_how_long_evaluations_take(script, stored):
     assert shown, "run python benchmarks/evaluation.py --table, and read what the page says about it"
 
 
-def test_the_page_of_real_files_shows_every_planner(script, stored):
+def test_real_files_page_shows_each_planner(script, stored):
     real = script("real_files")
     shown = f"{real.BEGIN}\n\n{real.tables(stored('real_files'))}\n\n{real.END}" in real.PAGE.read_text()
     assert shown, "run python benchmarks/real_files.py --table, and read what the page says about it"
 
 
-def test_the_page_of_the_benchmark_shows_what_was_driven(script, stored):
+def test_benchmark_page_shows_stored_results(script, stored):
     benchmark = script("benchmark")
     text = benchmark.PAGE.read_text()
     shown = benchmark.filled(text, stored("benchmark")) == text
@@ -77,7 +77,7 @@ def test_the_page_of_the_benchmark_shows_what_was_driven(script, stored):
     assert rows["expert"]["log"]["accuracy"]["mean"] == 1.0
 
 
-def test_how_far_it_goes_until_it_fails(script):
+def test_progress_until_failure(script):
     # 1 m a step from step 10 on: hits at step 13 and leaves the road later, fails never, fails at once.
     motion = np.zeros((3, 6, 4))
     motion[:, :, 0] = np.arange(6)
@@ -89,7 +89,7 @@ def test_how_far_it_goes_until_it_fails(script):
 
 
 @pytest.mark.slow
-def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
+def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
     benchmark = script("benchmark")
     monkeypatch.setattr(benchmark, "EPISODES", tmp_path)
     monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
@@ -128,13 +128,13 @@ def test_what_was_driven_is_judged_in_pairs(script, tmp_path, monkeypatch):
         benchmark.judged()
 
 
-def test_the_page_of_curation_shows_what_was_found(script, stored):
+def test_curation_page_shows_stored_results(script, stored):
     curation = script("curation")
     shown = curation.filled(curation.PAGE.read_text(), stored("curation")) == curation.PAGE.read_text()
     assert shown, "run python benchmarks/curation.py table, and read what the page says about it"
 
 
-def test_curation_was_scored_on_the_test_set_that_planners_drive(stored):
+def test_curation_and_planners_share_the_test_set(stored):
     assert stored("curation")["sets"]["test"] == stored("benchmark")["test"]["hash"]
 
 
@@ -147,7 +147,7 @@ def test_kinematic_finds_the_events_that_force_a_reaction(stored):
     assert lot[0] < 0.5 < lot[1]
 
 
-def test_scouts_disagree_where_they_err(stored):
+def test_members_disagree_where_they_err(stored):
     low, high = stored("curation")["methods"]["ensemble"]["error_rank_interval"]
     assert 0.0 < low < high
 
@@ -159,7 +159,7 @@ def found(script):
     return json.loads((longtail.KEPT / longtail.RESULTS).read_text())
 
 
-def test_the_page_of_the_long_tail_study_shows_what_was_found(script, found):
+def test_longtail_page_shows_stored_results(script, found):
     longtail = script("longtail")
     text = longtail.PAGE.read_text()
     assert longtail.filled(text, found) == text, (
@@ -167,7 +167,7 @@ def test_the_page_of_the_long_tail_study_shows_what_was_found(script, found):
     )
 
 
-def test_the_long_tail_study_found_what_its_agents_drove(script, found):
+def test_longtail_results_follow_from_episodes(script, found):
     """Every agent's mean over the whole test, from what is kept of its episodes."""
     longtail, about = script("longtail"), found["about"]
     for name, rates in found["rates"].items():
@@ -185,14 +185,14 @@ def test_the_long_tail_study_found_what_its_agents_drove(script, found):
         np.testing.assert_allclose(np.mean(means), whole, atol=1e-9)
 
 
-def test_the_long_tail_study_decides_the_same_if_all_claims_are_adjusted_together(found):
+def test_longtail_verdicts_hold_under_joint_adjustment(found):
     """As its page says."""
     claims = found["claims"]
     together = holm([one["p"] for one in claims])
     assert [p < 0.05 for p in together] == [one["verdict"] != "undecided" for one in claims]
 
 
-def test_the_page_of_offline_learning_shows_how_fast_it_is(script, stored):
+def test_offline_page_shows_stored_speed(script, stored):
     offline = script("offline")
     shown = (
         f"{offline.BEGIN}\n\n{offline.table(stored('offline'))}\n\n{offline.END}" in offline.PAGE.read_text()
@@ -226,7 +226,7 @@ def learning():
     }
 
 
-def test_tables_of_what_was_learned(script, learning):
+def test_learning_tables(script, learning):
     tables = script("learning_tables")
     training = {
         "training": {"ppo": {"steps_per_second": 9000, "share": {"simulation": 0.25, "update": 0.75}}}

@@ -17,10 +17,9 @@ from drivax.learning.policy_traffic import find_traffic
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.schema import Scenario
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import Start

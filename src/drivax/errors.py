@@ -1,4 +1,4 @@
-"""Errors that a user can act on: one line that says what is wrong, where, and what to do about it."""
+"""User errors in one line: what is wrong, where, and what to do about it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _EXTRAS = {
 
 
 class DrivaxError(Exception):
-    """A failure that the user can cure; the command line prints it as one line and exits with ``status``.
+    """A failure that the user can fix; the command line prints it as one line and exits with ``status``.
 
     Args:
         problem: What is wrong, without a trailing full stop.
-        file: The file or folder that is at fault.
+        file: The file or folder.
         record: The record inside the file (number or id).
         cure: What to do about it, without a trailing full stop.
     """
@@ -57,7 +57,7 @@ class DataError(DrivaxError):
 
 
 class UsageError(DrivaxError):
-    """The command, an option or a configuration value cannot be what the user meant."""
+    """The command, an option or a configuration value is invalid."""
 
     status = 2
 
@@ -70,9 +70,13 @@ def missing_package(error: ImportError) -> UsageError | None:
     return UsageError(f"{package} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
 
 
-def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return the cure for an unknown name: the closest known name, or all of them."""
+def did_you_mean(
+    name: str, names: Iterable[str], *, otherwise: str | None = None, cutoff: float = 0.6
+) -> str:
+    """Return the cure for an unknown name: the closest known name, else ``otherwise``, else all known names."""
     known = list(names)
     if close := difflib.get_close_matches(name, known, n=1, cutoff=cutoff):
         return f"did you mean {close[0]!r}?"
+    if otherwise is not None:
+        return otherwise
     return f"use one of {', '.join(known)}" if known else "there are none"

@@ -1,7 +1,4 @@
-"""Things of the user's own by dotted name, ``package.module:name``: how YAML says what Python would import.
-
-Below every room but the errors, so that rooms which know no YAML can find what a configuration names.
-"""
+"""Users' own classes and functions by dotted name, ``package.module:name``, as configuration files write them."""
 
 from __future__ import annotations
 
@@ -19,37 +16,37 @@ _FORM = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 
 
 def is_dotted(value: Any) -> bool:
-    """Whether a value has the form of a dotted name: words with dots, one colon."""
+    """Whether a value has the form ``package.module:name``."""
     return isinstance(value, str) and _FORM.fullmatch(value) is not None
 
 
 def find_named(name: str) -> Any:
-    """What a dotted name stands for; its module is imported.
+    """Import a module and return the object that a dotted name stands for.
 
-    Modules are looked for where Python looks, and then in the present folder.
+    Modules are searched on Python's path first, then in the current folder.
 
     Raises:
-        UsageError: The name is no dotted name, its module cannot be imported, or has nothing of that name.
+        UsageError: The name has another form, its module cannot be imported, or the module lacks the object.
     """
     if not is_dotted(name):
-        raise UsageError(f"{name!r} is no dotted name", cure="write package.module:name")
+        raise UsageError(f"{name!r} is not a dotted name", cure="write package.module:name")
     module_name, _, path = name.partition(":")
-    found = _module(module_name, name)
+    target = _import(module_name, name)
     for part in path.split("."):
-        if not hasattr(found, part):
-            inside = [known for known in vars(found) if not known.startswith("_")]
-            raise UsageError(f"{name!r}: {module_name!r} has no {part!r}", cure=did_you_mean(part, inside))
-        found = getattr(found, part)
-    return found
+        if not hasattr(target, part):
+            names = [known for known in vars(target) if not known.startswith("_")]
+            cure = did_you_mean(part, names, otherwise=f"define {part} there")
+            raise UsageError(f"{name!r}: {module_name!r} has no {part!r}", cure=cure)
+        target = getattr(target, part)
+    return target
 
 
-def _module(module_name: str, name: str) -> Any:
+def _import(module_name: str, name: str) -> Any:
     if module_name in sys.modules:
         return sys.modules[module_name]
-    top = module_name.split(".")[0]
-    here = str(Path.cwd())
-    if here not in sys.path and top not in sys.modules and importlib.util.find_spec(top) is None:
-        sys.path.append(here)
+    package, folder = module_name.split(".")[0], str(Path.cwd())
+    if folder not in sys.path and package not in sys.modules and importlib.util.find_spec(package) is None:
+        sys.path.append(folder)
         importlib.invalidate_caches()
     try:
         return importlib.import_module(module_name)
@@ -57,56 +54,56 @@ def _module(module_name: str, name: str) -> Any:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and (module_name == missing or module_name.startswith(f"{missing}.")):
             raise UsageError(
-                f"{name!r}: there is no module {missing!r}",
-                cure="install it, put its folder on PYTHONPATH, or start in its folder",
+                f"{name!r}: module {missing!r} not found",
+                cure="install it, add its folder to PYTHONPATH, or run from its folder",
             ) from error
-        told = f"{type(error).__name__}: {error}"
         raise UsageError(
-            f"{name!r}: importing {module_name!r} fails with {told}", cure="correct it there"
+            f"{name!r}: importing {module_name!r} fails with {type(error).__name__}: {error}",
+            cure="fix the module",
         ) from error
 
 
 def dotted_name(thing: Any) -> str:
-    """The dotted name of a function or class.
+    """Return the dotted name of a function or class.
 
     Raises:
-        UsageError: It has none, as a lambda or what was defined inside a function.
+        UsageError: It has none: a lambda, or defined inside a function.
     """
     name = f"{getattr(thing, '__module__', None)}:{getattr(thing, '__qualname__', None)}"
     try:
-        found = find_named(name)
+        known = find_named(name)
     except UsageError:
-        found = None
-    if found is not thing:
-        shown = getattr(thing, "__qualname__", repr(thing))
+        known = None
+    if known is not thing:
+        label = getattr(thing, "__qualname__", repr(thing))
         raise UsageError(
-            f"{shown} has no name that a file could hold", cure="define it at the top level of a module"
+            f"{label} cannot be saved in a configuration", cure="define it at the top level of a module"
         )
     return name
 
 
-def refuse_arguments(thing: Any, name: str, wanted: tuple[Any, ...]) -> None:
-    """Refuses a callable that cannot take these positional arguments.
+def check_arguments(function: Any, name: str, arguments: tuple[Any, ...]) -> None:
+    """Refuse a callable that cannot take these positional arguments.
 
     Raises:
-        ValueError: It takes others.
+        ValueError: Its signature differs.
     """
     try:
-        signature = inspect.signature(thing)
+        signature = inspect.signature(function)
     except (TypeError, ValueError):
-        return  # builtins say nothing
+        return  # builtins have no signature
     try:
-        signature.bind(*wanted)
+        signature.bind(*arguments)
     except TypeError as error:
-        types = ", ".join(getattr(one, "__name__", str(one)) for one in wanted)
+        types = ", ".join(getattr(argument, "__name__", str(argument)) for argument in arguments)
         raise ValueError(f"{name!r} takes {signature}; it is called with ({types})") from error
 
 
-def refuse_missing(thing: Any, name: str, protocol: Any) -> None:
-    """Refuses what lacks a member of a protocol.
+def check_protocol(thing: Any, name: str, protocol: Any) -> None:
+    """Refuse an object that lacks a member of a protocol.
 
     Raises:
-        ValueError: Names the first that is missing.
+        ValueError: Names the first missing member.
     """
     for member in protocol_members(protocol):
         if not hasattr(thing, member):
@@ -114,7 +111,7 @@ def refuse_missing(thing: Any, name: str, protocol: Any) -> None:
 
 
 def protocol_members(protocol: Any) -> list[str]:
-    """Names of what a protocol asks for, those of the protocols that it extends included."""
+    """Return the public members of a protocol and of the protocols that it extends."""
     names: list[str] = []
     for cls in reversed(protocol.__mro__):
         if getattr(cls, "_is_protocol", False) and cls.__name__ not in ("Protocol", "Generic"):

@@ -90,7 +90,7 @@ def test_a_folder_of_everything(tmp_path, capsys):
         ("nuscenes", "v1.0-*/sample.json", "tables of nuScenes, but not all that are needed"),
     ],
 )
-def test_what_is_missing_is_named(name, gone, words, tmp_path, capsys):
+def test_missing_parts_are_named(name, gone, words, tmp_path, capsys):
     folder = sample(name, tmp_path / "data")
     for path in list(folder.glob(gone)):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -145,7 +145,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_the_wrong_flavour_says_what_to_use_instead(name, tmp_path, capsys):
+def test_unsupported_flavours_name_the_alternative(name, tmp_path, capsys):
     content, problem, cure = WRONG[name]
     (tmp_path / name).write_bytes(content())
     status, out = asked(tmp_path / name, capsys)
@@ -156,7 +156,7 @@ def test_the_wrong_flavour_says_what_to_use_instead(name, tmp_path, capsys):
     assert not (tmp_path / "set").exists()
 
 
-def test_a_scenario_set_is_for_inspect(tmp_path, capsys):
+def test_scenario_sets_are_referred_to_inspect(tmp_path, capsys):
     (tmp_path / "shard.tfrecord").write_bytes(wire.frame(wire.scenario(steps=11, map=b"")))
     convert(tmp_path / "shard.tfrecord", tmp_path / "set")
     status, out = asked(tmp_path / "set", capsys)
@@ -183,14 +183,14 @@ def test_folders_without_recordings(files, words, tmp_path, capsys):
     assert status == 1 and words in out, out
 
 
-def test_nothing_there(tmp_path, capsys):
+def test_empty_paths_are_named(tmp_path, capsys):
     status, out = asked(tmp_path / "none", capsys)
     assert status == 1 and "does not exist" in out
     with pytest.raises(UsageError, match="there is no format"):
         diagnose(tmp_path, "wmod")
 
 
-def test_some_files_of_a_folder_are_damaged(tmp_path, capsys):
+def test_damaged_files_in_a_folder_are_listed(tmp_path, capsys):
     for number in range(12):
         (tmp_path / f"{number:02d}.tfrecord").write_bytes(
             wire.frame(wire.scenario(steps=11)) if number else b""
@@ -221,7 +221,7 @@ def test_many_files_are_sampled(tmp_path, monkeypatch, capsys):
         ([4], "1 of 5 shards, missing 00000 to 00003"),
     ],
 )
-def test_gaps_in_the_numbers_of_shards(numbers, told):
+def test_gaps_in_shard_numbers_are_named(numbers, told):
     paths = [Path("w") / f"training.tfrecord-{number:05d}-of-00005" for number in numbers]
     assert gaps([*paths, Path("w/other.tfrecord")]) == [f"training.tfrecord: {told}"]
 
@@ -231,7 +231,7 @@ def test_many_gaps_are_counted_only():
     assert gaps(paths) == ["t.tfrecord: 50 of 100 shards"]
 
 
-def test_shards_of_several_folders_are_families_of_their_own(tmp_path, capsys):
+def test_shards_are_grouped_by_folder(tmp_path, capsys):
     for split in ("training", "validation"):
         (tmp_path / split).mkdir()
         path = tmp_path / split / f"{split}.tfrecord-00001-of-00003"
@@ -273,7 +273,7 @@ def test_devices_are_asked_in_a_process_of_their_own(program, words, monkeypatch
     assert words in doctor.devices(timeout_s=1.0)
 
 
-def test_looking_at_data_needs_no_jax(tmp_path):
+def test_inspecting_data_needs_no_jax(tmp_path):
     sample("gpudrive", tmp_path / "data")
     program = (
         "import sys; from drivax.cli import main; status = main(['doctor', sys.argv[1]]);"

@@ -74,7 +74,7 @@ def test_one_set_in_full(sets, inspect):
     assert cells(out, "s3").split()[:3] == ["91", "4", "4"]
 
 
-def test_what_was_skipped_and_filtered_is_told(tmp_path, inspect):
+def test_skipped_and_filtered_records_are_reported(tmp_path, inspect):
     rows = [{"file": "a.tfrecord", "record": None, "problem": "is cut off"}]
     rows += [{"file": "b.tfrecord", "record": k, "problem": "the ego jumps"} for k in range(4)]
     source = {"skipped": 5, "skipped_records": rows, "filtered": 2, "filters": ["agents>1", "place=x"]}
@@ -88,7 +88,7 @@ def test_what_was_skipped_and_filtered_is_told(tmp_path, inspect):
     assert cells(inspect(tmp_path / "set", tmp_path / "set"), "skipped") == "5 5"
 
 
-def test_metres_are_not_summed():
+def test_distances_are_not_summed():
     assert finding_text([1.0, 2.0, 6.0]) == "mean 3, median 2, most 6"
     assert finding_text([True, False, True, True]) == "3 of 4 (75 %)"
     assert (
@@ -97,7 +97,7 @@ def test_metres_are_not_summed():
     )
 
 
-def test_several_sets_side_by_side(sets, inspect):
+def test_multiple_sets_are_compared_in_columns(sets, inspect):
     out = inspect(*sets)
     assert max(map(len, out.splitlines())) <= COLUMNS
     assert out.split()[:2] == ["one", "two"]
@@ -113,7 +113,7 @@ def test_several_sets_side_by_side(sets, inspect):
     assert cells(out, "fleet a") == "75 % 50 %"
 
 
-def test_many_sets_still_fit_the_terminal(sets, inspect):
+def test_tables_of_many_sets_fit_the_terminal(sets, inspect):
     out = inspect(*sets, *sets, *sets)
     assert max(map(len, out.splitlines())) <= COLUMNS
     assert len([line for line in out.splitlines() if line.startswith("scenarios ")]) == 2
@@ -122,7 +122,7 @@ def test_many_sets_still_fit_the_terminal(sets, inspect):
 def test_filters(sets, inspect):
     out = inspect(sets[0], "--filter", "place=boston|pittsburgh", "--filter", "audit.distance_m>0")
     assert cells(out, "scenarios") == "2 of 4 (recorded segments: 2, shards: 1)"
-    assert "1 do not know what 'place=boston|pittsburgh' asks for" in out
+    assert "1 lack what 'place=boston|pittsburgh' asks for" in out
     assert cells(out, "distance_m") == "mean 12, median 12, most 16 2"
     chosen = json.loads(inspect(sets[0], "--json", "--filter", "agents>=3"))
     assert [row["scenario_id"] for row in chosen["scenarios"]] == ["s2", "s3"]
@@ -183,7 +183,7 @@ def test_observations(sets, inspect, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_matters_to_a_trained_policy(sets, inspect):
+def test_importance_of_features_to_a_trained_policy(sets, inspect):
     """The policy of the zoo brings its own task; permuting what it sees changes what it does."""
     found = json.loads(inspect(sets[0], "--observations", "--planner", "zoo:aggressive", "--json"))
     assert found["permuted"] == found["states"] == 32 and found["planner"] == "aggressive"
@@ -214,9 +214,9 @@ def test_wrong_calls_get_one_line(words, said, status, sets, inspect):
     assert said in line and len(line.splitlines()) == 1
 
 
-def test_a_sample_is_spread_evenly(sets, monkeypatch):
+def test_samples_are_evenly_spread(sets, monkeypatch):
     from drivax.report import inspection
-    from drivax.scenario.select.filters import Selection
+    from drivax.scenario.select.selection import Selection
 
     one = Inspection.open(sets[0], Selection())
     assert [scenario.id for scenario in one.sample()] == ["s0", "s1", "s2", "s3"]

@@ -66,7 +66,7 @@ def test_flags_reach_the_command(probe: Any):
     assert seen == [Probe(3, True)]
 
 
-def test_status_is_the_commands(probe: Any):
+def test_exit_status_is_that_of_the_command(probe: Any):
     probe(lambda args: 5)
     assert cli.main(["probe"]) == 5
 
@@ -137,14 +137,14 @@ def test_usage_errors_have_status_2(probe: Any, argv: list[str], capsys: pytest.
     assert "drivax probe" in capsys.readouterr().err or argv[-1] == "x"
 
 
-def test_a_commands_help(probe: Any, capsys: pytest.CaptureFixture[str]):
+def test_command_help(probe: Any, capsys: pytest.CaptureFixture[str]):
     probe(lambda args: 0)
     assert cli.main(["probe", "--help"]) == 0
     assert "--number" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest.CaptureFixture[str]):
+def test_each_command_help_has_an_example(name: str, capsys: pytest.CaptureFixture[str]):
     command = cli.COMMANDS[name]
     assert cli.main([name, "--help"]) == 0
     out = capsys.readouterr().out
@@ -164,7 +164,7 @@ def test_help_imports_nothing_heavy():
     assert result.stdout.splitlines()[-1] == "[]"
 
 
-def test_a_closed_pipe_is_no_error():
+def test_closed_pipe_is_not_an_error():
     """``drivax --help | head -1``: no traceback, nothing on standard error."""
     pipeline = f"'{sys.executable}' -m drivax --help | head -c 1"
     result = subprocess.run(["bash", "-c", pipeline], capture_output=True, text=True, check=False)

@@ -44,7 +44,7 @@ def trained(place, data, out, *more):
 
 
 @pytest.mark.slow
-def test_scores_weigh_what_is_learned_from(place, capsys):
+def test_scores_weight_the_training_data(place, capsys):
     scores = ("--scores", str(place / "scores.npz"), "--scale", "scenario")
     assert trained(place, "set-3", "weighted", *scores) == 0
     assert len(json.loads((place / "weighted" / "run.json").read_text())["weights"]) == 64
@@ -56,14 +56,14 @@ def test_scores_weigh_what_is_learned_from(place, capsys):
 
 
 @pytest.mark.slow
-def test_a_subset_is_trained_on_by_its_own_scores(place):
+def test_subset_trains_with_its_own_scores(place):
     curate = ["curate", "uniform", "--data", str(place / "set-3"), "--out", str(place / "whole.npz")]
     assert main([*curate, "--export", str(place / "top"), "1"]) == 0
     assert trained(place, "top", "by-own", "--scores", str(place / "top" / "scores.npz")) == 0
     assert len(json.loads((place / "by-own" / "run.json").read_text())["weights"]) == 64
 
 
-def test_what_does_not_go_together(place, capsys):
+def test_incompatible_flags_are_refused(place, capsys):
     assert trained(place, "set-3", "none", "--weighting.temperature", "2") == 2
     assert "--weighting without scores to weight; pass --scores or --agent" in capsys.readouterr().err
     assert trained(place, "set-3", "none", "--agent", "heuristic") == 2
@@ -91,7 +91,7 @@ def test_what_does_not_go_together(place, capsys):
     assert not (place / "none").exists()
 
 
-def test_scoring_for_an_agent_shows_how_far_it_is(place, monkeypatch, capsys):
+def test_scoring_for_training_shows_progress(place, monkeypatch, capsys):
     monkeypatch.setattr("drivax.cli.train.train", lambda *_, **__: types.SimpleNamespace(path="a-run"))
     call = ["train", "offline/cql", "--data", str(place / "set-3"), "--out", str(place / "none")]
     assert main([*call, "--agent", "heuristic"]) == 0
@@ -111,7 +111,7 @@ def test_scoring_for_an_agent_shows_how_far_it_is(place, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_weighting_changes_what_is_drawn(place):
+def test_weights_change_the_draws(place):
     """Kinematic scores, evened out or not: all alike where the whole mixture is uniform."""
     effective = []
     curate = ["curate", "kinematic", "--data", str(place / "set-3"), "--out", str(place / "kinematic.npz")]

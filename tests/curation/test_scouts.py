@@ -276,6 +276,6 @@ def test_what_cannot_be_is_refused(data, tmp_path, capsys):
         ScoutsConfig(learn_from=0)
     call = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "s.npz")]
     assert main([*call, "--folds", "3"]) == 2
-    assert "folds: there is no such setting; use one of urgent_s" in capsys.readouterr().err
+    assert "folds: unknown setting; use one of urgent_s" in capsys.readouterr().err
     assert main([*call[:1], "uniform", *call[2:], "--folds", "3"]) == 2
     assert "uniform has no such setting; leave out --folds 3" in capsys.readouterr().err

@@ -20,8 +20,8 @@ from drivax.datasets.scenarionet.map import third_column_is_heading
 from drivax.datasets.scenarionet.reader import ScenarioNet, decode
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import MapFeature, Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import MapFeature, Recording, windows
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, AgentKind, Flag, LightState, RoadKind
 
 
@@ -427,7 +427,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], Any]] = {
     "the file has no dictionary 'tracks'": _without("tracks"),
     "the file has no dictionary 'map_features'": _without("map_features"),
     "the file has no dictionary 'dynamic_map_states'": _without("dynamic_map_states"),
-    "the ego 'gone' is none of 3 tracks": lambda tree: tree["metadata"].update(sdc_id="gone"),
+    "the ego 'gone' is not one of 3 tracks": lambda tree: tree["metadata"].update(sdc_id="gone"),
     "the ego 'is not named' is none": lambda tree: tree["metadata"].pop("sdc_id"),
     "has 40 values of heading, 91 steps": lambda tree: tree["tracks"]["17"]["state"].update(heading=np.zeros(40)),
     "has a velocity of shape (91, 1)": lambda tree: tree["tracks"]["17"]["state"].update(velocity=np.zeros(91)),

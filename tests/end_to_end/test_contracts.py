@@ -171,7 +171,7 @@ def test_bench_by_metric_set(data, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_part_of_a_set_has_the_rows_of_the_whole(evaluation, data, tmp_path, capsys):
+def test_subset_has_the_rows_of_the_full_set(evaluation, data, tmp_path, capsys):
     names = [one.id for one in ScenarioSet.open(data)]
     (tmp_path / "some.txt").write_text("\n".join(names[2:]))
     call = ["evaluate", "--planner", "constant_velocity", "--data", str(data), "--out", str(tmp_path / "run")]
@@ -190,7 +190,7 @@ def test_a_part_of_a_set_has_the_rows_of_the_whole(evaluation, data, tmp_path, c
 
 
 @pytest.mark.slow
-def test_a_python_function_that_raises(data, tmp_path, capsys):
+def test_python_planner_that_raises_is_a_crash(data, tmp_path, capsys):
     """It raises where ego begins faster than 12 m/s."""
     speed = {one.id: float(np.hypot(*one.agent_velocity[10, 0])) for one in ScenarioSet.open(data)}
     fast = [name for name in speed if speed[name] > 12.0]

@@ -77,7 +77,7 @@ def everything(real_data, tmp_path_factory):
     return out, drivax("convert", real_data, out, "--split", "60/20/20")
 
 
-def test_a_folder_of_all_real_files(everything):
+def test_folder_of_all_real_files(everything):
     out, said = everything
     found = ", ".join(
         f"{name} ({files} file{'s'[: files > 1]})" for name, (files, _) in sorted(FORMATS.items())
@@ -91,7 +91,7 @@ def test_a_folder_of_all_real_files(everything):
     ScenarioSet.open(out).check()
 
 
-def test_real_windows_of_a_recording_share_a_split(everything):
+def test_windows_of_a_recording_share_a_split(everything):
     out, _ = everything
     entries = {
         (entry["dataset"], entry["scenario_id"]): entry["segment"] for entry in ScenarioSet.open(out).entries
@@ -104,7 +104,7 @@ def test_real_windows_of_a_recording_share_a_split(everything):
     assert not entries and len(splits) == 10
 
 
-def test_doctor_agrees_with_the_conversion(real_data):
+def test_doctor_agrees_with_conversion(real_data):
     said = " ".join(drivax("doctor", real_data).split())
     assert "about 19 scenarios" in said and "missing" not in said
     for name, (files, _) in FORMATS.items():

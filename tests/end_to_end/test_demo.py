@@ -9,7 +9,7 @@ from drivax.studies.demo import REFERENCES
 
 
 @pytest.mark.slow
-def test_the_demo_writes_its_report_and_never_overwrites(tmp_path, capsys):
+def test_demo_writes_a_report_and_never_overwrites(tmp_path, capsys):
     out = tmp_path / "demo"
     sizes = ["--training", "4", "--held-out", "3", "--steps", "8192", "--workers", "1"]
     assert main(["demo", "--out", str(out), *sizes]) == 0

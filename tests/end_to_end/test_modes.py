@@ -43,7 +43,7 @@ def driven(out):
 
 
 @pytest.mark.slow
-def test_a_sampling_checkpoint_from_noisy_starts_over_an_old_run(data, tmp_path, capsys):
+def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, capsys):
     run = write_run(tmp_path / "bold", load(data).bank)
     out, planner = tmp_path / "run", f"{run.path}@4"
     assert evaluate(data, planner, out, "--sample") == 0
@@ -78,7 +78,7 @@ def test_a_sampling_checkpoint_from_noisy_starts_over_an_old_run(data, tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("planner", ["idm", "pdm", "search", "random", "zoo:aggressive"])
-def test_the_number_of_threads_changes_no_bit(data, planner, tmp_path):
+def test_thread_count_does_not_change_results(data, planner, tmp_path):
     """XLA's pool has a thread per core unless NPROC says otherwise, which it reads once per process."""
     found = []
     for threads in ("1", "2", "8"):

@@ -13,8 +13,8 @@ from drivax.evaluation.audit import BATCH, audit
 from drivax.evaluation.rollout import drive, episode_keys, judging
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import Light
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Light, windows
 from drivax.scenario.schema import CURRENT_STEP, Flag, LightState
 from drivax.scenario.select.filters import FINDINGS
 from drivax.simulator.simulator import Simulator

@@ -13,7 +13,8 @@ from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows
 from drivax.synthetic.world import generate_recording
 
 EXACT, DRIVEN = Expert(), Expert(replays=False)

@@ -17,7 +17,8 @@ from drivax.learning.environment import Environment
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.actions import Discrete
@@ -25,10 +26,10 @@ from drivax.tasks.observations import ObservationConfig, OwnGroup
 from drivax.tasks.task import Task
 
 
-def moment(bank, scene, frames):
+def moment(bank, context, frames):
     """A feature that tells where it was made: scenario, step, last action."""
-    place = jnp.stack([scene.index, scene.step]).astype(jnp.float32)
-    return jnp.concatenate([place, scene.action])[None]
+    place = jnp.stack([context.index, context.step]).astype(jnp.float32)
+    return jnp.concatenate([place, context.action])[None]
 
 
 OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2, own=(OwnGroup(moment),))
@@ -113,29 +114,29 @@ def test_the_row_behind_an_end_holds_the_final_state(experience):
     np.testing.assert_array_equal(~alive[1:], ended[:-1])
     np.testing.assert_array_equal(after.over, ended[-1])
     assert not (ended & ~alive).any() and (rollout.reward[~alive] == 0).all()
-    scene = rollout.state
+    context = rollout.state
     # Whatever happens, what a step led to is the same scenario one step later, seen with the same past.
     lived = alive[:-1]
-    np.testing.assert_array_equal(scene.index[1:][lived], scene.index[:-1][lived])
-    np.testing.assert_array_equal(scene.step[1:][lived], scene.step[:-1][lived] + 1)
-    np.testing.assert_array_equal(scene.history[1:][lived][:, :-1], scene.history[:-1][lived][:, 1:])
+    np.testing.assert_array_equal(context.index[1:][lived], context.index[:-1][lived])
+    np.testing.assert_array_equal(context.step[1:][lived], context.step[:-1][lived] + 1)
+    np.testing.assert_array_equal(context.history[1:][lived][:, :-1], context.history[:-1][lived][:, 1:])
     # Nothing of that reaches the episode that begins behind it.
-    begun = scene.step[1:][~lived]
+    begun = context.step[1:][~lived]
     assert (begun >= EARLIEST).all() and (begun <= LATEST).all() and len(np.unique(begun)) > 2
-    assert (scene.action[1:][~lived] == 0).all() and (scene.route_m[1:][~lived] >= 0).all()
+    assert (context.action[1:][~lived] == 0).all() and (context.route_m[1:][~lived] >= 0).all()
 
 
 def test_new_episodes_begin_as_logged(experience, bank):
-    scene, alive = experience[1].state, experience[1].alive
+    context, alive = experience[1].state, experience[1].alive
     rows = np.argwhere(~alive[:-1]) + np.array([1, 0])
     for time, number in rows:
-        step, history = scene.step[time, number], scene.history[time, number]
-        logged = np.asarray(bank.agents)[scene.index[time, number], max(step - 9, 0) : step + 1, 0]
+        step, history = context.step[time, number], context.history[time, number]
+        logged = np.asarray(bank.agents)[context.index[time, number], max(step - 9, 0) : step + 1, 0]
         np.testing.assert_allclose(history[-len(logged) :, :2], logged[:, :2], atol=1e-4)
 
 
 def test_episodes_begin_at_the_steps_asked_for(bank):
-    late = replace(bank, agents=bank.agents.at[1, :3, 0, AGENT_VALID].set(0.0))
+    late = replace(bank, agents=bank.agents.at[1, :3, 0, AgentColumn.VALID].set(0.0))
     index, step, _ = _draw(late, jax.random.key(2), 64, 0, 0)
     np.testing.assert_array_equal(step, np.where(index == 1, 10, 0))
     step = _draw(bank, jax.random.key(2), 256, 0, LATEST)[1]
@@ -173,7 +174,13 @@ def test_demonstrations_follow_the_log(bank, driving):
     rows = np.asarray(bank.agents)[index[:, None], step[:, None] + np.arange(2), 0]
     speed = (rows[..., 5:7] * rows[..., 3:5]).sum(-1).clip(0)
     motion = np.stack(
-        [rows[..., 0], rows[..., 1], np.arctan2(rows[..., AGENT_SIN], rows[..., AGENT_COS]), speed], axis=-1
+        [
+            rows[..., 0],
+            rows[..., 1],
+            np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS]),
+            speed,
+        ],
+        axis=-1,
     )
     reached = jax.vmap(bicycle)(motion[:, 0], 6.0 * action[:, 0], 0.3 * action[:, 1])
     off = np.linalg.norm(reached[:, :2] - motion[:, 1, :2], axis=-1)

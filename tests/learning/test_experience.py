@@ -15,7 +15,8 @@ from drivax.learning.driving import Driving
 from drivax.learning.experience import ExperienceConfig, Recorded, transitions
 from drivax.learning.loop import usable_steps
 from drivax.planners.simple import Expert, logged_motion
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -33,7 +34,7 @@ def bank(data):
     ego, box = bank.agents[0, 15, 0], bank.agent_box[0, 0]
     agents = bank.agents.at[0, :, 1].set(ego)
     # In the last, the log loses ego.
-    agents = agents.at[2, 70:, 0, AGENT_VALID].set(0.0)
+    agents = agents.at[2, 70:, 0, AgentColumn.VALID].set(0.0)
     # In the second, it looks aside for a moment.
     agents = agents.at[1, JUMP, 0, 3:5].set(-agents[1, JUMP, 0, 4:2:-1])
     return replace(bank, agents=agents, agent_box=bank.agent_box.at[0, 1].set(box))
@@ -49,11 +50,11 @@ def drive(bank, index):
     simulator, planner = DRIVING.simulator, Expert(DRIVING.task.actions)
 
     def step(state, _):
-        seen = simulator.observe(bank, state.scene)
+        seen = simulator.observe(bank, state.context)
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
-        after, made = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        following = simulator.observe(bank, after.scene)
+        after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        following = simulator.observe(bank, after.context)
         return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)
 
     return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]

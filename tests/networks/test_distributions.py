@@ -60,7 +60,7 @@ def test_gaussian_density_integrates_to_one():
     assert np.trapezoid(np.exp(log_prob), action) == pytest.approx(1.0, abs=2e-3)
 
 
-def test_gaussian_mean_action_is_that_of_quadrature():
+def test_gaussian_mean_action_equals_quadrature():
     cases = [(loc, scale) for loc in (-3.0, 0.0, 0.8) for scale in (1e-3, 0.3, 2.0)]
     wanted = [
         integrate.quad(lambda z, loc=loc, s=s: np.tanh(loc + s * z) * stats.norm.pdf(z), -9, 9)[0]
@@ -130,7 +130,7 @@ def test_mixture_against_scipy():
 
 
 @pytest.mark.parametrize("kind", ALL)
-def test_samples_agree_with_what_a_distribution_says_of_itself(kind):
+def test_samples_agree_with_mean_mode_and_entropy(kind):
     one = ALL[kind]
     assert isinstance(one, Distribution)
     choice = draws(one)
@@ -190,7 +190,7 @@ def test_policy_gradients_are_finite_at_saturation(kind):
     assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
-def test_first_parameters_are_around_zero_with_the_asked_spread():
+def test_first_parameters_are_centred_with_the_requested_scale():
     actions = Actions(2, LEVELS)
     gaussian = distribution("gaussian", jnp.asarray(first_parameters("gaussian", actions, 0.3)), actions)
     np.testing.assert_allclose(gaussian.scale, 0.3, rtol=1e-5)

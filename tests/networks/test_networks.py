@@ -40,7 +40,7 @@ def stacked(*observations):
 
 
 @pytest.mark.parametrize("rows", [(), (8, 8)])
-def test_masked_rows_never_matter_and_batches_agree(rows):
+def test_masked_rows_have_no_effect_and_batches_agree(rows):
     rng = np.random.default_rng(0)
     one, other = observation(rng), observation(rng)
     config = NetworkConfig(encoder=MlpConfig(rows=rows, hidden=(16, 16)), head=(8,))
@@ -70,7 +70,7 @@ def test_pooled_rows_have_no_order():
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "beta", "grid"])
-def test_every_distribution_has_a_head_that_begins_around_zero(kind):
+def test_heads_of_all_distributions_start_at_zero(kind):
     one = observation(np.random.default_rng(1))
     config = NetworkConfig(encoder=MlpConfig(hidden=(8,)), distribution=kind)
 
@@ -88,7 +88,7 @@ def test_every_distribution_has_a_head_that_begins_around_zero(kind):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_both_is_policy_and_value_and_a_shared_encoder_is_one(shared):
+def test_shared_encoder_runs_once_for_policy_and_value(shared):
     one = observation(np.random.default_rng(3))
     config = NetworkConfig(SMALL.encoder, (4,), shared_encoder=shared)
     graph, parameters = drawn(lambda: ActorCritic(config, group_spec(one), nnx.Rngs(0)))
@@ -160,19 +160,19 @@ def test_encoders_in_yaml():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("encoder: {kind: lqq}", r"^encoder: there is no kind 'lqq'; did you mean 'lq'"),
+        ("encoder: {kind: lqq}", r"^encoder: unknown kind 'lqq'; did you mean 'lq'"),
         (
             "encoder: {kind: cnn}",
-            r"^encoder: there is no kind 'cnn'; use one of mlp, lq, lqh, mtr, wayformer, entity",
+            r"^encoder: unknown kind 'cnn'; use one of mlp, lq, lqh, mtr, wayformer, entity",
         ),
-        ("encoder: {kind: lq, size: tiny}", r"^encoder\.size: 'tiny' is none of published, small"),
-        ("encoder: {kind: mtr, latents: 8}", r"^encoder\.latents: there is no such setting"),
-        ("encoder: {kind: lq, width: 10}", r"^encoder: width 10 is no multiple of 4 heads"),
+        ("encoder: {kind: lq, size: tiny}", r"^encoder\.size: 'tiny' is not one of published, small"),
+        ("encoder: {kind: mtr, latents: 8}", r"^encoder\.latents: unknown setting"),
+        ("encoder: {kind: lq, width: 10}", r"^encoder: width 10 is not a multiple of 4 heads"),
         (
             "encoder: {kind: wayformer, fusion: soon}",
-            r"^encoder\.fusion: 'soon' is none of early, late, hier",
+            r"^encoder\.fusion: 'soon' is not one of early, late, hier",
         ),
-        ("distribution: normal", r"^distribution: 'normal' is none of gaussian, beta, grid"),
+        ("distribution: normal", r"^distribution: 'normal' is not one of gaussian, beta, grid"),
         ("first_scale: 0", r"^first_scale is 0; use more than 0"),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 from drivax.networks.encoders import MlpConfig
-from drivax.networks.normalised import NormalisedConfig, feature_statistics, tell_statistics
+from drivax.networks.normalised import NormalisedConfig, feature_statistics, set_statistics
 
 SPEC = {"ego": (3,), "agents": (4, 2), "agents_mask": (4,)}
 
@@ -25,7 +25,7 @@ def groups():
     }
 
 
-def test_statistics_are_of_the_rows_that_are_there(groups):
+def test_statistics_use_valid_rows_only(groups):
     found = feature_statistics(groups)
     assert set(found) == {"ego", "agents"}
     rows = np.asarray(groups["agents"], np.float64)[np.asarray(groups["agents_mask"])]
@@ -46,13 +46,13 @@ def test_statistics_are_of_the_rows_that_are_there(groups):
     np.testing.assert_array_equal(jnp.stack(feature_statistics(nobody)["agents"]), [[0, 0], [1, 1]])
 
 
-def test_what_encoders_see_has_no_mean_and_unit_deviation(groups):
+def test_normalised_features_have_zero_mean_and_unit_deviation(groups):
     made = NormalisedConfig(MlpConfig(rows=(8,), hidden=(8,))).build(SPEC, nnx.Rngs(0))
     plain = made.encoder
     # Without statistics it changes nothing but what is very far.
     near = {**groups, "agents": groups["agents"] / 100, "ego": groups["ego"] / 10}
     np.testing.assert_allclose(made(near), plain(near), rtol=1e-5)
-    tell_statistics(made, feature_statistics(groups))
+    set_statistics(made, feature_statistics(groups))
     rows = np.asarray(made._scaled("agents", groups["agents"]))[np.asarray(groups["agents_mask"])]
     np.testing.assert_allclose(rows.mean(axis=0), 0.0, atol=1e-3)
     np.testing.assert_allclose(rows.std(axis=0), 1.0, rtol=1e-3)
@@ -63,7 +63,7 @@ def test_what_encoders_see_has_no_mean_and_unit_deviation(groups):
 
 def test_no_gradient_reaches_statistics(groups):
     made = NormalisedConfig(MlpConfig(hidden=(8,))).build(SPEC, nnx.Rngs(0))
-    tell_statistics(made, feature_statistics(groups))
+    set_statistics(made, feature_statistics(groups))
     graph, parameters = nnx.split(made, nnx.Param)
     slopes = jax.grad(lambda p: nnx.merge(graph, p)(groups).sum())(parameters)
     for name in ("mean", "deviation"):

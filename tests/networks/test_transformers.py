@@ -83,7 +83,7 @@ def by_numpy(config, groups, parameters):
             groups, ("agents", "ego", "ego_static"), ("lights", "route"), ("ego", "ego_static"), p
         )
     if isinstance(config, EntityConfig):
-        parts = {"ego": ["ego", "ego_static"], "others": ["agents"], "goal": ["route"], "beside": ["lights"]}
+        parts = {"ego": ["ego", "ego_static"], "others": ["agents"], "goal": ["route"], "context": ["lights"]}
         return oracle.entity(groups, parts, p)
     return oracle.latent_encoder(groups, names, p)
 
@@ -199,7 +199,7 @@ def test_parameter_counts():
     assert count(LqConfig(size="published")) == 14 * d + 5 * 3 * d + 16 * d + 4 * layer + 2 * d
 
 
-def test_groups_are_told_apart_by_their_masks_and_axes():
+def test_groups_are_classified_by_masks_and_axes():
     found = {name: (f.masked, f.rows, f.times, f.features, f.series) for name, f in forms(SPEC).items()}
     assert found == {
         "agents": (True, 3, 2, 4, True), "ego": (False, 1, 2, 3, True), "ego_static": (False, 1, 1, 2, False),
@@ -210,15 +210,15 @@ def test_groups_are_told_apart_by_their_masks_and_axes():
 
 
 @pytest.mark.parametrize("config", [MlpConfig(), MlpConfig(rows=(8,)), *CONFIGS.values()])
-def test_nothing_at_all_is_refused(config):
+def test_empty_observations_are_refused(config):
     for spec in ({}, EMPTY):
-        with pytest.raises(UsageError, match="every group is empty; observe at least one row"):
+        with pytest.raises(UsageError, match="all groups are empty; observe at least one row"):
             config.build(spec, nnx.Rngs(0))
 
 
 @pytest.mark.parametrize("name", ["lq", "mtr", "entity"])
 @pytest.mark.parametrize("missing", ["masked", "unmasked"])
-def test_encoders_of_sets_alone_and_of_nothing_but_the_ego(name, missing):
+def test_encoders_accept_sets_only_or_ego_only(name, missing):
     wanted = [g for g in GROUPS if (f"{g}_mask" in SPEC) != (missing == "masked")]
     spec = {key: shape for key, shape in SPEC.items() if key.removesuffix("_mask") in wanted}
     graph, parameters = build(CONFIGS[name], spec)
@@ -230,10 +230,10 @@ def test_encoders_of_sets_alone_and_of_nothing_but_the_ego(name, missing):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: LqConfig(width=10, heads=4), "width 10 is no multiple of 4 heads"),
+        (lambda: LqConfig(width=10, heads=4), "width 10 is not a multiple of 4 heads"),
         (lambda: LqConfig(latents=0), "use at least 1"),
         (lambda: MtrConfig(layers=0), "use at least 1"),
-        (lambda: EntityConfig(width=6), "width 6 is no multiple of 4 heads"),
+        (lambda: EntityConfig(width=6), "width 6 is not a multiple of 4 heads"),
     ],
 )
 def test_impossible_sizes_are_refused(make, words):

@@ -8,7 +8,8 @@ import pytest
 from drivax.datasets.womd.example_reader import WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.assemble import assemble, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import AgentKind, Flag, Scenario
 
 FILES = {
@@ -34,7 +35,7 @@ def ends(scenario, block):
     return (x[part].astype(np.float64) for x in (scenario.segment_a, scenario.segment_b))
 
 
-def test_every_track_has_a_place(recording, scenario):
+def test_every_track_is_placed(recording, scenario):
     placed = {*scenario.agent_id[scenario.agent_id >= 0], *scenario.parked_id[scenario.parked_id >= 0]}
     seen = recording.tracks.valid.any(axis=1)
     assert placed == set(recording.tracks.track_id[seen].tolist())
@@ -57,7 +58,7 @@ def test_segments_are_short_and_runs_fit_the_queries(scenario):
 
 
 @pytest.mark.parametrize("block", [0, 1])
-def test_all_within_eight_metres_is_in_the_nine_cells(scenario, block):
+def test_nine_cells_contain_all_segments_within_eight_metres(scenario, block):
     a, b = ends(scenario, block)
     start = (scenario.grid_edge, scenario.grid_lane)[block].astype(np.int64)
     rng = np.random.default_rng(0)
@@ -76,7 +77,7 @@ def test_all_within_eight_metres_is_in_the_nine_cells(scenario, block):
         assert np.isin(needed, found).all()
 
 
-def test_the_ego_is_on_the_drivable_side_of_the_nearest_edge(scenario):
+def test_ego_is_on_the_drivable_side_of_the_nearest_edge(scenario):
     """Check-list 7: edges are oriented, drivable side on the left."""
     a, b = ends(scenario, 0)
     good = []
@@ -103,7 +104,7 @@ def test_routes_are_a_metre_apart_and_pass_the_log(scenario):
     assert scenario.route_points[0] - 1 - scenario.log_progress[-1] >= 50.0
 
 
-def test_other_vehicles_as_egos_find_their_way(recording):
+def test_other_vehicles_as_ego_have_routes(recording):
     """A sweep over ten logged cars: those that end on a lane must have a route of lanes beside their log."""
     reach = 2.0 if recording.flags & Flag.LANE_GRAPH else 4.0  # a truncated map lacks lanes
     tracks, now = recording.tracks, recording.current_step

@@ -93,7 +93,7 @@ def test_three_commands_find_the_most_critical_scenarios(
 
 
 @pytest.mark.slow
-def test_scouts_score_recorded_drives(real_data, tmp_path):
+def test_members_score_logged_steps(real_data, tmp_path):
     """An ensemble of two on a recorded drive, twice: both score alike."""
     pytest.importorskip("google.protobuf", reason="needs the extra 'womd'")
     with ScenarioWriter(tmp_path / "set", Capacity()) as writer:

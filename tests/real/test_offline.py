@@ -28,7 +28,7 @@ def recorded(request, real_data, tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bc", "cql", "iql", "td3_bc"])
-def test_a_driver_learns_from_recordings_by_their_scores(recorded, kind, tmp_path):
+def test_policy_learns_from_recordings_weighted_by_scores(recorded, kind, tmp_path):
     data, run, drive = str(recorded / "set"), tmp_path / "run", tmp_path / "drive"
     call = ["train", f"offline/{kind}", "--data", data, "--validation", data, "--out", str(run)]
     assert main([*call, "--scores", str(recorded / "scores.npz"), *TINY]) == 0

@@ -10,8 +10,10 @@ import pytest
 from drivax.datasets.formats import detect
 from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows, with_ego
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
@@ -46,7 +48,7 @@ def driven(real_data):
 
 
 @pytest.mark.slow
-def test_only_heights_keep_the_levels_apart(driven):
+def test_levels_are_separated_by_height(driven):
     real = audit([assemble(with_ego(window, row)) for window, row in driven])
     flat = audit([assemble(with_ego(flattened(window), row)) for window, row in driven])
     assert len(real) >= 20 and not any(finding["log_collides"] for finding in real)
@@ -55,23 +57,26 @@ def test_only_heights_keep_the_levels_apart(driven):
 
 
 @pytest.mark.slow
-def test_the_height_of_a_car_is_that_of_its_road(driven):
+def test_vehicle_height_follows_its_road(driven):
     """Looked up in the map step by step, the height of every replayed car stays with the logged one."""
     bank = ScenarioBank.from_scenarios([assemble(with_ego(window, row)) for window, row in driven])
     simulator = Simulator(Task(metrics="none", ends=()))
 
     def one(state, _):
         action = jnp.zeros(2)
-        state, _ = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        return state, state.scene.z
+        state, _ = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        return state, state.context.z
 
     @jax.jit
     @jax.vmap
     def heights(index):
         return jax.lax.scan(one, simulator.reset(bank, index), None, 80)[1]
 
-    found, logged = np.asarray(heights(jnp.arange(len(driven)))), np.asarray(bank.agents[:, 11:, 0, AGENT_Z])
-    there = np.asarray(bank.agents[:, 11:, 0, AGENT_VALID]) > 0
+    found, logged = (
+        np.asarray(heights(jnp.arange(len(driven)))),
+        np.asarray(bank.agents[:, 11:, 0, AgentColumn.Z]),
+    )
+    there = np.asarray(bank.agents[:, 11:, 0, AgentColumn.VALID]) > 0
     apart = np.abs(found - logged)[there]
     # Recorded boxes float by centimetres over the road that was recorded with them.
     assert np.quantile(apart, 0.99) < 0.5 and np.median(apart) < 0.1

@@ -10,8 +10,10 @@ from shapely.geometry import LineString, Point
 
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.planners.simple import logged_motion
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
-from drivax.scenario.build.assemble import assemble, with_ego
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import CAR_LANE_KINDS, AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.rewards import RewardConfig
@@ -81,7 +83,7 @@ def crossings(recording, row):
 def changes(bank):
     def one(row):
         def step(state, _):
-            now = logged_motion(bank, state.scene, 1)
+            now = logged_motion(bank, state.context, 1)
             after, _ = SIMULATOR.replay(bank, state, now, jnp.zeros(2))
             return after, after.facts.lane_changed
 
@@ -94,7 +96,7 @@ def changes(bank):
 def test_logged_lane_changes_are_found_where_they_are(recording):
     rows = travelling(recording)
     bank = ScenarioBank.from_scenarios([assemble(with_ego(recording, row)) for row in rows])
-    there = np.asarray(bank.agents[:, 11:, 0, AGENT_VALID]) > 0
+    there = np.asarray(bank.agents[:, 11:, 0, AgentColumn.VALID]) > 0
     flags = np.asarray(changes(bank)) & there
     found = {row: (np.flatnonzero(flags[i]) + 11).tolist() for i, row in enumerate(rows)}
     expected = {row: crossings(recording, row) for row in rows}

@@ -9,7 +9,8 @@ import pytest
 
 from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.reader import BadRecord
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.traffic.reactive import DRIVES, REPLAYS
 from traffic_oracle import TRAFFIC, compare, meetings, runs_of
 from traffic_oracle import Path as Line
@@ -37,19 +38,19 @@ def runs(bank):
     return runs_of(bank)
 
 
-def test_vehicles_do_what_the_law_says(bank, runs):
+def test_reactive_vehicles_follow_idm(bank, runs):
     found = np.concatenate([compare(bank, index, *run, every=20) for index, run in enumerate(runs)])
     assert len(found) > 400
     assert np.quantile(found[:, 0], 0.99) < 5e-3
 
 
-def test_paths_follow_the_logs_and_vehicles_their_paths(bank, runs):
+def test_paths_follow_logs_and_vehicles_follow_paths(bank, runs):
     agents = np.asarray(bank.agents, np.float64)
     away, left, moves = [], [], []
     for index, (frames, traffic) in enumerate(runs):
         for row in np.flatnonzero((traffic.phase == DRIVES).any(0)):
             slot, path = int(bank.paths.slot[index, row]), Line(bank.paths, index, row)
-            seen = agents[index, :, slot, AGENT_VALID] > 0
+            seen = agents[index, :, slot, AgentColumn.VALID] > 0
             x, y, _, _ = path.at(np.asarray(bank.paths.log_arc[index, seen, row]))
             away += np.hypot(x - agents[index, seen, slot, 0], y - agents[index, seen, slot, 1]).tolist()
             moves += (np.hypot(*agents[index, seen, slot, 5:7].T) > 1.0).tolist()
@@ -61,7 +62,7 @@ def test_paths_follow_the_logs_and_vehicles_their_paths(bank, runs):
     assert max(left) < 0.02
 
 
-def test_few_vehicles_meet(bank, runs):
+def test_few_reactive_vehicles_collide(bank, runs):
     found = [meetings(bank, index, *run) for index, run in enumerate(runs)]
     reacting = sum(len(agents) for _, agents in found)
     between = sum(len([pair for pair in pairs if set(pair) <= set(agents)]) for pairs, agents in found)
@@ -72,7 +73,7 @@ def test_few_vehicles_meet(bank, runs):
     assert reacting > 300 and between <= 0.03 * reacting
 
 
-def test_logs_are_driven_about_as_fast_as_they_were(bank, runs):
+def test_reactive_speeds_match_the_log(bank, runs):
     shares = []
     for index, (_, traffic) in enumerate(runs):
         for row in np.flatnonzero((traffic.phase != REPLAYS).any(0)):

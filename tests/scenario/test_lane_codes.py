@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivax.scenario.bank.strands import NOWHERE_M, lane_codes
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.build.lane_codes import NOWHERE_M, lane_codes
 from drivax.scenario.schema import CAPACITIES
 
 from .recordings import arc, driving, edge, lane, line, make_recording, make_tracks

@@ -5,15 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import project
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.assemble import ego_log
-from drivax.scenario.build.lane_paths import trace
-from drivax.scenario.build.lane_search import LaneSearch
+from drivax.scenario.build.lane_paths import LaneSearch, trace
 from drivax.scenario.build.lanes import LaneSegments, lane_graph
-from drivax.scenario.build.route_published import LEAST_M, published_ways, score
-from drivax.scenario.build.route_start import join
-from drivax.scenario.build.routes import Intent, Route, RouteStyle, find_routes, log_progress
+from drivax.scenario.build.routes import (
+    LEAST_M,
+    Intent,
+    Route,
+    RouteStyle,
+    find_routes,
+    join,
+    log_progress,
+    published_ways,
+    score,
+)
 from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.build.tracks import local_tracks
 from drivax.scenario.schema import RoadKind

@@ -9,7 +9,8 @@ import pytest
 
 from drivax.datasets.export.restore import restore
 from drivax.errors import DataError
-from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows, with_ego
 from scenario.recordings import driving, make_recording, make_tracks, straight_road
 
 

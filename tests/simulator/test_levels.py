@@ -10,7 +10,7 @@ import pytest
 
 from drivax.evaluation.rollout import drive
 from drivax.planners.simple import ConstantVelocity
-from drivax.scenario.bank.scenario_bank import AGENT_Z
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 from drivax.simulator.simulator import Simulator
@@ -94,8 +94,8 @@ def test_height_follows_the_map_and_not_the_log():
         def one(state, _):
             state, _ = SIMULATOR.step(bank, state, jnp.zeros(2))
             return state, (
-                state.scene.history[-1, 0],
-                state.scene.z,
+                state.context.history[-1, 0],
+                state.context.z,
                 state.facts.collision,
                 state.facts.offroad,
             )
@@ -103,7 +103,7 @@ def test_height_follows_the_map_and_not_the_log():
         return jax.lax.scan(one, SIMULATOR.reset(bank, 0), None, 80)[1]
 
     x, z, collision, offroad = map(np.asarray, driven(bank))
-    rises = z - float(bank.agents[0, 10, 0, AGENT_Z])
+    rises = z - float(bank.agents[0, 10, 0, AgentColumn.Z])
     assert x[-1] > 90 and rises[-1] > 7.0
     np.testing.assert_allclose(rises, ramp(x), atol=0.25)
     assert not collision.any() and not offroad.any()

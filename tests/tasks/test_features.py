@@ -59,7 +59,7 @@ def bend(cars, **more):
 
 @pytest.fixture(scope="module")
 def seen():
-    """What is seen of one scene under every configuration of this file, in one program, at three places."""
+    """What is seen of one context under every configuration of this file, in one program, at three places."""
     cars = [car(0, 0, 0, 9), car(20, 0.5, np.pi / 2, 6, 5.0, 2.0), car(-12, 3.7, 0, 3)]
     bank = bank_of(bend(cars))
     configs = {"everything": EVERYTHING, "few": FEW, "cut": CUT, "uncut": UNCUT}
@@ -68,10 +68,12 @@ def seen():
         results = {}
         for name, config in configs.items():
             simulator = Simulator(Task(observation=config))
-            scene = simulator.scene(bank, 0, 10)
-            last = jnp.stack([x, y, heading, scene.history[-1, 3]])
-            scene = replace(scene, history=scene.history.at[-1].set(last), route_m=scene.route_m + route_m)
-            results[name] = simulator.observe(bank, scene)
+            context = simulator.context(bank, 0, 10)
+            last = jnp.stack([x, y, heading, context.history[-1, 3]])
+            context = replace(
+                context, history=context.history.at[-1].set(last), route_m=context.route_m + route_m
+            )
+            results[name] = simulator.observe(bank, context)
         return results
 
     # Where the log has ego; on the arc, 20 m behind its begin, 1 m left of the lane; and facing across the road.
@@ -86,7 +88,7 @@ def column(seen, group, name, place=0, of="everything", config=EVERYTHING):
     return seen[of][group][place][..., feature_names(config.features, shapes)[group].index(name)]
 
 
-def test_what_ego_and_agents_may_have_more(seen):
+def test_optional_features_of_ego_and_agents(seen):
     np.testing.assert_allclose(column(seen, "ego", "time"), [-0.1, 0.0], atol=1e-6)
     np.testing.assert_allclose(column(seen, "ego_static", "height"), 1.5 / 5)
     # Nearest first: the slower car behind (12.6 m), then the one that crosses (20.0 m).
@@ -126,14 +128,14 @@ def test_curvature_of_road_and_route(seen):
     np.testing.assert_allclose(seen["everything"]["recommended_speed"][0, :10, 0], speed[:10], rtol=1e-6)
 
 
-def test_the_goal_is_shown_from_ego(seen):
+def test_goal_is_in_the_ego_frame(seen):
     goal = np.stack([column(seen, "route", f"goal {axis}") for axis in "xy"], axis=-1)
     assert (goal == goal[:1]).all() and 0 < goal[0, 0] <= 5
     turned = np.stack([column(seen, "route", f"goal {axis}", place=2) for axis in "xy"], axis=-1)
     np.testing.assert_allclose(turned[0], [goal[0, 1], -goal[0, 0]], atol=1e-5)
 
 
-def test_chosen_columns_are_those_of_everything(seen):
+def test_selected_columns_equal_those_of_all_features(seen):
     names = feature_names(FEW.features, {name: value.shape[1:] for name, value in seen["few"].items()})
     assert names == {
         "ego": ("position x", "position y", "time"),
@@ -150,7 +152,7 @@ def test_chosen_columns_are_those_of_everything(seen):
     assert seen["few"]["agents_mask"].shape == (3, 3, 2) and "lights_mask" not in seen["few"]
 
 
-def test_pieces_are_cut_into_equal_rows_along_their_chord(seen):
+def test_road_pieces_are_cut_into_equal_rows(seen):
     lanes = seen["uncut"]["road"][0]
     assert seen["uncut"]["road_mask"][0].all() and (lanes[:, 5] == 1).all()
     rows = seen["cut"]["road"][0].reshape(12, 5, -1)
@@ -199,7 +201,7 @@ def test_car_following_sees_what_the_idm_reacts_to(seen):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_examples_keep_to_the_rules(name):
+def test_example_features_pass_their_checks(name):
     check_feature(f"drivax.tasks.example_features:{name}")
 
 
@@ -228,7 +230,7 @@ def test_presets_by_name_in_yaml():
     [
         (
             "{preset: minimum}",
-            "task.observation: there is no observation preset 'minimum'; did you mean 'minimal'?",
+            "task.observation: unknown observation preset 'minimum'; did you mean 'minimal'?",
         ),
         (
             "{features: {agents: [positon]}}",
@@ -241,7 +243,7 @@ def test_presets_by_name_in_yaml():
         ("{perception: {noise_m: -1}}", r"noise_m is -1\.0; use 0 or a positive"),
     ],
 )
-def test_mistakes_are_told_in_one_line(text, said):
+def test_mistakes_are_reported_in_one_line(text, said):
     with pytest.raises(UsageError, match=said) as error:
         load(text)
     assert "\n" not in str(error.value)

@@ -52,7 +52,7 @@ def in_view_by_shapely(eye, boxes, blocks, more):
     return np.array(result)
 
 
-def test_who_is_in_view_agrees_with_shapely():
+def test_visibility_agrees_with_shapely():
     pytest.importorskip("shapely")
     rng = np.random.default_rng(3)
     rule = jax.jit(in_view)
@@ -70,7 +70,7 @@ def test_who_is_in_view_agrees_with_shapely():
     assert hidden > 80 and clear > 80, (hidden, clear)
 
 
-def test_lines_of_sight_on_paper():
+def test_lines_of_sight_by_hand():
     eye, everyone = jnp.zeros(2), jnp.ones(3, bool)
     bus = shown(10, 0, 0, 10.0, 3.0)
     behind = jnp.stack([bus, shown(25, 0, 0, 4.0, 2.0), shown(25, 3.0, 0, 4.0, 2.0)])
@@ -112,8 +112,8 @@ def seen(bank):
     }
 
     def look(bank, step):
-        scene = simulators["none"].scene(bank, 0, step)
-        return {name: one.observe(bank, scene) for name, one in simulators.items()} | {"scene": scene}
+        context = simulators["none"].context(bank, 0, step)
+        return {name: one.observe(bank, context) for name, one in simulators.items()} | {"context": context}
 
     return jax.device_get(jax.jit(jax.vmap(look, (None, 0)))(bank, jnp.arange(FIRST, 91)))
 
@@ -124,7 +124,7 @@ def lengths(seen, step=0):
     return sorted(np.round(rows[mask, 2].astype(np.float64) * 5, 1).tolist())
 
 
-def test_who_is_behind_a_bus_is_not_there(seen):
+def test_agents_behind_a_bus_are_occluded(seen):
     assert lengths(seen["none"]) == [0.6, 4.0, 4.2, 4.4, 4.6, 12.0]
     # The car at 32 m is hidden by the bus ahead of ego; the one at 60 m, far to the left, is seen past it.
     assert lengths(seen["occlusion"]) == [0.6, 4.2, 4.4, 4.6, 12.0]
@@ -143,7 +143,7 @@ def errors(seen, group="agents"):
     return (seen["noise"][group][..., :2] - seen["none"][group][..., :2]) * 50
 
 
-def test_noise_is_as_large_as_said_and_independent(seen):
+def test_noise_has_its_deviation_and_is_independent(seen):
     truth, noisy = seen["none"], seen["noise"]
     error = errors(seen)[:, :6, -1]
     count = error.size
@@ -161,7 +161,7 @@ def test_noise_is_as_large_as_said_and_independent(seen):
     np.testing.assert_array_equal(noisy["ego"], truth["ego"])
 
 
-def test_a_past_step_is_shown_as_it_was_seen_then(seen):
+def test_past_steps_keep_their_perception(seen):
     """Ego drives straight on at 4 m/s, so what it saw a step ago lies 0.4 m further behind now."""
     for name in ("noise", "all"):
         rows, mask = seen[name]["agents"], seen[name]["agents_mask"]
@@ -181,11 +181,11 @@ def test_a_past_step_is_shown_as_it_was_seen_then(seen):
 
 def test_range_and_dropout_by_distance(bank, seen):
     """The share of steps at which something is seen is exp(-distance / 40 m); nothing is seen beyond the range."""
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["scene"])
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["context"])
     distance = jnp.array([1.0, 15.0, 40.0, 90.0])
 
     def look(faults):
-        return jax.vmap(lambda step: lights_seen(faults, bank, replace(scene, step=step), distance))(
+        return jax.vmap(lambda step: lights_seen(faults, bank, replace(context, step=step), distance))(
             jnp.arange(4000)
         )
 
@@ -205,7 +205,7 @@ def test_range_and_dropout_by_distance(bank, seen):
     assert len(np.unique(found)) > 2
 
 
-def test_lights_that_are_not_seen_are_hidden_from_groups_of_ones_own():
+def test_unseen_lights_are_hidden_from_custom_groups():
     """A red light 40 m ahead, and nobody else; out of range neither example that reads lights knows of it."""
     bank = bank_of(straight_road([car(0, 0, 0, 4)], light=RED))
     own = (OwnGroup(stop_line), OwnGroup(car_following))
@@ -215,7 +215,7 @@ def test_lights_that_are_not_seen_are_hidden_from_groups_of_ones_own():
     )
 
     def look(bank):
-        return [one.observe(bank, one.scene(bank, 0, FIRST)) for one in (near, far)]
+        return [one.observe(bank, one.context(bank, 0, FIRST)) for one in (near, far)]
 
     blind, sighted = jax.device_get(jax.jit(look)(bank))
     assert sighted["lights_mask"].any() and sighted["stop_line"][1:].tolist() == [1.0, 1.0]
@@ -225,15 +225,15 @@ def test_lights_that_are_not_seen_are_hidden_from_groups_of_ones_own():
 
 
 @pytest.mark.slow
-def test_a_replayed_scene_is_perceived_as_it_was_live(bank, seen):
-    """A stored scene, observed alone and in another program, as it was seen in the batch."""
+def test_replayed_perception_equals_live_perception(bank, seen):
+    """A stored context, observed alone and in another program, as it was seen in the batch."""
     simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["scene"])
-    for name, value in jax.jit(simulator.observe)(bank, scene).items():
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["context"])
+    for name, value in jax.jit(simulator.observe)(bank, context).items():
         np.testing.assert_allclose(value, seen["all"][name][25], atol=1e-6, err_msg=name)
 
 
-def test_what_is_off_leaves_no_trace(bank):
+def test_disabled_features_cost_nothing(bank):
     """The program of an observation without faults draws nothing, whatever the seed."""
 
     def program(faults):
@@ -241,9 +241,9 @@ def test_what_is_off_leaves_no_trace(bank):
         simulator = Simulator(Task(observation=config))
 
         def look(bank):
-            scene = simulator.scene(bank, 0, 20)
+            context = simulator.context(bank, 0, 20)
             return observe(
-                config, bank, scene, lambda back: simulator.frame(bank, scene, _alone(scene), back)
+                config, bank, context, lambda back: simulator.frame(bank, context, _alone(context), back)
             )
 
         return str(jax.make_jaxpr(look)(bank))
@@ -254,5 +254,5 @@ def test_what_is_off_leaves_no_trace(bank):
         assert "random" in program(faults)
 
 
-def _alone(scene):
-    return jax.tree.map(lambda leaf: leaf[None], scene)
+def _alone(context):
+    return jax.tree.map(lambda leaf: leaf[None], context)

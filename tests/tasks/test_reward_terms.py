@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +19,10 @@ from drivax.tasks.rewards import (
     AGGRESSIVE,
     PRESETS,
     PUBLISHED,
-    READS,
     TERMS,
     OwnTerm,
     RewardConfig,
-    Touching,
+    collision,
 )
 from drivax.tasks.task import Task
 
@@ -136,23 +136,24 @@ def test_terms_by_hand(term, changes, expected):
     assert value(term, **changes) == pytest.approx(expected, abs=1e-5)
 
 
-def test_every_term_has_its_cases():
+def test_each_term_has_cases():
     assert {term for term, _, _ in CASES} == set(TERMS)
 
 
-def test_away_from_all_lanes_nobody_straddles_them():
+def test_straddling_is_zero_away_from_lanes():
     assert value("straddling", near=False, straddling=True) == 0.0
 
 
-def test_the_goal_counts_once():
+def test_goal_counts_once():
     there = facts(goal_distance_m=2.0)
     assert value("goal", before=there, goal_distance_m=1.0) == 0.0
 
 
-def test_margins():
-    assert value(Touching(0.5), gap_m=0.6) == 0.0
-    assert value(Touching(0.5), gap_m=0.4) == 1.0
-    assert value(Touching(0.5), gap_m=0.6, collision=True) == 1.0
+def test_margins_widen_collisions():
+    with_margin = partial(collision, collision_margin_m=0.5)
+    assert value(with_margin, gap_m=0.6) == 0.0
+    assert value(with_margin, gap_m=0.4) == 1.0
+    assert value(with_margin, gap_m=0.6, collision=True) == 1.0
     wary = RewardConfig(
         preset="safety", collision_margin_m=0.5, ttc=-0.5, ttc_s=0.95, close=-0.1, close_m=3.0
     )
@@ -165,7 +166,7 @@ def test_margins():
     assert [float(terms["close"]) for terms in found.values()] == pytest.approx([-0.1, -0.1, 0])
 
 
-def test_scale_brings_a_step_into_another_range():
+def test_scale_multiplies_all_terms():
     """The worst step of ``published`` is -3.3 and the best 0.4, by the weights; scaled they are in [-1, 1]."""
     failures = dict.fromkeys(("collision", "offroad", "red_light", "off_route"), True)
     worst = facts(**failures, speed_mps=20.0, jerk_mps3=20.0, progress_m=19.0)
@@ -266,15 +267,15 @@ def test_terms_agree_with_numpy_on_random_facts():
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_terms_look_at_nothing_but_what_they_say(term):
+def test_terms_read_only_their_registered_facts(term):
     def lean(whole):
         kept = {field.name: getattr(whole, field.name) for field in fields(Facts)}
         made = object.__new__(Facts)
         for name, fact in kept.items():
-            object.__setattr__(made, name, fact if name in READS[term] else None)
+            object.__setattr__(made, name, fact if name in TERMS[term].reads else None)
         return made
 
-    assert READS[term] <= FACTS | ON_REQUEST
+    assert TERMS[term].reads <= FACTS | ON_REQUEST
     now = facts(lane_changed=True, straddling=True)
     assert float(TERMS[term](lean(BEFORE), lean(now), around())) == value(
         term, lane_changed=True, straddling=True
@@ -303,7 +304,7 @@ def test_published_by_hand():
     assert total("published", **worst) == pytest.approx(-3.3)
 
 
-def test_the_aggressive_driver_by_hand():
+def test_aggressive_preset_by_hand():
     # Published 0.4, 10 / 13.4 of the limit; then 0.3 s from a car in front; then into the next lane, which is a merge.
     fast = 0.3 * 10 / 13.4
     assert total("aggressive") == pytest.approx(0.4 + fast)
@@ -311,7 +312,7 @@ def test_the_aggressive_driver_by_hand():
     assert total("aggressive", lane_changed=True, merged=True) == pytest.approx(0.4 + fast + 0.4)
 
 
-def test_what_is_off_is_not_measured():
+def test_facts_of_disabled_terms_are_not_measured():
     for preset in ("safety", "navigation", "behaviour", "published"):
         assert not RewardConfig(preset=preset).reads & ON_REQUEST
         assert not Task(rewards=RewardConfig(preset=preset)).reads & ON_REQUEST
@@ -331,7 +332,7 @@ def test_own_terms_get_facts_on_request():
     config = RewardConfig(preset="safety", own=(asking,))
     assert config.reads == FACTS | {"gap_m"}
     assert float(config.weigh(BEFORE, facts(gap_m=1.0), around())["alongside"]) == pytest.approx(-0.1)
-    with pytest.raises(ValueError, match="reads 'gap', which is no fact"):
+    with pytest.raises(ValueError, match="reads unknown fact 'gap'"):
         OwnTerm(alongside, -0.1, reads=("gap",))
 
 

@@ -79,18 +79,18 @@ class ToyLearner:
         "mode": "at random by the mode",
     }.items(),
 )  # fmt: skip
-def test_wrong_algorithms(fault, words):
+def test_invalid_algorithms_fail(fault, words):
     with pytest.raises(BrokenContract) as error:
         check_algorithm(Toy(fault))
     assert re.search(words, str(error.value)) and "\n" not in str(error.value)
 
 
-def test_a_toy_passes():
+def test_toy_algorithm_passes():
     check_algorithm(Toy())
 
 
 @pytest.mark.slow
-def test_an_own_algorithm_passes():
+def test_custom_algorithm_passes():
     check_algorithm("own_terms:ReinforceConfig")
 
 
@@ -102,7 +102,7 @@ def test_ppo_passes():
     check_algorithm(PpoConfig(network=with_own, environments=4, unroll=4, epochs=1, minibatches=2))
 
 
-def test_an_own_algorithm_is_short(repository):
+def test_custom_algorithm_is_short(repository):
     """The guide's takes at most 80 lines, whole."""
     guide = (repository / "docs" / "guide" / "custom.md").read_text()
     (code,) = re.findall(r"```python\n(# my_algorithm.py\n.*?)```", guide, re.S)

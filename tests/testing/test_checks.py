@@ -28,7 +28,7 @@ def refused(check, term, words):
 
 
 @pytest.mark.slow
-def test_the_worlds_show_what_terms_look_at():
+def test_check_worlds_cover_the_facts_of_terms():
     found = moments().found
     facts = found.facts
     for name in ("collision", "offroad", "off_route", "ttc_defined", "straddling", "wrong_way"):
@@ -45,7 +45,7 @@ def some(names, *quick):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["own_terms:Crowded", *TERMS])
-def test_right_reward_terms(name):
+def test_valid_reward_terms_pass(name):
     check_reward(own_terms.Crowded(5.0) if name.endswith("Crowded") else TERMS.get(name, name))
 
 
@@ -69,14 +69,14 @@ WRONG_TERMS = {
 
 
 @pytest.mark.parametrize("words", some(WRONG_TERMS, "cannot be compiled", "turned and shifted"))
-def test_wrong_reward_terms(words):
+def test_invalid_reward_terms_fail(words):
     def term(before, now, around):
         return WRONG_TERMS[words](before, now, around)
 
     refused(check_reward, term, words)
 
 
-def test_a_term_that_knows_batches_is_refused():
+def test_batched_terms_fail():
     def term(before, now, around):
         inside = jnp.ndim(now.speed_mps) == 0 and isinstance(now.speed_mps, jax.core.Tracer)
         return now.speed_mps if inside else now.speed_mps + 1.0
@@ -85,15 +85,17 @@ def test_a_term_that_knows_batches_is_refused():
 
 
 @pytest.mark.parametrize("name", some(METRICS, "own_terms:nearest_other"))
-def test_right_metrics(name):
+def test_valid_metrics_pass(name):
     check_metric(METRICS.get(name, name))
 
 
 def metric(read, reads=frozenset(), **more):
-    return Metric("m", "low", "a wrong one", of=StepValue("wrong", "m", read, reads), operator="max", **more)
+    return Metric(
+        "m", "low", "a wrong one", step_value=StepValue("wrong", "m", read, reads), operator="max", **more
+    )
 
 
-def test_wrong_metrics():
+def test_invalid_metrics_fail():
     refused(check_metric, metric(lambda m: (m.facts.speed_mps, True)), "'reads' does not name")
     refused(check_metric, metric(lambda m: (m.facts.speed_mps, True), frozenset({"speed"})), "is no fact")
     divided = metric(lambda m: (1.0 / m.facts.speed_mps, True), frozenset({"speed_mps"}))
@@ -101,17 +103,17 @@ def test_wrong_metrics():
     guarded = metric(lambda m: (1.0 / m.facts.speed_mps, m.facts.speed_mps > 0), frozenset({"speed_mps"}))
     check_metric(guarded)
     refused(
-        check_metric, metric(lambda m: (m.found.surroundings.frame.box[0, 0], True)), "turned and shifted"
+        check_metric, metric(lambda m: (m.situation.surroundings.frame.box[0, 0], True)), "turned and shifted"
     )
     refused(
         check_metric, Metric("m", "low", "text", compute=lambda e, v, k: v.value), "does not compute a Value"
     )
-    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or text")
+    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or definition")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["walkers", "goal"])
-def test_right_features(name):
+def test_valid_features_pass(name):
     check_feature(f"own_terms:{name}")
 
 
@@ -133,15 +135,15 @@ WRONG_FEATURES = {
 
 
 @pytest.mark.parametrize("words", some(WRONG_FEATURES, "the log's future changes"))
-def test_wrong_features(words):
-    def feature(bank, scene, frames):
-        return WRONG_FEATURES[words](bank, scene, frames)
+def test_invalid_features_fail(words):
+    def feature(bank, context, frames):
+        return WRONG_FEATURES[words](bank, context, frames)
 
     refused(check_feature, feature, words)
 
 
 @pytest.mark.slow
-def test_an_own_encoder():
+def test_custom_encoder_passes():
     check_encoder("own_terms:MeanConfig")
 
 
@@ -157,7 +159,7 @@ _TINY = {"width": 8, "heads": 2, "layers": 1}
         WayformerConfig(**_TINY, fusion="early", factorised=True), WayformerConfig(**_TINY, fusion="hierarchical"),
     ],
 )  # fmt: skip
-def test_our_encoders(config):
+def test_built_in_encoders_pass(config):
     check_encoder(config)
 
 
@@ -204,9 +206,9 @@ class WrongConfig:
         "nobody": "without any row is not finite", "gradient": "gradients that are not finite",
     }.items(),
 )  # fmt: skip
-def test_wrong_encoders(fault, words):
+def test_invalid_encoders_fail(fault, words):
     refused(check_encoder, WrongConfig(fault), words)
 
 
-def test_no_encoder_at_all():
+def test_objects_that_are_not_encoders_fail():
     refused(check_encoder, "own_terms:hurry", "has no build")

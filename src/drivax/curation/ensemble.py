@@ -30,8 +30,7 @@ from drivax.learning.sampler import draw, sampler
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.stats.clusters import recordings_of

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 
 from drivax.curation.kinematic import check_positive, crowding
 from drivax.curation.logged import Logged
-from drivax.geometry.angles import wrap
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, wrap
 from drivax.scenario.bank.queries import vertex_distances
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax.curation.logged import of_logs
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.store import ScenarioSet
 
 #: Scenarios that are scored side by side.

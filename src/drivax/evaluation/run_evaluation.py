@@ -10,11 +10,11 @@ from typing import Any
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.runner import evaluate
 from drivax.files import replace_folder
-from drivax.metrics.selection import selected
+from drivax.metrics.selection import select_metrics
 from drivax.planners.planner import Planner
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import Sizes
 from drivax.scenario.schema import CURRENT_STEP
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.catalogue import make_traffic

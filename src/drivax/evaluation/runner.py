@@ -24,12 +24,11 @@ from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Tr
 from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_out_of_memory
 from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
 from drivax.metrics.catalogue import METRICS, Metric
-from drivax.metrics.selection import catalogue
+from drivax.metrics.selection import metric_specs
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
-from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int16
 
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_X, AGENT_Y
+from drivax.scenario.bank.columns import AgentColumn
 
 #: Units of places (m) and headings (rad); int16 reaches 655 m from the origin of a scenario.
 _METRES, _RADIANS = 0.02, 1e-4
@@ -19,10 +19,10 @@ _ABSENT = -32768
 
 def packed(agents: Float[Array, "*batch A 8"]) -> Int16[Array, "*batch A 3"]:
     """Place and heading of traffic's rows; who is not there, or further from the origin than 650 m, is absent."""
-    place = agents[..., AGENT_X : AGENT_Y + 1]
-    heading = jnp.arctan2(agents[..., AGENT_SIN], agents[..., AGENT_COS])
+    place = agents[..., AgentColumn.XY]
+    heading = jnp.arctan2(agents[..., AgentColumn.SIN], agents[..., AgentColumn.COS])
     rows = jnp.concatenate([place / _METRES, heading[..., None] / _RADIANS], axis=-1)
-    there = (agents[..., AGENT_VALID] > 0) & (jnp.abs(place) < _REACH_M).all(axis=-1)
+    there = (agents[..., AgentColumn.VALID] > 0) & (jnp.abs(place) < _REACH_M).all(axis=-1)
     return jnp.where(there[..., None], jnp.round(rows), _ABSENT).astype(jnp.int16)
 
 

@@ -1,4 +1,4 @@
-"""Policies, values and critics: an encoder and a head each."""
+"""Policies, value functions and critics: an encoder and a head each."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from drivax.networks.entity import EntityConfig
 from drivax.networks.pooling import ACTIVATIONS, Activation
 from drivax.networks.transformers import LqConfig, LqhConfig, MtrConfig, WayformerConfig
 
-#: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or the
-#: dotted name of one's own.
+#: What ``encoder:`` can be; ``kind:`` in YAML is ``mlp``, ``lq``, ``lqh``, ``mtr``, ``wayformer``, ``entity``, or a
+#: dotted name.
 EncoderSettings = (
     MlpConfig | LqConfig | LqhConfig | MtrConfig | WayformerConfig | EntityConfig | EncoderConfig
 )
@@ -37,17 +37,17 @@ EncoderSettings = (
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Networks of an agent.
+    """Architecture of policy, value and critics.
 
     Attributes:
-        encoder: The encoder; policy, value and every critic have one each, but for ``shared_encoder``.
+        encoder: The encoder; policy, value and each critic have their own, unless ``shared_encoder``.
         head: Hidden layers between embedding and output.
-        activation: After every hidden layer of a head; outputs are linear.
+        activation: After each hidden layer of a head; outputs are linear.
         first_scale: Standard deviation of an untrained policy: before squashing (gaussian), of the action (beta), or
-            of the Gaussian whose density gives the levels their probabilities (grid).
-        distribution: Of actions: a squashed Gaussian, a mixture of three, a Beta, or a grid of levels, for ``discrete``
-            actions.
-        shared_encoder: Whether policy and value look through one encoder. Critics never share.
+            of the Gaussian whose density weights the levels (grid).
+        distribution: Action distribution: a squashed Gaussian, a mixture of three, a Beta, or a grid of levels for
+            ``discrete`` actions.
+        shared_encoder: Whether policy and value share one encoder. Critics never share.
     """
 
     encoder: EncoderSettings = field(default_factory=MlpConfig)
@@ -69,28 +69,28 @@ class _Head(nnx.Module):
         width = config.head[-1] if config.head else width
         self.out = nnx.Linear(width, out, kernel_init=nnx.initializers.orthogonal(scale), rngs=rngs)
 
-    def __call__(self, x: Array, beside: Array | None = None) -> Array:
-        """Of ``x``, or of ``x`` and what stands beside it, which may have leading axes that ``x`` lacks."""
-        if beside is not None and beside.shape[:-1] == x.shape[:-1]:
-            # Nothing is shared: one product is quicker than two.
-            x, beside = jnp.concatenate([x, beside], axis=-1), None
+    def __call__(self, x: Array, extra: Array | None = None) -> Array:
+        """Apply the head to ``x``, or to ``x`` and ``extra`` concatenated; ``extra`` may have further leading axes."""
+        if extra is not None and extra.shape[:-1] == x.shape[:-1]:
+            # Nothing is shared: one product is faster than two.
+            x, extra = jnp.concatenate([x, extra], axis=-1), None
         layers = [*self.hidden, self.out]
         for number, layer in enumerate(layers):
-            x = layer(x) if number or beside is None else _side_by_side(layer, x, beside)
+            x = layer(x) if number or extra is None else _concatenated(layer, x, extra)
             if number < len(self.hidden):
                 x = ACTIVATIONS[self.activation](x)
         return x
 
 
-def _side_by_side(layer: nnx.Linear, x: Array, beside: Array) -> Array:
-    """The layer of both, concatenated: what it makes of ``x`` is computed once for everything beside it."""
+def _concatenated(layer: nnx.Linear, x: Array, extra: Array) -> Array:
+    """Apply a layer to both, concatenated; the product with ``x`` is computed once for all of ``extra``."""
     kernel, bias = layer.kernel[...], 0.0 if layer.bias is None else layer.bias[...]
     width = x.shape[-1]
-    return x @ kernel[:width] + beside @ kernel[width:] + bias
+    return x @ kernel[:width] + extra @ kernel[width:] + bias
 
 
 class Policy(nnx.Module):
-    """Observation -> distribution over actions."""
+    """Map observations to action distributions."""
 
     def __init__(
         self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
@@ -102,17 +102,17 @@ class Policy(nnx.Module):
         self.head = _Head(config, self.encoder.width, parameters_of(self.kind, self.actions), 0.01, rngs)
 
     def __call__(self, groups: Groups) -> Distribution:
-        """The action distribution; around zero with the first standard deviation before training."""
+        """Return the action distribution; before training it is centred at zero with ``first_scale``."""
         return self.of(self.encoder(groups))
 
     def of(self, embedding: Float[Array, "*batch width"]) -> Distribution:
-        """The distribution for what the encoder makes of an observation."""
+        """Return the action distribution of an embedding."""
         first = first_parameters(self.kind, self.actions, self.first_scale)
         return distribution(self.kind, self.head(embedding) + first, self.actions)
 
 
 class Value(nnx.Module):
-    """Observation -> value."""
+    """Map observations to values."""
 
     def __init__(
         self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, encoder: Encoder | None = None
@@ -121,16 +121,16 @@ class Value(nnx.Module):
         self.head = _Head(config, self.encoder.width, 1, 1.0, rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch"]:
-        """Expected discounted return."""
+        """Return the expected discounted return."""
         return self.of(self.encoder(groups))
 
     def of(self, embedding: Float[Array, "*batch width"]) -> Float[Array, "*batch"]:
-        """The value for what the encoder makes of an observation."""
+        """Return the value of an embedding."""
         return self.head(embedding)[..., 0]
 
 
 class ActorCritic(nnx.Module):
-    """A policy and a value, with an encoder each or one for both."""
+    """A policy and a value function, with separate encoders or a shared one."""
 
     def __init__(
         self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
@@ -140,7 +140,7 @@ class ActorCritic(nnx.Module):
         self.value = Value(config, spec, rngs, self.policy.encoder if self.shared else None)
 
     def both(self, groups: Groups) -> tuple[Distribution, Float[Array, "*batch"]]:
-        """Action distribution and value; a shared encoder encodes once."""
+        """Return action distribution and value; a shared encoder runs once."""
         if not self.shared:
             return self.policy(groups), self.value(groups)
         embedding = self.policy.encoder(groups)
@@ -148,7 +148,7 @@ class ActorCritic(nnx.Module):
 
 
 class Critic(nnx.Module):
-    """Observation and action -> value of taking it, any real number: the output is linear."""
+    """Map observation and action to the action value; the output is linear."""
 
     def __init__(
         self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
@@ -158,15 +158,15 @@ class Critic(nnx.Module):
         self.head = _Head(config, width, 1, 1.0, rngs)
 
     def __call__(self, groups: Groups, action: Float[Array, "*actions D"]) -> Float[Array, "*actions"]:
-        """Expected discounted return of an action in [-1, 1].
+        """Return the expected discounted return of an action in [-1, 1].
 
-        Several actions of an observation stand in leading axes; it is encoded once.
+        Leading axes hold several actions per observation, which is encoded once.
         """
         return self.head(self.encoder(groups), action)[..., 0]
 
 
 class TwinCritic(nnx.Module):
-    """Two critics that share nothing, so that the smaller of their values is a cautious one."""
+    """Two critics without shared parameters (clipped double Q-learning)."""
 
     def __init__(
         self, config: NetworkConfig, spec: GroupSpec, rngs: nnx.Rngs, actions: Actions | None = None
@@ -174,5 +174,5 @@ class TwinCritic(nnx.Module):
         self.critics = nnx.List([Critic(config, spec, rngs, actions) for _ in range(2)])
 
     def __call__(self, groups: Groups, action: Float[Array, "*actions D"]) -> Float[Array, "2 *actions"]:
-        """Both values; see :class:`Critic` for several actions."""
+        """Return both values; see :class:`Critic` for several actions."""
         return jnp.stack([critic(groups, action) for critic in self.critics])

@@ -1,7 +1,6 @@
-"""Masked attention and the residual layers made of it (Vaswani et al. 2017, arXiv 1706.03762), normalised before.
+"""Masked attention and pre-norm residual layers (Vaswani et al. 2017, arXiv 1706.03762).
 
-Parameters are float32. With ``dtype`` bfloat16 the products of matrices are computed in it; softmax, norms and what
-layers add to are float32 all the same.
+Parameters are float32. ``dtype`` bfloat16 applies to matrix products; softmax, norms and residuals stay float32.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from jaxtyping import Array, Bool, Float
 
 Dtype = Literal["float32", "bfloat16"]
 
-#: Logit of what is masked: finite, so that a softmax over nothing else stays finite.
+#: Logit of masked tokens: finite, because a softmax over masked tokens alone must stay finite.
 _NOWHERE = -1e30
 
 
 class Attention(nnx.Module):
-    """Multi-head scaled dot-product attention. No biases, so that who has nothing to look at gets zeros.
+    """Multi-head scaled dot-product attention without biases: with all tokens masked the output is zero.
 
     Args:
-        width: Size of queries, tokens and results, a multiple of ``heads``.
+        width: Size of queries, tokens and outputs, a multiple of ``heads``.
         heads: Number of heads.
         rngs: For the parameters.
-        dtype: Of the products.
+        dtype: Type of the matrix products.
     """
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
@@ -45,9 +44,9 @@ class Attention(nnx.Module):
         tokens: Float[Array, "*batch k width"],
         mask: Bool[Array, "*batch k"] | None = None,
     ) -> Float[Array, "*batch q width"]:
-        """What every query finds among the tokens that are there (``mask``; None: all); float32.
+        """Return ``softmax(Q K^T / sqrt(width / heads)) V`` over the tokens in ``mask`` (None: all); float32.
 
-        Per head, ``softmax(Q K^T / sqrt(width / heads)) V``, and zeros where no token is there.
+        Zeros where no token is valid.
         """
         _, heads, size = self.query.shape
         if queries.shape[-2] * heads < self.query.shape[0]:
@@ -61,30 +60,28 @@ class Attention(nnx.Module):
         )
 
     def _few(self, queries: Array, tokens: Array, mask: Array | None) -> Array:
-        """The same for few queries: it takes keys to the queries and values to the results, never to every token.
+        """The same for few queries: keys are applied to queries and values to outputs, never to all tokens.
 
         ``(W_q x) . (W_k y) = (W_k^T W_q x) . y``, and the mean of ``W_v y`` is ``W_v`` times the mean of ``y``.
         """
         query = self._times("...qd,dhc->...qhc", queries, self.query) * self.query.shape[2] ** -0.5
-        asked = self._times("...qhc,dhc->...qhd", query, self.key)
-        weights = _weights(self._times("...qhd,...kd->...hqk", asked, tokens), mask)
-        found = self._times("...hqk,...kd->...qhd", weights, tokens)
-        return self._times(
-            "...qhc,hcd->...qd", self._times("...qhd,dhc->...qhc", found, self.value), self.out
-        )
+        projected = self._times("...qhc,dhc->...qhd", query, self.key)
+        weights = _weights(self._times("...qhd,...kd->...hqk", projected, tokens), mask)
+        mean = self._times("...hqk,...kd->...qhd", weights, tokens)
+        return self._times("...qhc,hcd->...qd", self._times("...qhd,dhc->...qhc", mean, self.value), self.out)
 
-    def _times(self, axes: str, one: Any, other: Any) -> Array:
-        def product(one: Array, other: Array) -> Array:
-            return jnp.einsum(axes, one, other, preferred_element_type=jnp.float32)
+    def _times(self, axes: str, left: Any, right: Any) -> Array:
+        def product(left: Array, right: Array) -> Array:
+            return jnp.einsum(axes, left, right, preferred_element_type=jnp.float32)
 
-        def rounded(one: Array, other: Array) -> Array:
-            return product(one.astype(jnp.float32), other.astype(jnp.float32))
+        def rounded(left: Array, right: Array) -> Array:
+            return product(left.astype(jnp.float32), right.astype(jnp.float32))
 
-        one, other = jnp.asarray(one[...], self.dtype), jnp.asarray(other[...], self.dtype)
+        left, right = jnp.asarray(left[...], self.dtype), jnp.asarray(right[...], self.dtype)
         if self.dtype == "float32":
-            return product(one, other)
-        # XLA for CPUs knows some products of bfloat16 only; those of the rounded numbers in float32 are the same.
-        return jax.lax.platform_dependent(one, other, cpu=rounded, default=product)
+            return product(left, right)
+        # XLA for CPUs lacks some bfloat16 products; float32 products of the rounded numbers are the same.
+        return jax.lax.platform_dependent(left, right, cpu=rounded, default=product)
 
 
 def _weights(
@@ -93,14 +90,14 @@ def _weights(
     if mask is None:
         return jax.nn.softmax(logits)
     there = mask[..., None, None, :]
-    # Where nobody is there the softmax is even over everyone; the second mask makes it zero.
+    # With all tokens masked the softmax is uniform; the second mask makes it zero.
     return jnp.where(there, jax.nn.softmax(jnp.where(there, logits, _NOWHERE)), 0.0)
 
 
 class Attend(nnx.Module):
-    """``x + attention(norm(x), tokens)``; the tokens are ``norm(x)`` itself where none are given.
+    """``x + attention(norm(x), tokens)``; self-attention without ``tokens``.
 
-    Given tokens are normalised already: their norm's scale is as good as part of the keys and values.
+    ``tokens`` are normalised already.
     """
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
@@ -113,7 +110,7 @@ class Attend(nnx.Module):
         tokens: Float[Array, "*batch k width"] | None = None,
         mask: Bool[Array, "*batch k"] | None = None,
     ) -> Float[Array, "*batch q width"]:
-        """``x`` and what it finds."""
+        """Return ``x`` plus the attention output."""
         normed = self.norm(x)
         return x + self.attention(normed, normed if tokens is None else tokens, mask)
 
@@ -127,12 +124,12 @@ class FeedForward(nnx.Module):
         self.narrow = nnx.Linear(4 * width, width, dtype=jnp.dtype(dtype), rngs=rngs)
 
     def __call__(self, x: Float[Array, "*batch width"]) -> Float[Array, "*batch width"]:
-        """``x`` and what two dense layers add."""
+        """Return ``x`` plus the output of two dense layers."""
         return x + self.narrow(jax.nn.gelu(self.wide(self.norm(x))))
 
 
 class SelfAttention(nnx.Module):
-    """A transformer layer: rows attend to each other, then each passes two dense layers."""
+    """A transformer layer: self-attention over rows, then two dense layers."""
 
     def __init__(self, width: int, heads: int, rngs: nnx.Rngs, dtype: Dtype = "float32") -> None:
         self.attend = Attend(width, heads, rngs, dtype)
@@ -141,13 +138,13 @@ class SelfAttention(nnx.Module):
     def __call__(
         self, x: Float[Array, "*batch rows width"], mask: Bool[Array, "*batch rows"] | None = None
     ) -> Float[Array, "*batch rows width"]:
-        """The rows after the layer; those that are not there mean nothing."""
+        """Return the rows after the layer; masked rows are undefined."""
         return self.feed_forward(self.attend(x, mask=mask))
 
 
 def masked_mean(
     rows: Float[Array, "*batch rows width"], mask: Bool[Array, "*batch rows"]
 ) -> Float[Array, "*batch width"]:
-    """The mean over the rows that are there; zeros without any."""
+    """Return the mean over valid rows; zeros without any."""
     total = jnp.sum(jnp.where(mask[..., None], rows, 0.0), axis=-2)
     return total / jnp.maximum(mask.sum(axis=-1, keepdims=True), 1)

@@ -1,4 +1,4 @@
-"""Encoders: from named groups with masks to one vector. They know arrays, not driving."""
+"""Encoders: from named groups with masks to one vector."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GroupSpec = Mapping[str, tuple[int, ...]]
 
 @runtime_checkable
 class Encoder(Protocol):
-    """An ``nnx.Module`` whose whole state are ``nnx.Param``: it is a function of its parameters and its input."""
+    """An ``nnx.Module`` whose state consists of ``nnx.Param`` only: a pure function of parameters and input."""
 
     @property
     def width(self) -> int:
@@ -29,28 +29,28 @@ class Encoder(Protocol):
         ...
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """The embedding of one observation or a batch; masked rows never matter."""
+        """Return the embedding of an observation or a batch; masked rows have no effect."""
         ...
 
 
 @runtime_checkable
 class EncoderConfig(Protocol):
-    """Settings of an encoder; own ones are frozen dataclasses, named in YAML as ``kind: package.module:Name``."""
+    """Settings of an encoder; yours is a frozen dataclass, in YAML ``kind: package.module:Name``."""
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> Encoder:
-        """An encoder of observations with these groups."""
+        """Return an encoder of observations with these groups."""
         ...
 
 
 @dataclass(frozen=True)
 class MlpConfig:
-    """All groups side by side through dense layers.
+    """Dense layers over all groups, concatenated.
 
     Attributes:
-        rows: Layers that the rows of each masked group share before a maximum over the rows, so that their order does
-            not matter; empty: the rows are flattened in their order.
-        hidden: Width of each layer behind; the last is the size of the embedding.
-        activation: After every layer.
+        rows: Layers shared by the rows of each masked group, before a maximum over rows (order-invariant); empty: rows
+            are flattened in order.
+        hidden: Width of each following layer; the last is the size of the embedding.
+        activation: After each layer.
     """
 
     kind: Literal["mlp"] = "mlp"
@@ -59,12 +59,12 @@ class MlpConfig:
     activation: Activation = "relu"
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MlpEncoder:
-        """The encoder with fresh parameters."""
+        """Return the encoder with fresh parameters."""
         return MlpEncoder(self, spec, rngs)
 
 
 class MlpEncoder(nnx.Module):
-    """Flattens or pools every group (masked rows never matter), then applies dense layers."""
+    """Flatten or pool each group (masked rows have no effect), then apply dense layers."""
 
     def __init__(self, config: MlpConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         self.pools = bool(config.rows)
@@ -75,9 +75,9 @@ class MlpEncoder(nnx.Module):
         for name in self.names:
             masked = f"{name}_mask" in spec
             if masked and self.pools:
-                # One row is what the mask's first axis counts; times of one row go side by side with their masks.
-                one = math.prod(spec[name][1:]) + math.prod(spec[f"{name}_mask"][1:])
-                shared[name] = dense_layers(one, config.rows, rngs)
+                # A row is what the mask's first axis counts; its times are concatenated with their masks.
+                row_width = math.prod(spec[name][1:]) + math.prod(spec[f"{name}_mask"][1:])
+                shared[name] = dense_layers(row_width, config.rows, rngs)
                 width += config.rows[-1]
             else:
                 width += math.prod(spec[name]) + (math.prod(spec[f"{name}_mask"]) if masked else 0)
@@ -103,12 +103,12 @@ class MlpEncoder(nnx.Module):
         rows = self.shapes[name][0]
         there = mask.reshape(*lead, rows, -1)
         row = jnp.concatenate([value.reshape(*lead, rows, -1), there.astype(jnp.float32)], axis=-1)
-        # A row counts when any of its times does; no row at all embeds as zero.
+        # A row counts when any of its times does; without rows the embedding is zero.
         return largest(self.activation, _weights(self.shared[name]), row, there.any(axis=-1))
 
 
 def dense_layers(width: int, sizes: tuple[int, ...], rngs: nnx.Rngs) -> Any:
-    """Dense layers of these sizes, with orthogonal weights for what follows relu or tanh."""
+    """Return dense layers of these sizes, with orthogonal weights scaled for relu or tanh."""
     layers = []
     for size in sizes:
         layers.append(nnx.Linear(width, size, kernel_init=nnx.initializers.orthogonal(2**0.5), rngs=rngs))
@@ -121,18 +121,18 @@ def _weights(layers: Any) -> Layers:
 
 
 def group_spec(observation: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Shapes of the groups of one (unbatched) observation."""
+    """Return the shapes of the groups of one (unbatched) observation."""
     return {name: tuple(value.shape) for name, value in observation.items()}
 
 
 def group_names(spec: GroupSpec) -> tuple[str, ...]:
-    """The groups that are no mask of another, in alphabetical order, but for those that hold nothing (no rows).
+    """Return the non-empty groups that are not masks, in alphabetical order.
 
     Raises:
-        UsageError: There is none.
+        UsageError: All groups are empty.
     """
     groups = (n for n in spec if not (n.endswith("_mask") and n.removesuffix("_mask") in spec))
     names = tuple(sorted(name for name in groups if math.prod(spec[name])))
     if not names:
-        raise UsageError("there is nothing to encode: every group is empty", cure="observe at least one row")
+        raise UsageError("nothing to encode: all groups are empty", cure="observe at least one row")
     return names

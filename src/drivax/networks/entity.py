@@ -1,9 +1,9 @@
-"""The attention encoder of the long-tail study: the ego asks the things around it, once."""
+"""The attention encoder of the long-tail study: the ego attends once to its surroundings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from flax import nnx
@@ -11,26 +11,25 @@ from jaxtyping import Array, Float
 
 from drivax.networks.attention import Attention, Dtype, masked_mean
 from drivax.networks.encoders import Groups, GroupSpec
-from drivax.networks.tokens import Form, forms, raw_rows, side_by_side
+from drivax.networks.tokens import Form, concatenate_groups, forms, raw_rows
 
 #: Parts of the embedding, in its order.
-_PARTS = ("ego", "others", "goal", "beside")
+_PARTS = ("ego", "others", "goal", "context")
 
 
 @dataclass(frozen=True)
 class EntityConfig:
-    """Every row, its times side by side, becomes an entity by one layer with relu; the ego and its goal ask the others.
+    """Embed each row with one relu layer; the ego and its goal attend to the other rows.
 
-    Groups are told apart by their masks, and by name where the study treats them differently; names that an
-    observation lacks are passed over.
+    Groups are distinguished by their masks, and by name in ``goal`` and ``context``; missing names are ignored.
 
     Attributes:
         size: ``published``: width 64; ``small``: 32; 4 heads either way.
-        width: Of an entity, a multiple of ``heads``; the embedding is several entities wide.
-        heads: Of the attention.
-        goal: Groups whose mean joins what asks.
-        beside: Groups whose mean stands beside what was found.
-        dtype: Of the attention's products; the rest is float32.
+        width: Width of a row, a multiple of ``heads``; the embedding concatenates several.
+        heads: Number of attention heads.
+        goal: Groups whose mean is added to the query.
+        context: Groups whose mean is appended to the embedding.
+        dtype: Type of the attention's matrix products; the rest is float32.
     """
 
     kind: Literal["entity"] = "entity"
@@ -38,25 +37,28 @@ class EntityConfig:
     width: int | None = None
     heads: int = 4
     goal: tuple[str, ...] = ("route",)
-    beside: tuple[str, ...] = ("lights",)
+    context: tuple[str, ...] = ("lights",)
     dtype: Dtype = "float32"
+
+    #: Keys of version 0.1.
+    renamed: ClassVar[dict[str, str]] = {"beside": "context"}
 
     def __post_init__(self) -> None:
         if self.heads < 1 or self.entity_width < 1 or self.entity_width % self.heads:
-            raise ValueError(f"width {self.entity_width} is no multiple of {self.heads} heads")
+            raise ValueError(f"width {self.entity_width} is not a multiple of {self.heads} heads")
 
     @property
     def entity_width(self) -> int:
-        """The width, as given or by ``size``."""
+        """Width of a row, from ``width`` or ``size``."""
         return self.width if self.width is not None else {"published": 64, "small": 32}[self.size]
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> EntityEncoder:
-        """The encoder with fresh parameters."""
+        """Return the encoder with fresh parameters."""
         return EntityEncoder(self, spec, rngs)
 
 
 class EntityEncoder(nnx.Module):
-    """``[ego, attention(ego + goal, others), goal, beside]``, without the parts that there are no groups for."""
+    """``[ego, attention(ego + goal, others), goal, context]``, without parts that have no groups."""
 
     def __init__(self, config: EntityConfig, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         width = config.entity_width
@@ -71,20 +73,22 @@ class EntityEncoder(nnx.Module):
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """The embedding of one observation or a batch; float32."""
+        """Return the embedding of an observation or a batch; float32."""
         rows = {
-            part: side_by_side([self._entities(groups, n) for n, its in self.parts.items() if its == part])
+            part: concatenate_groups(
+                [self._entities(groups, n) for n, its in self.parts.items() if its == part]
+            )
             for part in self.order
         }
-        found = {part: masked_mean(*rows[part]) for part in self.order}
-        if "others" in found:
-            asks = sum((found[part] for part in ("ego", "goal") if part in found), jnp.zeros(()))
-            asks = jnp.broadcast_to(asks, found["others"].shape)[..., None, :]
-            found["others"] = self.norm(self.attention(asks, *rows["others"])[..., 0, :])
-        return jnp.concatenate([found[part] for part in self.order], axis=-1)
+        means = {part: masked_mean(*rows[part]) for part in self.order}
+        if "others" in means:
+            query = sum((means[part] for part in ("ego", "goal") if part in means), jnp.zeros(()))
+            query = jnp.broadcast_to(query, means["others"].shape)[..., None, :]
+            means["others"] = self.norm(self.attention(query, *rows["others"])[..., 0, :])
+        return jnp.concatenate([means[part] for part in self.order], axis=-1)
 
     def _entities(self, groups: Groups, name: str) -> tuple[Array, Array]:
-        """One entity for every row, and whether any of its times is there."""
+        """Return an embedding per row, and whether any of its times is valid."""
         value, mask = raw_rows(groups, name, self.forms[name])
         lead = value.shape[:-2]
         numbers = [value.reshape(*lead, -1)]
@@ -94,13 +98,13 @@ class EntityEncoder(nnx.Module):
 
 
 def _numbers(form: Form) -> int:
-    """Numbers in a row: of all its times, and, of a series, which of them are there."""
+    """Return the width of a row: its features at all times, and the mask of a series."""
     return form.times * form.features + (form.times if form.series else 0)
 
 
 def _part(config: EntityConfig, name: str, form: Form) -> str:
     if name in config.goal:
         return "goal"
-    if name in config.beside:
-        return "beside"
+    if name in config.context:
+        return "context"
     return "others" if form.masked else "ego"

@@ -1,4 +1,4 @@
-"""Features of zero mean and unit deviation in front of any encoder."""
+"""Normalisation of features to zero mean and unit deviation before any encoder."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from drivax.networks.encoders import Encoder, EncoderConfig, Groups, GroupSpec, 
 #: Mean and standard deviation of each feature, by group.
 Statistics = Mapping[str, tuple[Float[Array, " F"], Float[Array, " F"]]]
 
-#: A feature that hardly varies is not blown up.
+#: Lower bound of deviations: a nearly constant feature is not amplified.
 _LEAST = 1e-3
-#: Normalised features are clipped there, in deviations.
+#: Normalised features are clipped at this many deviations.
 _FAR = 10.0
 
 
 def feature_statistics(groups: Groups) -> dict[str, tuple[Float[Array, " F"], Float[Array, " F"]]]:
-    """Mean and standard deviation of every feature of every group, over all rows that are there.
+    """Return mean and standard deviation of each feature of each group, over all valid rows.
 
-    A feature is the same number in whatever row it stands, so that neither the order of rows nor padding matters:
-    masked rows have no part. Without any row, 0 and 1.
+    Rows share their statistics, so that neither order nor padding matters. Without valid rows, 0 and 1.
 
     Args:
         groups: Observations, with any leading axes; features are the last axis, masks are ``<name>_mask``.
@@ -39,14 +38,14 @@ def _of_group(value: Array, mask: Array | None) -> tuple[Array, Array]:
     counts = jnp.ones(len(rows)) if mask is None else mask.reshape(-1).astype(jnp.float32)
     share = (counts / jnp.maximum(counts.sum(), 1.0))[:, None]
     mean = jnp.sum(jnp.where(share > 0, rows, 0.0) * share, axis=0)
-    # Of what is left, not of squares: differences of large squares lose all digits.
+    # Of the residuals, not of squares: differences of large squares cancel.
     variance = jnp.sum(jnp.where(share > 0, rows - mean, 0.0) ** 2 * share, axis=0)
     return mean, jnp.where(counts.sum() > 0, jnp.sqrt(variance), 1.0)
 
 
 @dataclass(frozen=True)
 class NormalisedConfig:
-    """An encoder behind normalisation.
+    """An encoder of normalised features.
 
     Attributes:
         encoder: The encoder.
@@ -55,12 +54,12 @@ class NormalisedConfig:
     encoder: EncoderConfig
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> NormalisedEncoder:
-        """The encoder with fresh parameters, which normalises nothing until it is told statistics."""
+        """Return the encoder with fresh parameters; it normalises nothing until statistics are set."""
         return NormalisedEncoder(self.encoder.build(spec, rngs), spec)
 
 
 class NormalisedEncoder(nnx.Module):
-    """Shifts and scales features, then encodes. Statistics are parameters that no gradient reaches."""
+    """Shift and scale features, then encode. Statistics are parameters without gradients."""
 
     def __init__(self, encoder: Encoder, spec: GroupSpec) -> None:
         self.encoder = encoder
@@ -69,14 +68,14 @@ class NormalisedEncoder(nnx.Module):
         self.mean = nnx.Dict({name: nnx.Param(jnp.zeros(size)) for name, size in sizes.items()})
         self.deviation = nnx.Dict({name: nnx.Param(jnp.ones(size)) for name, size in sizes.items()})
 
-    def tell(self, statistics: Statistics) -> None:
-        """Takes statistics over."""
+    def set_statistics(self, statistics: Statistics) -> None:
+        """Set the statistics."""
         for name, (mean, deviation) in statistics.items():
             self.mean[name][...] = mean
             self.deviation[name][...] = deviation
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """Encodes one observation or a batch of them."""
+        """Return the embedding of an observation or a batch."""
         return self.encoder(dict(groups) | {name: self._scaled(name, groups[name]) for name in self.mean})
 
     def _scaled(self, name: str, value: Array) -> Array:
@@ -84,8 +83,8 @@ class NormalisedEncoder(nnx.Module):
         return jnp.clip((value - mean) / jnp.maximum(deviation, _LEAST), -_FAR, _FAR)
 
 
-def tell_statistics(network: nnx.Module, statistics: Statistics) -> None:
-    """Tells them to every normalised encoder of a network."""
+def set_statistics(network: nnx.Module, statistics: Statistics) -> None:
+    """Set the statistics of all normalised encoders of a network."""
     for _, part in nnx.iter_graph(network):
         if isinstance(part, NormalisedEncoder):
-            part.tell(statistics)
+            part.set_statistics(statistics)

@@ -1,8 +1,7 @@
-"""The largest of what a set of rows is embedded as, with a cheap backward pass.
+"""Maximum over a set of embedded rows, with a cheap backward pass.
 
-The gradient of a maximum concerns one row of each number of the result. Differentiated as it stands, a maximum over
-200 rows takes the gradient of all of them through every layer, zeros for the most part; here only the rows that won
-are embedded again, one number each, where that is less work. Of equal rows the first wins.
+The gradient of a maximum concerns one row per output. Plain differentiation takes the gradients of all rows, mostly
+zeros, through all layers; here only the maximal rows are embedded again, where that is less work. Ties: the first row.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Layers = Sequence[tuple[Float[Array, "_ _"], Float[Array, " _"]]]
 def dense(
     activation: Activation, layers: Layers, x: Float[Array, "*batch inputs"]
 ) -> Float[Array, "*batch outputs"]:
-    """Dense layers with an activation after each."""
+    """Apply dense layers with an activation after each."""
     for kernel, bias in layers:
         x = ACTIVATIONS[activation](x @ kernel + bias)
     return x
@@ -37,23 +36,23 @@ def largest(
     rows: Float[Array, "*batch row inputs"],
     there: Bool[Array, "*batch row"],
 ) -> Float[Array, "*batch outputs"]:
-    """The largest of zero and of the rows that are there, each after the layers."""
+    """Return the maximum of zero and the valid rows after the layers."""
     if only_winners(rows.shape[-2], [rows.shape[-1], *(bias.shape[0] for _, bias in layers)]):
         return _of_layers(activation, tuple(layers), rows, there)
     return _of_rows(dense(activation, layers, rows), there)
 
 
 def only_winners(rows: int, sizes: Sequence[int]) -> bool:
-    """Whether it is less work to differentiate the rows that won, one for each number of the result.
+    """Whether it is less work to differentiate the maximal rows only, one per output.
 
-    A backward pass takes two products for each layer and row. Of a winner, what it embeds as is computed once more,
-    which makes three, and of the last layer one number only.
+    A backward pass takes two products per layer and row. A maximal row is embedded again, which makes three, with one
+    output of the last layer.
 
     Args:
-        rows: How many there are.
-        sizes: Of a row and after each layer.
+        rows: Number of rows.
+        sizes: Width of a row and of each layer.
     """
-    products = [one * other for one, other in pairwise(sizes)]
+    products = [inputs * outputs for inputs, outputs in pairwise(sizes)]
     return 3 * sizes[-1] * (sum(products[:-1]) + sizes[-2]) < 2 * rows * sum(products)
 
 
@@ -99,7 +98,7 @@ def _of_layers_backward(activation: Activation, kept: Any, gradient: Array) -> t
     layers, rows, winner, counts = kept
 
     def again(layers: Layers, rows: Array) -> Array:
-        """Of the row that won a number, that number."""
+        """Return each output from the row that attains it."""
         won = dense(activation, layers[:-1], jnp.take_along_axis(rows, winner[..., None], axis=-2))
         kernel, bias = layers[-1]
         return ACTIVATIONS[activation](jnp.sum(won * kernel.T, axis=-1) + bias)
@@ -112,8 +111,8 @@ _of_layers.defvjp(_of_layers_forward, _of_layers_backward)
 
 
 def _winners(embedded: Array, there: Array) -> tuple[Array, Array, Array]:
-    """The largest, which row it is, and whether that is there and above zero, so that its gradient counts."""
-    # What is not there is never above zero, and so never counts.
+    """Return the maximum, its row, and whether it is above zero, so that it has a gradient."""
+    # Invalid rows are never above zero.
     candidates = jnp.where(there[..., None], embedded, 0.0)
-    found = jnp.max(candidates, axis=-2)
-    return jnp.maximum(found, 0.0), jnp.argmax(candidates, axis=-2), found > 0.0
+    maximum = jnp.max(candidates, axis=-2)
+    return jnp.maximum(maximum, 0.0), jnp.argmax(candidates, axis=-2), maximum > 0.0

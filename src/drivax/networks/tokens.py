@@ -1,8 +1,8 @@
-"""Groups of an observation as rows of tokens, by their shapes alone.
+"""Observation groups as rows of tokens, by their shapes.
 
-A group with a mask is a set of rows; axes behind the rows are times, in order. A group without a mask is one row that
-is always there, with its times in order. So agents ``[rows, time, F]`` are a set of series, the points of a route
-``[rows, F]`` a set (their features say where they lie), and the ego's history ``[time, F]`` is one series.
+A group with a mask is a set of rows; further axes are times, in order. A group without a mask is one valid row with its
+times in order. Agents ``[rows, time, F]`` are a set of series, route points ``[rows, F]`` a set, and the ego's history
+``[time, F]`` is one series.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from drivax.networks.encoders import Groups, GroupSpec, dense_layers, group_name
 
 @dataclass(frozen=True)
 class Form:
-    """What a group is.
+    """Shape of a group.
 
     Attributes:
-        shape: Its own axes, features last.
+        shape: Axes of one observation, features last.
         masked: Whether it has a mask.
     """
 
@@ -34,44 +34,44 @@ class Form:
 
     @property
     def features(self) -> int:
-        """Numbers in one token."""
+        """Width of a token."""
         return self.shape[-1]
 
     @property
     def rows(self) -> int:
-        """How many rows may be there."""
+        """Number of rows."""
         return self.shape[0] if self.masked else 1
 
     @property
     def series(self) -> bool:
-        """Whether there is an axis of times, even with one time only."""
+        """Whether there is a time axis, possibly of length 1."""
         return len(self.shape) > (2 if self.masked else 1)
 
     @property
     def times(self) -> int:
-        """Tokens of a row."""
+        """Number of tokens of a row."""
         return math.prod(self.shape[:-1]) // self.rows
 
 
 class Rows(NamedTuple):
-    """Rows of tokens, and which of these are there."""
+    """Rows of tokens and their mask."""
 
     value: Float[Array, "*batch rows time width"]
     mask: Bool[Array, "*batch rows time"]
 
     def flat(self) -> tuple[Float[Array, "*batch tokens width"], Bool[Array, "*batch tokens"]]:
-        """All tokens side by side."""
+        """Return all tokens along one axis."""
         *lead, rows, times, width = self.value.shape
         return self.value.reshape(*lead, rows * times, width), self.mask.reshape(*lead, rows * times)
 
 
 def forms(spec: GroupSpec) -> dict[str, Form]:
-    """What every group is."""
+    """Return the shape of each group."""
     return {name: Form(tuple(spec[name]), f"{name}_mask" in spec) for name in group_names(spec)}
 
 
 def raw_rows(groups: Groups, name: str, form: Form) -> Rows:
-    """A group's features as rows of times; those that are not there are zero."""
+    """Return a group's features as rows of times; masked ones are zero."""
     value = groups[name].astype(jnp.float32)
     axes = (*value.shape[: value.ndim - len(form.shape)], form.rows, form.times)
     value = value.reshape(*axes, form.features)
@@ -80,17 +80,16 @@ def raw_rows(groups: Groups, name: str, form: Form) -> Rows:
 
 
 def time_code(times: int, width: int) -> Float[np.ndarray, "time width"]:
-    """Sines and cosines of the time counted back from the last one, which is 0 (Vaswani et al. 2017, section 3.5)."""
+    """Return the sinusoidal encoding of time, counted back from the last step (Vaswani et al. 2017, section 3.5)."""
     back = np.arange(times - 1, -1, -1)[:, None]
     angle = back / 10_000 ** (2 * np.arange((width + 1) // 2) / width)
     return np.stack([np.sin(angle), np.cos(angle)], axis=-1).reshape(times, -1)[:, :width].astype(np.float32)
 
 
 class Embedding(nnx.Module):
-    """Features -> normalised tokens: dense layers of each group's own, plus a code of the time where there is one.
+    """Map features to normalised tokens: dense layers per group, plus a time encoding for series.
 
-    Features are embedded in float32, whatever the encoder computes in: eight bits would move a point 50 m away by
-    20 cm.
+    Features are embedded in float32: in bfloat16 a point 50 m away would move by 20 cm.
     """
 
     def __init__(
@@ -106,7 +105,7 @@ class Embedding(nnx.Module):
         self.width = width
 
     def __call__(self, groups: Groups) -> dict[str, Rows]:
-        """The tokens of every group, by its name."""
+        """Return the tokens of each group by name."""
         return {name: self._rows(groups, name) for name in self.forms}
 
     def _rows(self, groups: Groups, name: str) -> Rows:
@@ -120,6 +119,6 @@ class Embedding(nnx.Module):
         return Rows(self.norms[name](x).astype(self.dtype), mask)
 
 
-def side_by_side(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Tokens and masks of several groups as one."""
+def concatenate_groups(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Concatenate tokens and masks of several groups."""
     return jnp.concatenate([x for x, _ in parts], axis=-2), jnp.concatenate([m for _, m in parts], axis=-1)

@@ -1,7 +1,6 @@
 """Attention encoders over groups with masks: latent queries (``lq``, ``lqh``, ``wayformer``) and ``mtr``.
 
-Layers normalise before they act (pre-norm) and rows that are not there are never looked at. See
-``docs/algorithms/encoders.md``.
+Layers are pre-norm; masked rows have no effect. See ``docs/algorithms/encoders.md``.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from drivax.networks.attention import Attend, Dtype, FeedForward, SelfAttention, masked_mean
 from drivax.networks.encoders import Groups, GroupSpec
-from drivax.networks.tokens import Embedding, Rows, forms, side_by_side
+from drivax.networks.tokens import Embedding, Rows, concatenate_groups, forms
 
 
 @dataclass(frozen=True)
@@ -38,17 +37,17 @@ SIZES = {
 
 @dataclass(frozen=True)
 class TransformerConfig:
-    """What all transformers have. Sizes that are not given are those of ``size``.
+    """Settings of all transformers. Missing sizes come from ``size``.
 
     Attributes:
         kind: Which encoder.
         size: ``published`` (width 256, 8 heads, 4 layers, 16 latents, linear embedding) or ``small`` (64, 4, 2, 8, one
             hidden layer of 64).
-        width: Of tokens and of the encoder's result; a multiple of ``heads``.
-        heads: Of every attention.
+        width: Width of tokens and of the embedding; a multiple of ``heads``.
+        heads: Number of attention heads.
         layers: Depth.
-        embedding: Hidden layers, with relu, between a row's features and its token; empty: a linear map.
-        dtype: Of the products of matrices; parameters, softmax and norms are float32.
+        embedding: Hidden relu layers between features and tokens; empty: a linear map.
+        dtype: Type of matrix products; parameters, softmax and norms are float32.
     """
 
     kind: str = ""
@@ -65,12 +64,12 @@ class TransformerConfig:
         if min(counts) < 1:
             raise ValueError(f"sizes of the encoder are {counts}; use at least 1")
         if sizes.width % sizes.heads:
-            raise ValueError(f"width {sizes.width} is no multiple of {sizes.heads} heads")
+            raise ValueError(f"width {sizes.width} is not a multiple of {sizes.heads} heads")
 
     @property
     def sizes(self) -> Sizes:
-        """The sizes, none left open."""
-        given = {one.name: getattr(self, one.name, None) for one in fields(Sizes)}
+        """All sizes, with those of ``size`` where none is set."""
+        given = {field.name: getattr(self, field.name, None) for field in fields(Sizes)}
         return replace(
             SIZES[self.size], **{name: value for name, value in given.items() if value is not None}
         )
@@ -81,7 +80,7 @@ class LatentConfig(TransformerConfig):
     """A transformer with latent queries.
 
     Attributes:
-        latents: How many.
+        latents: Number of latent queries.
     """
 
     latents: int | None = None
@@ -89,40 +88,40 @@ class LatentConfig(TransformerConfig):
 
 @dataclass(frozen=True)
 class LqConfig(LatentConfig):
-    """Latent queries (Perceiver; Jaegle et al. 2021, arXiv 2103.03206): latents look at all tokens in every layer."""
+    """Latent queries (Perceiver; Jaegle et al. 2021, arXiv 2103.03206): latents attend to all tokens in each layer."""
 
     kind: Literal["lq"] = "lq"
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
-        """The encoder with fresh parameters."""
+        """Return the encoder with fresh parameters."""
         return LatentEncoder(self.sizes, Fusion(0, self.sizes.layers, again=True), spec, rngs)
 
 
 @dataclass(frozen=True)
 class LqhConfig(LatentConfig):
-    """Latent queries per group, then latent queries over all of theirs.
+    """Latent queries per group, then latent queries over those of all groups.
 
     Attributes:
-        local_layers: Depth per group; ``layers`` is that of what joins them.
+        local_layers: Depth per group; ``layers`` is the depth over all groups.
     """
 
     kind: Literal["lqh"] = "lqh"
     local_layers: int = 1
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
-        """The encoder with fresh parameters."""
+        """Return the encoder with fresh parameters."""
         fusion = Fusion(max(self.local_layers, 1), self.sizes.layers, again=True)
         return LatentEncoder(self.sizes, fusion, spec, rngs)
 
 
 @dataclass(frozen=True)
 class WayformerConfig(LatentConfig):
-    """Wayformer (Nayakanti et al. 2022, arXiv 2207.05844): latents look once, then at each other.
+    """Wayformer (Nayakanti et al. 2022, arXiv 2207.05844): cross-attention once, then self-attention.
 
     Attributes:
-        fusion: ``early``: one encoder over all tokens; ``late``: one per group, whose latents are averaged;
-            ``hierarchical``: one layer per group, then ``layers`` over all their latents.
-        factorised: Whether tokens attend to each other first: times of a row, then rows of a time, within each group.
+        fusion: ``early``: one encoder over all tokens; ``late``: one per group, latents averaged; ``hierarchical``: one
+            layer per group, then ``layers`` over all latents.
+        factorised: Whether each group's tokens first attend over times, then over rows.
     """
 
     kind: Literal["wayformer"] = "wayformer"
@@ -130,7 +129,7 @@ class WayformerConfig(LatentConfig):
     factorised: bool = False
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> LatentEncoder:
-        """The encoder with fresh parameters."""
+        """Return the encoder with fresh parameters."""
         layers = self.sizes.layers
         local, whole = {"early": (0, layers), "late": (layers, 0), "hierarchical": (1, layers)}[self.fusion]
         fusion = Fusion(local, whole, again=False, factorised=self.factorised)
@@ -139,28 +138,28 @@ class WayformerConfig(LatentConfig):
 
 @dataclass(frozen=True)
 class MtrConfig(TransformerConfig):
-    """After the Motion Transformer (Shi et al. 2022, arXiv 2209.13508).
+    """An encoder after the Motion Transformer (Shi et al. 2022, arXiv 2209.13508).
 
-    Every mover attends to its own times, then in each layer to the other movers and to the map. Movers are the series
-    and whatever has no mask; the map are the other groups.
+    Each mover attends to its own times, then in each layer to the other movers and to the map. Movers are series and
+    groups without a mask; the map is all other groups.
     """
 
     kind: Literal["mtr"] = "mtr"
 
     def build(self, spec: GroupSpec, rngs: nnx.Rngs) -> MtrEncoder:
-        """The encoder with fresh parameters."""
+        """Return the encoder with fresh parameters."""
         return MtrEncoder(self.sizes, spec, rngs)
 
 
 @dataclass(frozen=True)
 class Fusion:
-    """How latent queries come together.
+    """How latent queries of groups are combined.
 
     Attributes:
-        local: Layers of latents that each group has for itself; 0: none.
-        whole: Layers of latents over everything so far; 0: none.
-        again: Whether latents look at the tokens before every layer, or before the first only.
-        factorised: Whether tokens of a group attend to each other first, over times, then over rows.
+        local: Layers of latents per group; 0: none.
+        whole: Layers of latents over all groups; 0: none.
+        again: Whether latents attend to the tokens before each layer, or before the first only.
+        factorised: Whether tokens of a group first attend over times, then over rows.
     """
 
     local: int
@@ -170,7 +169,7 @@ class Fusion:
 
 
 class _Latents(nnx.Module):
-    """Learned queries that look at tokens and at each other."""
+    """Learned queries with cross-attention to tokens and self-attention."""
 
     def __init__(self, sizes: Sizes, layers: int, again: bool, rngs: nnx.Rngs) -> None:
         width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
@@ -207,7 +206,7 @@ class _Factorised(nnx.Module):
 
 
 class LatentEncoder(nnx.Module):
-    """Latent queries over each group, over everything, or over both one after the other; their mean."""
+    """Mean of latent queries over each group, over all groups, or over both in turn."""
 
     def __init__(self, sizes: Sizes, fusion: Fusion, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         self.width = sizes.width
@@ -222,7 +221,7 @@ class LatentEncoder(nnx.Module):
         )
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """The embedding of one observation or a batch; float32."""
+        """Return the embedding of an observation or a batch; float32."""
         parts = []
         for name, rows in self.embedding(groups).items():
             x, mask = (self.before[name](rows) if name in self.before else rows).flat()
@@ -230,14 +229,14 @@ class LatentEncoder(nnx.Module):
                 x = self.local[name](x, mask)
                 mask = jnp.ones(x.shape[:-1], bool)
             parts.append((x, mask))
-        x, mask = side_by_side(parts)
+        x, mask = concatenate_groups(parts)
         for latents in self.whole:
             x = latents(x, mask)
         return jnp.mean(x.astype(jnp.float32), axis=-2)
 
 
 class MtrEncoder(nnx.Module):
-    """Times of each mover, then movers and map; the mean of the movers that have no mask (the ego)."""
+    """Attention over the times of each mover, then over movers and map; mean of the movers without a mask (ego)."""
 
     def __init__(self, sizes: Sizes, spec: GroupSpec, rngs: nnx.Rngs) -> None:
         width, heads, dtype = sizes.width, sizes.heads, sizes.dtype
@@ -245,7 +244,7 @@ class MtrEncoder(nnx.Module):
         self.embedding = Embedding(spec, width, sizes.embedding, rngs, dtype)
         kinds = forms(spec)
         movers = tuple(name for name, form in kinds.items() if form.series or not form.masked)
-        # Where nothing moves, all rows are on a par.
+        # Without movers, all rows count as movers.
         self.movers = movers or tuple(kinds)
         self.map = tuple(name for name in kinds if name not in self.movers)
         self.own = tuple(name for name in self.movers if not kinds[name].masked)
@@ -258,23 +257,23 @@ class MtrEncoder(nnx.Module):
         self.norm = nnx.LayerNorm(width, rngs=rngs)
 
     def __call__(self, groups: Groups) -> Float[Array, "*batch width"]:
-        """The embedding of one observation or a batch; float32."""
+        """Return the embedding of an observation or a batch; float32."""
         tokens = self.embedding(groups)
         movers = {name: self._mover(name, tokens[name]) for name in self.movers}
-        x, mask = side_by_side(list(movers.values()))
-        around = side_by_side([tokens[name].flat() for name in self.map]) if self.map else None
+        x, mask = concatenate_groups(list(movers.values()))
+        around = concatenate_groups([tokens[name].flat() for name in self.map]) if self.map else None
         for number, layer in enumerate(self.feed_forward):
             x = self.among[number](x, mask=mask)
             if around is not None:
                 x = self.around[number](x, *around)
             x = layer(x)
-        asked = [
+        queried = [
             m if name in self.own or not self.own else jnp.zeros_like(m) for name, (_, m) in movers.items()
         ]
-        return masked_mean(self.norm(x), jnp.concatenate(asked, axis=-1))
+        return masked_mean(self.norm(x), jnp.concatenate(queried, axis=-1))
 
     def _mover(self, name: str, rows: Rows) -> tuple[Array, Array]:
-        """One token for every row: the mean over its times after they attended to each other."""
+        """Return one token per row: the mean over its times after self-attention."""
         if not self.embedding.forms[name].series:
             return rows.flat()
         return masked_mean(self.time(rows.value, rows.mask), rows.mask), rows.mask.any(axis=-1)

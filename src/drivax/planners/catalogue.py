@@ -11,7 +11,7 @@ from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.search import SearchPlanner
 from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
-from drivax.plugins import find_named, is_dotted, refuse_arguments
+from drivax.plugins import check_arguments, find_named, is_dotted
 
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "expert": Expert,
@@ -53,7 +53,7 @@ def as_planner(thing: Any, name: str) -> Planner:
         return thing
     if callable(thing):
         try:
-            refuse_arguments(thing, name, ())
+            check_arguments(thing, name, ())
         except ValueError as error:
             cure = "put @drivax.python_planner or @drivax.jax_planner above a function that drives"
             raise UsageError(str(error), cure=cure) from None

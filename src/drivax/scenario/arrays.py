@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.errors import UsageError
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind, Scenario
 
 Array = np.ndarray[Any, Any]
 
@@ -85,6 +86,28 @@ def recording_from_arrays(
         flags=Flag.NONE if "velocity" in agents else Flag.DIFFERENTIATED_VELOCITY,
         tags={"source_format": "arrays"},
     )
+
+
+def scenario_from_arrays(
+    scenario_id: str,
+    agents: Mapping[str, Any],
+    roads: Mapping[str, Any],
+    lights: Sequence[Mapping[str, Any]] = (),
+    route: Sequence[int] = (),
+    ego: int = 0,
+    dt_s: float = DT_S,
+    dataset: str = "own",
+) -> Scenario:
+    """Return a scenario from plain arrays of at most 91 steps; step 10 is the current one.
+
+    Takes the arguments of :func:`recording_from_arrays`; cut longer recordings with
+    :func:`drivax.scenario.recording.windows`.
+
+    Raises:
+        UsageError: An argument is missing, misspelt, or has another shape.
+        DataError: The data make no scenario (the ego is not valid at the current step, a number is not finite).
+    """
+    return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
 
 
 def _check_step(dt_s: float) -> None:

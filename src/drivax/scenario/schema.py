@@ -11,7 +11,6 @@ This module needs numpy only, so that worker processes that convert data never i
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any
@@ -304,32 +303,6 @@ class Scenario:
     overflow: dict[str, int] = field(default_factory=dict)
     audit: dict[str, float | int | bool | None] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def from_arrays(
-        cls,
-        scenario_id: str,
-        agents: Mapping[str, Any],
-        roads: Mapping[str, Any],
-        lights: Sequence[Mapping[str, Any]] = (),
-        route: Sequence[int] = (),
-        ego: int = 0,
-        dt_s: float = DT_S,
-        dataset: str = "own",
-    ) -> Scenario:
-        """A scenario from plain arrays of at most 91 steps, the current one being number 10.
-
-        The arguments are those of :func:`drivax.scenario.arrays.recording_from_arrays`; cut what it makes of longer
-        data with :func:`drivax.scenario.build.assemble.windows` (docs/data/own-data.md).
-
-        Raises:
-            UsageError: An argument is missing, misspelt, or has another shape.
-            DataError: The data make no scenario (the ego is not valid at the current step, a number is not finite).
-        """
-        from drivax.scenario.arrays import recording_from_arrays
-        from drivax.scenario.build.assemble import assemble
-
-        return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in _OWN_FIELDS:

@@ -1,11 +1,10 @@
-"""Configuration records: frozen dataclasses <-> YAML <-> command-line overrides.
+"""Configuration records: frozen dataclasses to and from YAML, with command-line overrides.
 
 A configuration record holds scalars, strings, literals, paths, tuples, other records, and unions of records, which
-carry a ``kind`` key in YAML (:func:`kind_of`). What a section leaves out keeps the default of the record that holds
-the section; in a record that has presets (a class method ``preset(name)``) the key ``preset`` names one to start from
-instead, and a dumped record holds what came of it. Nothing is guessed: an unknown key or a value of the wrong type is a
-:class:`~drivax.errors.UsageError` that names the dotted path and, where there is one, the nearest valid name. YAML is
-read by the 1.2 core rules, so ``3e-4`` is a number and ``no`` is a word.
+carry a ``kind`` key in YAML (:func:`kind_of`). Missing keys keep the defaults of the enclosing record. In a record with
+presets (a class method ``preset(name)``) the key ``preset`` names one to start from. An unknown key or a value of the
+wrong type is a :class:`~drivax.errors.UsageError` with the dotted path and the closest valid name. YAML follows the 1.2
+core rules: ``3e-4`` is a number and ``no`` is a string. A class variable ``renamed`` maps former keys to present ones.
 """
 
 from __future__ import annotations
@@ -24,23 +23,23 @@ Record = TypeVar("Record")
 
 
 def load(cls: type[Record], source: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> Record:
-    """A configuration record from YAML and command-line overrides.
+    """Return a configuration record from YAML and command-line overrides.
 
     Args:
         cls: The dataclass to build; keys that ``source`` lacks take its defaults.
         source: A YAML file, the name of a preset, or a mapping.
         overrides: ``["--optimizer.lr", "1e-3", "--resume"]`` or ``["--optimizer.lr=1e-3"]``; hyphens in names
-            count as underscores. Choosing another ``kind`` drops the settings of the former one.
+            count as underscores. Another ``kind`` drops the settings of the previous one.
 
     Raises:
-        UsageError: No such file or preset, damaged YAML, an unknown key, or a value of the wrong type.
+        UsageError: File or preset not found, invalid YAML, unknown key, or a value of the wrong type.
     """
     file = None if isinstance(source, Mapping) else _find(source)
     values = parse_yaml(_read(file), file) if file else source
     if values is None:
         values = {}
     if not isinstance(values, Mapping):
-        raise UsageError("is not a mapping of settings", file=file, cure="write 'name: value' lines")
+        raise UsageError("not a mapping of settings", file=file, cure="write 'name: value' lines")
     values = _override(_copy(values), overrides)
     try:
         return structure(values, cls)
@@ -49,24 +48,24 @@ def load(cls: type[Record], source: str | Path | Mapping[str, Any], overrides: S
 
 
 def dump(record: Any) -> str:
-    """YAML text of a record, defaults included; ``load(type(record), parse_yaml(dump(record))) == record``."""
+    """Return a record as YAML, defaults included; ``load(type(record), parse_yaml(dump(record))) == record``."""
     return write_yaml(plain(record))
 
 
 def preset(name: str) -> Path:
-    """The packaged configuration file ``configs/<name>.yaml``.
+    """Return the path of the packaged configuration file ``configs/<name>.yaml``.
 
     Raises:
-        UsageError: There is none of that name.
+        UsageError: Unknown name.
     """
     names = presets()
     if name not in names:
-        raise UsageError(f"there is no preset or file {name!r}", cure=did_you_mean(name, names))
+        raise UsageError(f"no preset or file {name!r}", cure=did_you_mean(name, names))
     return _configs() / f"{name}.yaml"
 
 
 def presets() -> list[str]:
-    """Names of all presets (sub-folders with a slash)."""
+    """Return the names of all presets, relative to ``configs``."""
     folder = _configs()
     return sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.yaml"))
 
@@ -74,7 +73,7 @@ def presets() -> list[str]:
 def _configs() -> Path:
     package = Path(__file__).resolve().parent.parent
     packaged = package / "configs"
-    # A checkout keeps them at its root; a wheel inside the package.
+    # At the root of a checkout, inside the package of a wheel.
     return packaged if packaged.is_dir() else package.parent.parent / "configs"
 
 
@@ -82,14 +81,14 @@ def _find(source: str | Path) -> Path:
     path = Path(source)
     if path.is_file():
         return path
-    # A folder may bear the name of a preset (`drivax demo` writes one called demo).
+    # A folder may have the name of a preset: `drivax demo` writes one called demo.
     if path.is_dir() and source not in presets():
         raise UsageError(
-            "is a folder, not a configuration file", file=path, cure="name a .yaml file or a preset"
+            "not a configuration file but a folder", file=path, cure="name a .yaml file or a preset"
         )
     if isinstance(source, Path) or path.suffix in (".yaml", ".yml"):
         raise UsageError(
-            "does not exist", file=path, cure=f"name a file or a preset ({', '.join(presets())})"
+            "file not found", file=path, cure=f"name a file or a preset ({', '.join(presets())})"
         )
     return preset(source)
 
@@ -98,7 +97,7 @@ def _read(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise UsageError("is not text", file=file, cure="name a YAML file") from error
+        raise UsageError("not a text file", file=file, cure="name a YAML file") from error
 
 
 def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -108,7 +107,7 @@ def _override(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any
         for name in parents:
             inner = place.get(name)
             if not isinstance(inner, dict):
-                # A record that is left out, null or given by a flag starts from its defaults.
+                # A record that is missing, null or set by a flag starts from its defaults.
                 inner = place[name] = {}
             place = inner
         if last == "kind" and str(place.get("kind")) != text:
@@ -123,7 +122,7 @@ def _pairs(overrides: Sequence[str]) -> list[tuple[list[str], str]]:
     while rest:
         flag = rest.pop(0)
         if not flag.startswith("--") or flag == "--":
-            raise UsageError(f"{flag!r} is no setting", cure="write --section.key value")
+            raise UsageError(f"{flag!r} is not a setting", cure="write --section.key value")
         name, sign, text = flag[2:].partition("=")
         if not sign:
             text = rest.pop(0) if rest and not rest[0].startswith("--") else "true"

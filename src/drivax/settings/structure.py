@@ -1,4 +1,4 @@
-"""Plain values -> configuration records and back, strictly, with the dotted path of what is wrong."""
+"""Plain values to configuration records and back; errors name the dotted path of the wrong value."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from cattrs.errors import ClassValidationError, ForbiddenExtraKeysError, Iterabl
 from cattrs.gen import make_dict_structure_fn
 
 from drivax.errors import DrivaxError, UsageError, did_you_mean
-from drivax.plugins import dotted_name, find_named, is_dotted, refuse_arguments, refuse_missing
+from drivax.plugins import check_arguments, check_protocol, dotted_name, find_named, is_dotted
 from drivax.settings.text import parse_yaml
 
 _UNIONS = (Union, types.UnionType)
 
 
 class _Problem(ValueError):
-    """What is wrong with a value, and where inside it."""
+    """A wrong value and its path inside the enclosing one."""
 
     def __init__(self, problem: str, path: str) -> None:
         super().__init__(problem)
@@ -32,16 +32,16 @@ class _Problem(ValueError):
 
 
 class Flag(str):
-    """The text of a command-line value: what it means depends on the type of the setting."""
+    """The text of a command-line value, parsed by the type of its setting."""
 
     __slots__ = ()
 
 
 def structure(values: Any, cls: Any) -> Any:
-    """An instance of ``cls`` from plain values.
+    """Return an instance of ``cls`` from plain values.
 
     Raises:
-        ValueError: ``path: problem; cure`` of the first thing that is wrong.
+        ValueError: ``path: problem; cure`` of the first wrong value.
     """
     try:
         return _converter().structure(values, cls)
@@ -51,12 +51,12 @@ def structure(values: Any, cls: Any) -> Any:
 
 
 def plain(record: Any) -> Any:
-    """A record as mappings, lists and scalars; members of unions carry ``kind``."""
+    """Return a record as mappings, lists and scalars; members of unions carry ``kind``."""
     return _plain(record, type(record))
 
 
 def kind_of(cls: type) -> str:
-    """What ``kind:`` says for a record in a union: the default of its field ``kind``, else its name in snake_case."""
+    """Return the ``kind:`` of a record in a union: the default of its field ``kind``, else its name in snake_case."""
     for field in dataclasses.fields(cls):
         if field.name == "kind":
             return str(field.default)
@@ -72,8 +72,8 @@ def _value(value: Any) -> Any:
         raise _refuse(value, "a value that YAML can read") from error
 
 
-def _refuse(value: Any, wanted: str) -> ValueError:
-    return ValueError(f"{str(value) if isinstance(value, Flag) else value!r} is not {wanted}")
+def _refuse(value: Any, expected: str) -> ValueError:
+    return ValueError(f"{str(value) if isinstance(value, Flag) else value!r} is not {expected}")
 
 
 def _to_bool(value: Any, _: Any) -> bool:
@@ -120,7 +120,7 @@ def _to_literal(value: Any, cls: Any) -> Any:
             if type(option) in (type(candidate), Flag) and option == candidate:
                 return candidate
     near = did_you_mean(str(value), [str(option) for option in allowed])
-    raise ValueError(f"{str(value)!r} is none of {', '.join(map(str, allowed))}; {near}")
+    raise ValueError(f"{str(value)!r} is not one of {', '.join(map(str, allowed))}; {near}")
 
 
 def _to_tuple(value: Any, cls: Any) -> tuple[Any, ...]:
@@ -163,7 +163,7 @@ def _to_union(value: Any, cls: Any) -> Any:
                 if member is not type(None):
                     problems.append(_first_problem(error, "")[0])
     if records:
-        raise ValueError(f"{value!r} is no section with a kind ({', '.join(records)})")
+        raise ValueError(f"{value!r} is not a section with a kind ({', '.join(records)})")
     raise ValueError(" and ".join(problems))
 
 
@@ -172,33 +172,37 @@ def _kind(value: Any) -> Any:
 
 
 def _to_own(value: Any, cls: Any) -> Any:
-    """Something of the user's own: a dotted name, or a section whose kind is one.
+    """Return the user's own object: a dotted name, or a section whose kind is one.
 
-    A record class is built from the rest of the section; anything else is taken as it is found.
+    A dataclass is built from the rest of the section; any other object is used as it is.
     """
     value = _value(value)
     name = _kind(value)
     if not isinstance(name, str):
-        raise ValueError(f"{value!r} is no dotted name (package.module:name) and no section with such a kind")
-    found = find_named(name)
-    if _is_record(found):
-        rest = {key: one for key, one in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
-        found = _converter().structure(rest, found)
+        raise ValueError(
+            f"{value!r} is neither a dotted name (package.module:name) nor a section with such a kind"
+        )
+    thing = find_named(name)
+    if _is_record(thing):
+        rest = (
+            {key: item for key, item in value.items() if key != "kind"} if isinstance(value, Mapping) else {}
+        )
+        thing = _converter().structure(rest, thing)
     elif isinstance(value, Mapping) and len(value) > 1:
-        raise ValueError(f"{name!r} has no settings; make it a frozen dataclass that has")
+        raise ValueError(f"{name!r} takes no settings; make it a frozen dataclass")
     if _is_protocol(cls):
-        refuse_missing(found, name, cls)
-        return found
-    if not callable(found):
-        raise ValueError(f"{name!r} cannot be called; name a function")
+        check_protocol(thing, name, cls)
+        return thing
+    if not callable(thing):
+        raise ValueError(f"{name!r} is not callable; name a function")
     arguments = get_args(cls)[0] if get_args(cls) else ...
     if arguments is not ...:
-        refuse_arguments(found, name, tuple(arguments))
-    return found
+        check_arguments(thing, name, tuple(arguments))
+    return thing
 
 
 def _specific(member: Any) -> int:
-    """Text takes anything a flag can say, so it is tried last, and numbers go from narrow to wide."""
+    """Return the order in which members of a union are tried: numbers from narrow to wide, text last."""
     order = (type(None), bool, int, float)
     return order.index(member) if member in order else len(order) + (member is str)
 
@@ -210,7 +214,7 @@ def _to_record_of_kind(value: dict[str, Any], records: dict[str, Any]) -> Any:
         raise ValueError(f"has no kind; use one of {', '.join(records)}")
     kind = str(value["kind"])
     if kind not in records:
-        raise ValueError(f"there is no kind {kind!r}; {did_you_mean(kind, list(records))}")
+        raise ValueError(f"unknown kind {kind!r}; {did_you_mean(kind, list(records))}")
     if "kind" not in {field.name for field in dataclasses.fields(records[kind])}:
         del value["kind"]
     return _converter().structure(value, records[kind])
@@ -224,14 +228,16 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
     def hook(value: Any, _: Any) -> Any:
         value = {} if value is None else _value(value)
         if is_dotted(value):
-            found = find_named(value)
-            if not isinstance(found, cls):
-                raise ValueError(f"{value!r} is no {cls.__name__}")
-            return found
+            record = find_named(value)
+            if not isinstance(record, cls):
+                raise ValueError(f"{value!r} is not a {cls.__name__}")
+            return record
         if not isinstance(value, Mapping):
             raise _refuse(
                 value, f"a section of settings ({', '.join(f.name for f in dataclasses.fields(cls))})"
             )
+        renamed = getattr(cls, "renamed", {})
+        value = {renamed.get(key, key): item for key, item in value.items()}
         if _names_preset(cls, value):
             base = cls.preset(str(value["preset"]))
             rest = {name: given for name, given in value.items() if name != "preset"}
@@ -242,7 +248,7 @@ def _record_hook(cls: Any, converter: cattrs.BaseConverter) -> Any:
 
 
 def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """``given`` with nested sections completed from the defaults of this record, not from those of their own."""
+    """Return ``given`` with nested sections completed from the defaults of this record, not from their own."""
     result = dict(given)
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
@@ -258,7 +264,7 @@ def _on_defaults(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _names_preset(cls: Any, given: Mapping[str, Any]) -> bool:
-    """Whether a section says from which preset of its record it starts: ``cls.preset(name)`` is one."""
+    """Whether a section starts from a preset of its record, ``cls.preset(name)``."""
     named = {field.name for field in dataclasses.fields(cls)}
     return "preset" in given and "preset" not in named and callable(getattr(cls, "preset", None))
 
@@ -289,7 +295,7 @@ def _is_callable(cls: Any) -> bool:
 
 
 def _is_open(cls: Any) -> bool:
-    """Whether users may put something of their own here."""
+    """Whether the type accepts the user's own object."""
     return _is_protocol(cls) or _is_callable(cls)
 
 
@@ -308,11 +314,11 @@ def _converter() -> cattrs.Converter:
 
 
 def _first_problem(error: BaseException, path: str) -> tuple[str, str]:
-    """The first thing that is wrong inside a cattrs error, and its dotted path."""
+    """Return the first problem inside a cattrs error and its dotted path."""
     if isinstance(error, ForbiddenExtraKeysError):
         names = [field.name for field in dataclasses.fields(error.cl)]
         unknown = sorted(error.extra_fields)[0]
-        return f"there is no such setting; {did_you_mean(unknown, names)}", _join(path, unknown)
+        return f"unknown setting; {did_you_mean(unknown, names)}", _join(path, unknown)
     if isinstance(error, ClassValidationError | IterableValidationError):
         noted, plain_errors = error.group_exceptions()
         if noted:

@@ -1,4 +1,4 @@
-"""YAML by the 1.2 core rules: ``3e-4`` is a number, ``no`` is a word, ``010`` is ten, and no key comes twice."""
+"""YAML by the 1.2 core rules: ``3e-4`` is a number, ``no`` a string, ``010`` ten; duplicate keys are errors."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from drivax.errors import UsageError
 
 
 def parse_yaml(text: str, file: Path | None = None) -> Any:
-    """Plain values of a YAML text; a key that appears twice is an error.
+    """Return the plain values of a YAML text.
 
     Raises:
-        UsageError: The text is not YAML; names the line.
+        UsageError: Invalid YAML or a duplicate key, with the line.
     """
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        problem = getattr(error, "problem", None) or "cannot be read"
+        problem = getattr(error, "problem", None) or "invalid"
         place = "YAML" if mark is None else f"line {mark.line + 1}"
-        raise UsageError(f"{place}: {problem}", file=file, cure="correct it") from error
+        raise UsageError(f"{place}: {problem}", file=file, cure="fix the file") from error
 
 
 def write_yaml(values: Any) -> str:
-    """YAML text of mappings, lists and scalars; what :func:`parse_yaml` reads back as the same values."""
+    """Return mappings, lists and scalars as YAML; :func:`parse_yaml` is the inverse."""
     return yaml.dump(
         values, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True
     )
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2 core scalars, and no key twice."""
+    """Reads YAML 1.2 core scalars and refuses duplicate keys."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
@@ -42,7 +42,7 @@ class _Loader(yaml.SafeLoader):
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, str):
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is not a word", key_node.start_mark
+                    None, None, f"the key {key!r} is not a string", key_node.start_mark
                 )
             if key in seen:
                 raise yaml.constructor.ConstructorError(
@@ -53,7 +53,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what the loader would read as something else."""
+    """Quotes strings that the loader would read as other types."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -10,8 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.angles import rotate, wrap
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, rotate, wrap
 from drivax.scenario.schema import DT_S
 
 #: Grip limit |curvature| v^2, m/s2.

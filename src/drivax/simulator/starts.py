@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import (
     OFFROAD_TOLERANCE_M,
     around_lanes,
@@ -23,11 +24,11 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
     project_on_route,
 )
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.traffic.log import alone, frame_of, logged_history
-from drivax.simulator.types import HISTORY, MOTION_SPEED, Scene
+from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext
 
 #: What 1 means for acceleration (m/s2) and curvature (1/m) in the published description, which is in action units.
 _ACCELERATION, _CURVATURE = 6.0, 0.3
@@ -107,7 +108,9 @@ class NoisyStart:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
         # Only steps at which the log has the agent can be driven anew.
         back = jnp.arange(1, self.steps + 1)
-        known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AGENT_VALID] > 0) & (back <= step)
+        known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0) & (
+            back <= step
+        )
         count = jnp.cumprod(known.astype(jnp.int32)).sum()
         base = logged_history(bank, index, step - count, slot)
 
@@ -159,10 +162,10 @@ def _acceptable(
     history: Float[Array, "16 4"],
 ) -> Bool[Array, ""]:
     """Whether an agent with this history touches none of the others and is on the road at ``step``."""
-    zero, z = jnp.zeros(()), bank.agents[index, step, slot, AGENT_Z]
-    scene = Scene(index, step, slot, history, jnp.zeros(2), zero, z, ())
-    frame = frame_of(bank, index, step, agents, alone(scene), 0)
-    box, ground = frame.box[slot], z - bank.agent_box[index, slot, 2] / 2
+    zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
+    context = AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, ())
+    frame = frame_of(bank, index, step, agents, alone(context), 0)
+    box, ground = frame.box[slot], z - bank.height_m(index, slot) / 2
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near
     beyond = offroad_distance(bank, index, box[:2], points, near, ground).max()

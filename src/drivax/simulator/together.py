@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.types import SimState
 
@@ -24,10 +25,10 @@ def slots_of(
         count: K, the size of the stack; further agents of the mask are left to traffic.
         step: Step at which they begin.
     """
-    there = mask & (bank.agents[index, step, :, AGENT_VALID] > 0)
+    there = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
     return jnp.nonzero(there, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
 
 
 def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:
     """Which states of a stack belong to an agent; the others fill it up."""
-    return states.scene.slot < bank.agents.shape[2]
+    return states.context.slot < bank.agents.shape[2]

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.signal import lfilter
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import LENGTH, WIDTH, corners, passage
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 

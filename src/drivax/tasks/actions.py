@@ -1,8 +1,8 @@
-"""Action spaces: what a policy's action means, how it moves the agent, and which action follows a log.
+"""Action spaces: meaning and bounds of actions, the dynamics that they drive, and expert actions.
 
-Three drive the kinematic bicycle by acceleration and curvature: :class:`Physical` (default), :class:`Published` and
-:class:`Discrete`. :class:`DeltaLocal` displaces the agent, :class:`DirectState` puts it somewhere. Actions lie in
-[-1, 1] in every dimension and zero means zero, :class:`DirectState` aside.
+:class:`Physical` (default), :class:`Published` and :class:`Discrete` drive the kinematic bicycle by acceleration and
+curvature. :class:`DeltaLocal` displaces the agent, :class:`DirectState` sets its state. Except for
+:class:`DirectState`, actions are in [-1, 1] and zero means zero.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
 
 #: Wheelbase as a share of the length, for steering angles (semantics, ``published``).
 _WHEELBASE = 0.6
-#: An action may be this far outside [-1, 1], by rounding, without being clipped.
+#: Tolerance of rounding outside [-1, 1].
 _ROUNDING = 1e-4
 
 
@@ -30,10 +30,10 @@ class Physical:
     """Acceleration and curvature of the bicycle.
 
     Attributes:
-        braking_mps2, acceleration_mps2: What -1 and +1 mean for the first action.
-        steering: What 1 means for the second action: curvature, 1/m.
-        jerk_mps3: Largest change of the acceleration per second; none by default.
-        steering_rate: Largest change of the second action's quantity per second, 1/m/s; none by default.
+        braking_mps2, acceleration_mps2: Accelerations at -1 and +1 of the first action.
+        steering: Curvature at 1 of the second action, 1/m.
+        jerk_mps3: Largest change of the acceleration per second; unlimited by default.
+        steering_rate: Largest change of the curvature per second, 1/m/s; unlimited by default.
     """
 
     braking_mps2: float = 6.0
@@ -44,11 +44,11 @@ class Physical:
 
     @property
     def size(self) -> int:
-        """Numbers in an action."""
+        """Dimension of an action."""
         return 2
 
     def command(self, action: Float[Array, " 2"], length_m: Any) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Acceleration (m/s2) and curvature (1/m) of an action; actions beyond [-1, 1] are clipped."""
+        """Return acceleration (m/s2) and curvature (1/m) of an action, clipped to [-1, 1]."""
         acceleration, steering = self._quantities(jnp.clip(action, -1.0, 1.0))
         return acceleration, self._curvature(steering, length_m)
 
@@ -56,7 +56,7 @@ class Physical:
         self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
         length_m: Any,
     ) -> Float[Array, " 2"]:  # fmt: skip
-        """The action that commands this; not clipped, so that what lies outside [-1, 1] can be seen."""
+        """Return the action of an acceleration and a curvature, not clipped."""
         return self._action(acceleration, self._steering(curvature, length_m))
 
     def expert(
@@ -66,20 +66,19 @@ class Physical:
         beyond: Float[Array, " 4"],
         length_m: Any,
     ) -> Float[Array, " 2"]:
-        """The action that follows a log, given its motions one and two steps ahead; not clipped."""
+        """Return the action that follows the log, from its motions one and two steps ahead; not clipped."""
         return self.action(motion, *follow(motion, target, beyond), length_m)
 
     def clipped(self, action: Float[Array, " 2"]) -> Bool[Array, ""]:
-        """Whether an action lies outside the bounds, so that driving it would do something else."""
+        """Whether an action is outside the bounds."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any()
 
     def actuated(
         self, motion: Float[Array, " 4"], action: Float[Array, " 2"], last: Float[Array, " 2"]
     ) -> Float[Array, " 2"]:
-        """What is carried out when ``action`` is asked for and ``last`` was carried out a step ago.
+        """Return the executed action, given the one executed a step ago.
 
-        Clips to the bounds and to the actuators' rates. A car that stands has let go of its last braking: its
-        acceleration is zero, whatever the brake was asked for.
+        Clips to the bounds and the actuator rates. At standstill the last acceleration counts as at least zero.
         """
         action = jnp.clip(action, -1.0, 1.0)
         if self.jerk_mps3 is None and self.steering_rate is None:
@@ -97,15 +96,15 @@ class Physical:
     def move(
         self, motion: Float[Array, " 4"], action: Float[Array, " 2"], length_m: Any
     ) -> Float[Array, " 4"]:
-        """The motion one step later."""
+        """Return the motion one step later."""
         return bicycle(motion, *self.command(action, length_m))
 
     def sharpest(self, length_m: Any) -> Any:
-        """The largest curvature that can be asked for, 1/m."""
+        """Return the largest curvature, 1/m."""
         return self._curvature(jnp.asarray(self.steering), length_m)
 
     def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 2"]:
-        """What counts as the last action when an episode begins: none, or what the actuators did in the log."""
+        """Return the last action at the start of an episode: zero, or that of the log if actuator rates are limited."""
         if self.jerk_mps3 is None and self.steering_rate is None:
             return jnp.zeros(2)
         command = command_between(history[-2], history[-1])
@@ -131,10 +130,10 @@ class Published(Physical):
     """Acceleration and steering angle, as published: k = tan(angle) / (0.6 length).
 
     Attributes:
-        braking_mps2, acceleration_mps2: What -1 and +1 mean for the first action.
-        steering: What 1 means for the second action: steering angle, rad.
-        jerk_mps3: Largest change of the acceleration per second; none by default.
-        steering_rate: Largest change of the steering angle per second, rad/s; none by default.
+        braking_mps2, acceleration_mps2: Accelerations at -1 and +1 of the first action.
+        steering: Steering angle at 1 of the second action, rad.
+        jerk_mps3: Largest change of the acceleration per second; unlimited by default.
+        steering_rate: Largest change of the steering angle per second, rad/s; unlimited by default.
     """
 
     braking_mps2: float = 4.0
@@ -149,13 +148,13 @@ class Published(Physical):
 
 @dataclass(frozen=True)
 class Discrete(Physical):
-    """``physical``, of which only some levels can be chosen: the nearest one is carried out.
+    """``physical`` with discrete levels: the nearest level is executed.
 
     Level i of n, counted from the middle, is ``sign(i) (|i| / ((n - 1) / 2)) ** density`` of the bound.
 
     Attributes:
-        accelerations, curvatures: Number of levels of either action; odd, so that zero is one of them.
-        density: How much denser levels lie near zero; 1 is evenly spaced.
+        accelerations, curvatures: Number of levels of each action; odd, to include zero.
+        density: Exponent by which levels are denser near zero; 1 is evenly spaced.
     """
 
     accelerations: int = 7
@@ -173,20 +172,20 @@ class Discrete(Physical):
 
     @property
     def choices(self) -> int:
-        """Number of different actions."""
+        """Number of actions."""
         return self.accelerations * self.curvatures
 
     def levels(self) -> tuple[Float[Array, " A"], Float[Array, " C"]]:
-        """The levels of both actions in [-1, 1], ascending."""
+        """Return the levels of both actions in [-1, 1], ascending."""
         return _levels(self.accelerations, self.density), _levels(self.curvatures, self.density)
 
     def of_index(self, index: Int[Array, ""]) -> Float[Array, " 2"]:
-        """The action of choice ``index``: acceleration level ``index // curvatures``, curvature level the rest."""
+        """Return action number ``index``: acceleration level ``index // curvatures``, curvature level the remainder."""
         accelerations, curvatures = self.levels()
         return jnp.stack([accelerations[index // self.curvatures], curvatures[index % self.curvatures]])
 
     def index(self, action: Float[Array, " 2"]) -> Int[Array, ""]:
-        """The choice nearest to an action."""
+        """Return the number of the nearest action."""
         accelerations, curvatures = self.levels()
         row = jnp.argmin(jnp.abs(accelerations - action[0]))
         return row * self.curvatures + jnp.argmin(jnp.abs(curvatures - action[1]))
@@ -194,7 +193,7 @@ class Discrete(Physical):
     def actuated(
         self, motion: Float[Array, " 4"], action: Float[Array, " 2"], last: Float[Array, " 2"]
     ) -> Float[Array, " 2"]:
-        """The nearest level, then as :class:`Physical`."""
+        """Return the nearest level, limited as in :class:`Physical`."""
         return super().actuated(motion, self.of_index(self.index(action)), last)
 
 
@@ -205,11 +204,11 @@ def _levels(count: int, density: float) -> Float[Array, " count"]:
 
 @dataclass(frozen=True)
 class DeltaLocal:
-    """A displacement in the agent's own frame: ahead, left, turn. Never backwards; without grip.
+    """Displacement in the agent's frame: ahead, left, turn. Never backwards; without grip limit.
 
     Attributes:
-        ahead_m, left_m: What 1 means for the first two actions.
-        turn_rad: What 1 means for the third.
+        ahead_m, left_m: Displacements at 1 of the first two actions.
+        turn_rad: Turn at 1 of the third.
     """
 
     ahead_m: float = 6.0
@@ -218,14 +217,14 @@ class DeltaLocal:
 
     @property
     def size(self) -> int:
-        """Numbers in an action."""
+        """Dimension of an action."""
         return 3
 
     def action(
         self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
         length_m: Any,
     ) -> Float[Array, " 3"]:  # fmt: skip
-        """The displacement along an arc after which the speed is what the acceleration makes of it; not clipped."""
+        """Return the displacement along an arc of this curvature at the accelerated speed; not clipped."""
         distance = jnp.maximum(motion[3] + acceleration * DT_S, 0.0) * DT_S
         turn = curvature * distance
         return self._action(distance * jnp.stack([jnp.cos(turn / 2), jnp.sin(turn / 2)]), turn)
@@ -237,34 +236,34 @@ class DeltaLocal:
         beyond: Float[Array, " 4"],
         length_m: Any,
     ) -> Float[Array, " 3"]:
-        """The displacement to the logged motion one step ahead; not clipped."""
+        """Return the displacement to the logged motion one step ahead; not clipped."""
         return self._action(*displacement(motion, target))
 
     def clipped(self, action: Float[Array, " 3"]) -> Bool[Array, ""]:
-        """Whether an action lies outside the bounds, or leads backwards by more than a millimetre."""
+        """Whether an action is outside the bounds or moves backwards by more than a millimetre."""
         return (jnp.abs(action) > 1.0 + _ROUNDING).any() | (action[0] * self.ahead_m < -1e-3)
 
     def actuated(
         self, motion: Float[Array, " 4"], action: Float[Array, " 3"], last: Float[Array, " 3"]
     ) -> Float[Array, " 3"]:
-        """The action within its bounds."""
+        """Return the action clipped to its bounds."""
         return jnp.clip(action, jnp.array([0.0, -1.0, -1.0]), 1.0)
 
     def move(
         self, motion: Float[Array, " 4"], action: Float[Array, " 3"], length_m: Any
     ) -> Float[Array, " 4"]:
-        """The motion one step later."""
+        """Return the motion one step later."""
         action = self.actuated(motion, action, action)
         return displace(
             motion, action[:2] * jnp.array([self.ahead_m, self.left_m]), action[2] * self.turn_rad
         )
 
     def sharpest(self, length_m: Any) -> Any:
-        """The largest curvature that can be asked for: any, 1/m."""
+        """Return the largest curvature: unlimited, 1/m."""
         return jnp.inf
 
     def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 3"]:
-        """Nothing."""
+        """Return zeros."""
         return jnp.zeros(3)
 
     def _action(self, shift: Float[Array, " 2"], turn: Float[Array, ""]) -> Float[Array, " 3"]:
@@ -273,21 +272,21 @@ class DeltaLocal:
 
 @dataclass(frozen=True)
 class DirectState:
-    """The next motion itself, in the scenario's frame: x, y (m), heading (rad), speed (m/s, negative counts as 0).
+    """The next motion in the scenario's frame: x, y (m), heading (rad), speed (m/s, negative counts as 0).
 
-    For drivers that have computed a trajectory and for optimising one; policies do not learn in it.
+    For planners that output trajectories and for trajectory optimisation; not for learning.
     """
 
     @property
     def size(self) -> int:
-        """Numbers in an action."""
+        """Dimension of an action."""
         return 4
 
     def action(
         self, motion: Float[Array, " 4"], acceleration: Float[Array, ""], curvature: Float[Array, ""],
         length_m: Any,
     ) -> Float[Array, " 4"]:  # fmt: skip
-        """Where the bicycle would get to."""
+        """Return the motion of the bicycle one step later."""
         return bicycle(motion, acceleration, curvature)
 
     def expert(
@@ -297,35 +296,35 @@ class DirectState:
         beyond: Float[Array, " 4"],
         length_m: Any,
     ) -> Float[Array, " 4"]:
-        """The logged motion one step ahead."""
+        """Return the logged motion one step ahead."""
         return target
 
     def clipped(self, action: Float[Array, " 4"]) -> Bool[Array, ""]:
-        """Never."""
+        """Return False."""
         return jnp.zeros((), bool)
 
     def actuated(
         self, motion: Float[Array, " 4"], action: Float[Array, " 4"], last: Float[Array, " 4"]
     ) -> Float[Array, " 4"]:
-        """The motion with its heading in [-pi, pi) and no negative speed."""
+        """Return the motion with heading in [-pi, pi) and nonnegative speed."""
         return jnp.stack([action[0], action[1], wrap(action[2]), jnp.maximum(action[3], 0.0)])
 
     def move(
         self, motion: Float[Array, " 4"], action: Float[Array, " 4"], length_m: Any
     ) -> Float[Array, " 4"]:
-        """The motion one step later."""
+        """Return the motion one step later."""
         return self.actuated(motion, action, action)
 
     def sharpest(self, length_m: Any) -> Any:
-        """The largest curvature that can be asked for: any, 1/m."""
+        """Return the largest curvature: unlimited, 1/m."""
         return jnp.inf
 
     def first(self, history: Float[Array, "16 4"], length_m: Any) -> Float[Array, " 4"]:
-        """Where the agent is."""
+        """Return the current motion."""
         return history[-1]
 
 
-#: What ``task.actions`` can be; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local`` or
+#: Types of ``task.actions``; ``kind:`` in YAML is ``physical``, ``published``, ``discrete``, ``delta_local`` or
 #: ``direct_state``.
 ActionSpace = Physical | Published | Discrete | DeltaLocal | DirectState
 

@@ -1,8 +1,8 @@
-"""Features that are no part of the groups of ``tasks.observations``: examples of groups of one's own, ready to use.
+"""Example features for custom observation groups, ready to use.
 
 In YAML ``observation: {own: [{feature: drivax.tasks.example_features:lane_curvature}]}``, from Python
-``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, scene and frames; ``frames(k)`` is
-everyone k steps ago as ego perceives them.
+``ObservationConfig(own=(OwnGroup(lane_curvature),))``. Each is a function of bank, context and frames; ``frames(k)`` is
+the frame of all agents k steps ago as ego perceives them.
 """
 
 from __future__ import annotations
@@ -11,36 +11,37 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.vectors import norm
+from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import LIGHT_ARC, NEVER_M, ROAD_LANE, ScenarioBank
+from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import LightState
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters
-from drivax.simulator.types import MOTION_SPEED, Scene
+from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
 from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
 
-#: How many others have a relative velocity; how far apart the route is looked at, m, and how often.
+#: Number of agents with a relative velocity; spacing (m) and number of route points.
 _OTHERS, _STEP_M, _POINTS = 8, 5.0, 10
-#: Half the width of the stripe ahead in which a leader drives, m; the longest gap that is told apart, s.
+#: Half the width of the strip ahead in which a leader drives, m; cap of time gaps, s.
 _STRIPE_M, _LONGEST_S = 1.5, 10.0
-#: The driver whose acceleration is shown, its hardest braking, m/s2, and how far it looks, m.
+#: Driver model, its hardest braking, m/s2, and its look-ahead, m.
 _IDM = IdmParameters()
 _HARDEST_MPS2, _FARTHEST_M = 6.0, 90.0
-#: A car that is slower keeps the time gap of this speed, m/s.
+#: Lower bound of the speed in time gaps, m/s.
 _SLOWEST_MPS = 1.0
 
 
 def relative_velocity(
-    bank: ScenarioBank, scene: Scene, frames: Frames
+    bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 2"], Bool[Array, " K"]]:
-    """Velocity of the eight nearest others relative to ego's, ego frame, in units of 15 m/s.
+    """Return the velocity of the eight nearest agents relative to ego, ego frame, in units of 15 m/s.
 
-    The rows are those of the group ``agents``, as far as they go.
+    Rows are in the order of the group ``agents``.
     """
-    now, view, ego = frames(0), View.of(scene), scene.history[-1]
-    there = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    now, view, ego = frames(0), View.of(context), context.history[-1]
+    there = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     distance = jnp.where(there, norm(now.box[:, :2] - view.xy), jnp.inf)
     rank = jnp.arange(_OTHERS)
     order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
@@ -48,67 +49,69 @@ def relative_velocity(
     return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
 
 
-def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
-    """Curvature of the lane that ego is on, in units of 0.1 1/m (left positive), and whether it is on one.
+def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
+    """Return the curvature of ego's lane in units of 0.1 1/m (left positive), and whether ego is on a lane.
 
-    It is that of the piece of lane within 2.5 m and 60 degrees that fits place and heading best, a metre weighing as
-    much as 15 degrees. No route is needed. Bridges are not told apart from what is under them.
+    The lane piece within 2.5 m and 60 degrees that fits position and heading best counts; a metre weighs as much as 15
+    degrees. Needs no route. Levels of bridges are not distinguished.
     """
-    view = View.of(scene)
-    rows, layer = bank.road[scene.index], bank.road_at[scene.index, 2]
-    middle, direction = view.point(rows[:, :2]), view.vector(rows[:, 2:4])
-    half = rows[:, 4] / 2
+    view = View.of(context)
+    rows, layer = bank.road[context.index], bank.road_at[context.index, 2]
+    middle, direction = view.point(rows[:, RoadColumn.XY]), view.vector(rows[:, RoadColumn.DIRECTION])
+    half = rows[:, RoadColumn.LENGTH] / 2
     along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
     apart = norm(middle + along[:, None] * direction)
-    fits = (layer == ROAD_LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
+    fits = (layer == RoadLayer.LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
     best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
-    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[scene.index, best]), 0.0)
+    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[context.index, best]), 0.0)
     return jnp.stack([curvature, fits[best].astype(jnp.float32)])
 
 
 def recommended_speed(
-    bank: ScenarioBank, scene: Scene, frames: Frames
+    bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
-    """Speed for the curvature k of the route at ten points 5 m apart: ``clip(30 - 25 |k|, 5, 30)``, in 15 m/s."""
+    """Return the recommended speed at ten route points 5 m apart, ``clip(30 - 25 |k|, 5, 30)`` m/s, in 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
-    _, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    curvature = features.route_curvature(bank, scene.index, scene.route_m + offsets)
-    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(bank, scene)
+    _, there = route_ahead(bank, context.index, context.route_m, offsets)
+    curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
+    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(
+        bank, context
+    )
 
 
-def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
-    """Seconds to the leader's bumper at ego's speed, of ten at most, as a share of ten; and whether there is a leader.
+def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
+    """Return the time gap to the leader's bumper over 10 s, at most 1, and whether there is a leader.
 
-    The leader is the nearest agent whose centre lies in the stripe of 3 m width straight ahead of ego. An ego slower
-    than 1 m/s counts as driving 1 m/s. Without a leader the share is 1.
+    The leader is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Speeds below 1 m/s
+    count as 1 m/s. Without a leader the first number is 1.
     """
-    now, view = frames(0), View.of(scene)
+    now, view = frames(0), View.of(context)
     place = view.point(now.box[:, :2])
-    others = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
-    half = bank.agent_box[scene.index, scene.slot, 0] / 2
+    half = bank.length_m(context.index, context.slot) / 2
     gap = jnp.where(
         leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
     )
-    time = jnp.min(gap) / jnp.maximum(scene.history[-1, 3], _SLOWEST_MPS)
+    time = jnp.min(gap) / jnp.maximum(context.history[-1, 3], _SLOWEST_MPS)
     share = jnp.minimum(time / _LONGEST_S, 1.0)
     return jnp.stack([share, leading.any().astype(jnp.float32)])
 
 
 def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Array, " S"]:
-    """How far boxes of these directions (ego frame) reach back from their centres along ego's heading, m."""
+    """Return how far boxes of these directions (ego frame) extend from their centres along ego's heading, m."""
     return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
 
 
-def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 6"]:
-    """What a car-following driver looks at along the route, and what the IDM would do with it.
+def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
+    """Return the inputs of a car-following driver along the route, and the IDM acceleration.
 
-    Gap to the leader or a light that asks to stop (90 m at most, in 50 m); speed towards it and its own (15 m/s);
-    whether there is one; the speed that the limit and the curves ahead allow (15 m/s); the acceleration of the
-    Intelligent Driver Model with its default parameters (6 m/s2). Without a leader both of its speeds are 0.
+    Gap to the leader or a light to stop at (at most 90 m, in 50 m); approach speed and speed of the leader (15 m/s);
+    whether there is one; the speed that limit and curves ahead allow (15 m/s); the acceleration of the Intelligent
+    Driver Model with default parameters (6 m/s2). Without a leader both speeds are 0.
     """
-    speed = scene.history[-1, MOTION_SPEED]
-    seen = ahead(bank, scene, frames(0), _IDM.min_gap_m)
+    speed = context.history[-1, MOTION_SPEED]
+    seen = ahead(bank, context, frames(0), _IDM.min_gap_m)
     leads = seen.gap < _FARTHEST_M
     speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads
     return jnp.concatenate(
@@ -126,17 +129,17 @@ def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Arr
     )
 
 
-def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 3"]:
-    """The next stop line on the route: distance from the front bumper in 50 m, whether it is red, whether there is one.
+def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
+    """Return the next stop line on the route: distance from the front bumper in 50 m, whether red, whether any.
 
-    Lines further than 50 m, or passed by the bumper, are not there; the distance is then 1.
+    Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
     """
-    ahead = bank.light_line[scene.index, LIGHT_ARC] - scene.route_m
-    gap = ahead - bank.agent_box[scene.index, scene.slot, 0] / 2
+    ahead = bank.light_line[context.index, LightRow.ARC] - context.route_m
+    gap = ahead - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
-    real = bank.light_line[scene.index, LIGHT_ARC] < NEVER_M
-    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
-    next_one = jnp.argmin(jnp.where(there, gap, jnp.inf))
+    real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
+    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
+    nearest = jnp.argmin(jnp.where(there, gap, jnp.inf))
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
-    distance = jnp.where(there.any(), gap[next_one] / POSITION_M, 1.0)
-    return jnp.stack([distance, *((there & kind)[next_one].astype(jnp.float32) for kind in (red, True))])
+    distance = jnp.where(there.any(), gap[nearest] / POSITION_M, 1.0)
+    return jnp.stack([distance, *((there & kind)[nearest].astype(jnp.float32) for kind in (red, True))])

@@ -1,6 +1,6 @@
-"""Which features the groups of an observation are made of: their names, columns and order, and the optional ones.
+"""Features of observation groups: names, columns, order, and how the optional ones are computed.
 
-The columns of a group stand in the order of :data:`COLUMNS`, whatever the order in a configuration.
+The columns of a group follow the order of :data:`COLUMNS`, not that of a configuration.
 """
 
 from __future__ import annotations
@@ -13,25 +13,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import ROUTE_COS, ROUTE_SIN, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Flag
-from drivax.simulator.types import Scene
+from drivax.simulator.types import AgentContext
 from drivax.tasks.view import PIECE_M, POSITION_M
 
-#: What curvatures are divided by, 1/m: a turn of 10 m radius is 1.
+#: Unit of curvature, 1/m: a turn of 10 m radius is 1.
 CURVATURE_PM = 0.1
-#: No curvature is shown larger than this, in these units.
+#: Cap of curvatures, in these units.
 _MOST_CURVED = 3.0
-#: Distance on each side over which the curvature of the route is measured, m.
+#: Half the distance over which the curvature of the route is measured, m.
 _ARM_M = 2.0
 
 _PLACE = {"position": ("x", "y"), "heading": ("sin", "cos"), "velocity": ("ahead", "left")}
-#: Columns of every feature of every group; one name "" where a feature is one number.
+#: Columns of each feature of each group; "" for a feature with one column.
 COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "ego": {**_PLACE, "time": ("",)},
-        # The last action has as many columns as the action space has numbers.
+        # The last action has as many columns as the action space has dimensions.
         "ego_static": {"length": ("",), "width": ("",), "height": ("",), "last_action": ()},
         "agents": {
             **_PLACE,
@@ -64,15 +65,15 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Features:
-    """The features of each group; a group without any is left out. Columns: ``COLUMNS``.
+    """Features of each group; a group without features is omitted. Columns: ``COLUMNS``.
 
     Attributes:
-        ego: Of the driven agent at each past step.
-        ego_static: Of the driven agent now.
-        agents: Of each other agent at each past step.
-        road: Of each piece of road.
-        lights: Of each light.
-        route: Of each point of the route.
+        ego: Driven agent at each past step.
+        ego_static: Driven agent now.
+        agents: Each other agent at each past step.
+        road: Each road piece.
+        lights: Each light.
+        route: Each point of the route.
     """
 
     ego: tuple[str, ...] = ("position", "heading", "velocity")
@@ -95,14 +96,14 @@ class Features:
 
 
 def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> dict[str, tuple[str, ...]]:
-    """Names of the columns of every group that has any, masks aside.
+    """Return the column names of each group, without masks.
 
     Args:
-        features: The features of our own groups.
+        features: Features of the built-in groups.
         shapes: Shapes of one observation, by group.
 
     Returns:
-        By group a name per column, as ``velocity ahead``; the columns of the user's own groups are numbered.
+        A name per column by group, as ``velocity ahead``; columns of the user's groups are numbered.
     """
     names = {}
     for group, shape in shapes.items():
@@ -121,52 +122,52 @@ def feature_names(features: Features, shapes: Mapping[str, Sequence[int]]) -> di
 def joined(
     chosen: Sequence[str], parts: Mapping[str, Callable[[], Array]], rows: tuple[int, ...]
 ) -> Float[Array, "... F"]:
-    """The columns of the chosen features side by side; parts that are not chosen are not computed.
+    """Concatenate the columns of the selected features; others are not computed.
 
     Args:
-        chosen: Features; those without a part are somebody else's.
-        parts: What computes each, ``[*rows, columns]``.
-        rows: Shape of the rows, for when nothing is chosen.
+        chosen: Selected features; those without a function are ignored.
+        parts: Function of each feature, to ``[*rows, columns]``.
+        rows: Shape of the rows if nothing is selected.
     """
-    found = [parts[name]() for name in chosen if name in parts]
-    return jnp.concatenate(found, axis=-1) if found else jnp.zeros((*rows, 0))
+    columns = [parts[name]() for name in chosen if name in parts]
+    return jnp.concatenate(columns, axis=-1) if columns else jnp.zeros((*rows, 0))
 
 
 def columns_of(group: str, chosen: Sequence[str]) -> list[int]:
-    """Where the columns of the chosen features stand among those of all features that are on by default."""
-    place, found = 0, []
+    """Return the indices of the selected features' columns among those of all default features."""
+    start, columns = 0, []
     for name in getattr(Features(), group):
         width = len(COLUMNS[group][name])
-        found += range(place, place + width) if name in chosen else ()
-        place += width
-    return found
+        columns += range(start, start + width) if name in chosen else ()
+        start += width
+    return columns
 
 
 def shown_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A curvature (1/m) in units of 0.1 1/m, at most 3 of them."""
+    """Return a curvature (1/m) in units of 0.1 1/m, clipped to 3."""
     return jnp.clip(curvature / CURVATURE_PM, -_MOST_CURVED, _MOST_CURVED)
 
 
-def has_route(bank: ScenarioBank, scene: Scene) -> Bool[Array, ""]:
-    """Whether the driven agent has a route on lanes; else the bank holds the log's own path, which nobody may see."""
-    return ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
+def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
+    """Whether the driven agent has a route on lanes; without one the bank holds the log's path, which is privileged."""
+    return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
 
 
 def route_curvature(
     bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, " K"]
 ) -> Float[Array, " K"]:
-    """Curvature of the route to the goal, 1/m, left positive: its turn from 2 m before to 2 m behind a place.
+    """Return the curvature of the route to the goal, 1/m, left positive: its turn over 4 m around a position.
 
-    At the ends of the route what there is of these 4 m counts.
+    At the ends of the route the distance is shorter.
     """
     last = (bank.route_points[index, 0] - 1).astype(jnp.float32)
     before, behind = jnp.clip(along_m - _ARM_M, 0.0, last), jnp.clip(along_m + _ARM_M, 0.0, last)
     zero = jnp.zeros(())
-    one, _ = route_ahead(bank, index, zero, before)
-    other, _ = route_ahead(bank, index, zero, behind)
-    (c0, s0), (c1, s1) = ((rows[:, ROUTE_COS], rows[:, ROUTE_SIN]) for rows in (one, other))
+    start, _ = route_ahead(bank, index, zero, before)
+    end, _ = route_ahead(bank, index, zero, behind)
+    (c0, s0), (c1, s1) = ((rows[:, RouteColumn.COS], rows[:, RouteColumn.SIN]) for rows in (start, end))
     apart = behind - before
-    # Without a route its rows are zero, of which there is no angle.
+    # Without a route its rows are zero and have no angle.
     turn = jnp.where(
         apart > 0, jnp.arctan2(c0 * s1 - s0 * c1, jnp.where(apart > 0, c0 * c1 + s0 * s1, 1.0)), 0.0
     )
@@ -174,17 +175,17 @@ def route_curvature(
 
 
 def recommended_speed(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A speed for a curvature k in 1/m: ``clip(30 - 25 |k|, 5, 30)`` m/s, as published (semantics, Observation)."""
+    """Return the published speed at a curvature k in 1/m, ``clip(30 - 25 |k|, 5, 30)`` m/s (semantics)."""
     return jnp.clip(30.0 - 25.0 * jnp.abs(curvature), 5.0, 30.0)
 
 
 def goal_ahead(goal_m: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """The goal, given in the ego frame in m, in units of 50 m, at most 5 of them each way."""
+    """Return the goal (ego frame, m) in units of 50 m, clipped to 5 in each direction."""
     return jnp.clip(goal_m / POSITION_M, -5.0, 5.0)
 
 
 def cut_rows(rows: Float[Array, "P F"], count: int) -> Float[Array, "R F"]:
-    """Pieces of road (position, direction, length, ...), each cut into equal ones along its chord."""
+    """Cut each road piece (position, direction, length, ...) into equal pieces along its chord."""
     place = ((jnp.arange(count) + 0.5) / count - 0.5)[:, None]
     position, direction, length = rows[:, None, :2], rows[:, None, 2:4], rows[:, None, 4:5]
     middle = position + direction * length * (PIECE_M / POSITION_M) * place

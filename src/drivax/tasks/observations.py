@@ -1,7 +1,7 @@
 """Observations: named groups of features with masks, in the ego frame, scaled to about [-1, 1].
 
-Layout (semantics, Observation): each group is an array whose last axis are features and a boolean mask over its rows.
-Masked rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m (pieces of road by 10 m).
+Each group is an array with features on its last axis and a boolean mask over its rows (semantics, Observation). Masked
+rows are zero. Positions are divided by 50 m, speeds by 15 m/s, lengths by 5 m (road pieces by 10 m).
 """
 
 from __future__ import annotations
@@ -16,23 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError, did_you_mean
+from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteColumn, SizeColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import (
-    LIGHT_ARC,
-    LIGHT_COS,
-    LIGHT_SIN,
-    LIGHT_X,
-    LIGHT_Y,
-    NEVER_M,
-    ROAD_AREA,
-    ROAD_EDGE,
-    ROAD_LANE,
-    ROAD_NONE,
-    ROUTE_LIMIT,
-    ScenarioBank,
-)
+from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, LightState
-from drivax.simulator.types import HISTORY, Scene
+from drivax.simulator.types import HISTORY, AgentContext
 from drivax.tasks.features import (
     COLUMNS,
     Features,
@@ -45,13 +33,13 @@ from drivax.tasks.features import (
     route_curvature,
     shown_curvature,
 )
-from drivax.tasks.own import own_name, refuse_taken
+from drivax.tasks.own import check_unique, name_of
 from drivax.tasks.perception import Perception, moved_lights, moved_road, perceived
 from drivax.tasks.view import PIECE_M, POSITION_M, SIZE_M, SPEED_MPS, Frames, View
 
-#: Places of a block of the running count.
+#: Block size of the running count.
 _BLOCK = 8
-#: A stop line so far behind the ego is passed, m.
+#: A stop line this far behind the ego is passed, m.
 _PASSED_M = 5.0
 Observation = dict[str, Array]
 #: Names of the groups of this module.
@@ -59,52 +47,51 @@ GROUPS = tuple(COLUMNS)
 
 
 #: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
-Feature = Callable[[ScenarioBank, Scene, Frames], Any]
+Feature = Callable[[ScenarioBank, AgentContext, Frames], Any]
 
 
 @dataclass(frozen=True)
 class OwnGroup:
-    """A group of features of the user's own.
+    """A user's observation group.
 
     Attributes:
-        feature: From bank, scene and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
-            boolean mask ``[...]`` of the rows that are there; ``testing.check_feature`` tells whether it keeps to the
-            rules.
-        name: Of the group; by default the function's own.
+        feature: From bank, context and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
+            boolean mask ``[...]`` of the valid rows; ``testing.check_feature`` checks it.
+        name: Name of the group; the function's own by default.
     """
 
     feature: Feature
     name: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", own_name(self.feature, self.name))
+        object.__setattr__(self, "name", name_of(self.feature, self.name))
         if self.name.endswith("_mask"):
-            raise ValueError(f"a group cannot be called {self.name!r}; masks are named so")
+            raise ValueError(f"a group cannot be named {self.name!r}: the suffix is reserved for masks")
 
-    def observe(self, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
-        """The group, and its mask where it has one."""
-        found = self.feature(bank, scene, frames)
-        return _masked(self.name, *found) if isinstance(found, tuple) else {self.name: found}
+    def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames) -> Observation:
+        """Return the group, and its mask if it has one."""
+        rows = self.feature(bank, context, frames)
+        return _masked(self.name, *rows) if isinstance(rows, tuple) else {self.name: rows}
 
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """Which groups, how many rows, how many past steps, which features of each.
+    """Groups of an observation, their numbers of rows and past steps, and their features.
 
-    In YAML the key ``preset`` names one of ``PRESETS`` to start from instead of these defaults.
+    In YAML the key ``preset`` names one of ``PRESETS`` to start from.
 
     Attributes:
-        agents: How many of the nearest others.
+        agents: Number of the nearest other agents.
         steps: Past steps of ego and agents, the present one included; at most 10.
-        road: Rows of the road group; 0 leaves it out.
-        lanes, edges, crosswalks: Which layers the road group shows.
-        road_ahead_m, road_behind_m, road_side_m: Reach of the road group ahead, behind and to each side.
-        road_cut: Into how many equal rows each piece of road (of at most 10 m) is cut along its chord.
-        lights: How many of the nearest lights on or near the route.
+        road: Rows of the road group; 0 omits it.
+        lanes, edges, crosswalks: Layers of the road group.
+        road_ahead_m, road_behind_m, road_side_m: Range of the road group ahead, behind and to each side.
+        road_cut: Number of equal rows into which each road piece (of at most 10 m) is cut along its chord.
+        lights: Number of the nearest lights on or near the route.
         route: Points of the route, ``route_step_m`` apart.
         features: Columns of each group.
-        perception: Faults of what ego sees; none by default.
-        own: Groups beside those of this module.
+        perception: Errors of perception; none by default.
+        own: The user's groups.
     """
 
     agents: int = 16
@@ -125,7 +112,7 @@ class ObservationConfig:
     own: tuple[OwnGroup, ...] = ()
 
     def __post_init__(self) -> None:
-        refuse_taken("observation.own", [group.name for group in self.own], GROUPS)
+        check_unique("observation.own", [group.name for group in self.own], GROUPS)
         counts = {name: getattr(self, name) for name in ("agents", "road", "lights", "route")}
         for name, count in counts.items():
             if count < 0:
@@ -139,20 +126,18 @@ class ObservationConfig:
 
     @classmethod
     def preset(cls, name: str) -> ObservationConfig:
-        """One of ``PRESETS``.
+        """Return one of ``PRESETS``.
 
         Raises:
-            UsageError: There is none of that name.
+            UsageError: Unknown name.
         """
         if name not in PRESETS:
-            raise UsageError(
-                f"there is no observation preset {name!r}", cure=did_you_mean(name, list(PRESETS))
-            )
+            raise UsageError(f"unknown observation preset {name!r}", cure=did_you_mean(name, list(PRESETS)))
         return PRESETS[name]
 
 
-#: ``published`` is the observation of the published description as far as a layer of pieces of at most 10 m has it:
-#: 2,000 rows are 400 pieces, each cut into five, and a box of 100 m takes the place of the circle.
+#: ``published`` is the observation of the published description with road pieces of at most 10 m: 2,000 rows are 400
+#: pieces cut into five each, in a box of 100 m instead of a circle.
 PRESETS = MappingProxyType(
     {
         "minimal": ObservationConfig(agents=8, steps=1, edges=False),
@@ -175,34 +160,36 @@ PRESETS = MappingProxyType(
 )
 
 
-def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
-    """The observation of a scene.
+def observe(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, frames: Frames
+) -> Observation:
+    """Return the observation of a context.
 
     Args:
         config: Groups, sizes and features.
         bank: The scenarios.
-        scene: The scene.
-        frames: Everyone ``back`` steps ago.
+        context: The context of the observing agent.
+        frames: Frame of all agents some steps ago.
 
     Returns:
         By default ``ego [steps, 6]``: position, heading (sin, cos), velocity; ``ego_static [4]``: length, width, last
         action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
-        ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's own groups.
+        ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
     """
-    view, features = View.of(scene), config.features
+    view, features = View.of(context), config.features
     if config.perception.of_agents:
-        frames = perceived(config.perception, bank, scene, frames)
-    result = _ego(config, bank, scene, view)
+        frames = perceived(config.perception, bank, context, frames)
+    result = _ego(config, bank, context, view)
     if features.agents:
-        result |= _agents(config, bank, scene, view, frames)
+        result |= _agents(config, bank, context, view, frames)
     if config.road and features.road:
-        result |= _shown_road(config, bank, scene, view)
+        result |= _shown_road(config, bank, context, view)
     if features.lights:
-        result |= _lights(config, bank, scene, view, frames(0).lights)
+        result |= _lights(config, bank, context, view, frames(0).lights)
     if features.route:
-        result |= _route(config, bank, scene, view)
+        result |= _route(config, bank, context, view)
     for group in config.own:
-        result |= group.observe(bank, scene, frames)
+        result |= group.observe(bank, context, frames)
     return result
 
 
@@ -210,10 +197,10 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
-def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    past = scene.history[HISTORY - config.steps :]
+def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    past = context.history[HISTORY - config.steps :]
     turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
-    size = bank.agent_box[scene.index, scene.slot, :2] / SIZE_M
+    size = bank.agent_box[context.index, context.slot, SizeColumn.FOOTPRINT] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: turned[:, ::-1],
@@ -223,8 +210,8 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View
     static = {
         "length": lambda: size[:1],
         "width": lambda: size[1:],
-        "height": lambda: bank.agent_box[scene.index, scene.slot, 2:3] / SIZE_M,
-        "last_action": lambda: scene.action,
+        "height": lambda: bank.agent_box[context.index, context.slot, SizeColumn.HEIGHT][..., None] / SIZE_M,
+        "last_action": lambda: context.action,
     }
     result = {}
     for name, parts in (("ego", moving), ("ego_static", static)):
@@ -234,18 +221,18 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View
 
 
 def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
-    """Indices of the smallest entries, nearest first; repeats the last ones where there are too few."""
+    """Return the indices of the smallest entries, nearest first; padded with 0."""
     count_there = min(count, distance.shape[0])
     chosen = jax.lax.top_k(-distance, count_there)[1]
     return jnp.concatenate([chosen, jnp.zeros(count - count_there, chosen.dtype)])
 
 
 def _agents(
-    config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, frames: Frames
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, frames: Frames
 ) -> Observation:
     now, chosen_features = frames(0), config.features.agents
     slots = now.valid.shape[0]
-    seen = now.valid & (jnp.arange(slots) != scene.slot)
+    seen = now.valid & (jnp.arange(slots) != context.slot)
     dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
     distance = jnp.where(seen, dx * dx + dy * dy, jnp.inf)
     chosen = _nearest(distance, config.agents)
@@ -253,7 +240,7 @@ def _agents(
 
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
         frame = now if back == 0 else frames(back)
-        box, x = frame.box[chosen], scene.history[HISTORY - 1 - back]
+        box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
 
         def relative() -> Float[Array, "K 2"]:
             own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
@@ -269,13 +256,13 @@ def _agents(
         return joined(chosen_features, parts, (config.agents,)), frame.valid[chosen]
 
     rows = [row(back) for back in range(config.steps - 1, -1, -1)]
-    moving = jnp.stack([one for one, _ in rows], axis=1)
+    moving = jnp.stack([features for features, _ in rows], axis=1)
     mask = jnp.stack([valid for _, valid in rows], axis=1) & there[:, None]
     size = now.box[chosen, 4:6] / SIZE_M
     parts = {
         "length": lambda: size[:, :1],
         "width": lambda: size[:, 1:],
-        "height": lambda: bank.agent_box[scene.index, chosen, 2:3] / SIZE_M,
+        "height": lambda: bank.agent_box[context.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
         "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
     static = joined(chosen_features, parts, (config.agents,))
@@ -283,87 +270,95 @@ def _agents(
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
-def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    """The road group as configured: pieces cut, moved by noise, of the chosen columns."""
-    wanted, noisy = config.features.road, config.perception.noise_m > 0
+def _shown_road(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
+) -> Observation:
+    """Return the road group: pieces cut, with noise, in the selected columns."""
+    selected, noisy = config.features.road, config.perception.noise_m > 0
     pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
-    found = _road(pieces, bank, scene, view)
-    if config.road_cut == 1 and wanted == Features().road and not noisy:
-        return found
-    rows, mask = found["road"], found["road_mask"]
+    group = _road(pieces, bank, context, view)
+    if config.road_cut == 1 and selected == Features().road and not noisy:
+        return group
+    rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
         rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, bank, scene, config.road) / POSITION_M)
-    columns = columns_of("road", wanted) + ([rows.shape[-1] - 1] if "curvature" in wanted else [])
+        rows = rows.at[:, :2].add(moved_road(config.perception, bank, context, config.road) / POSITION_M)
+    columns = columns_of("road", selected) + ([rows.shape[-1] - 1] if "curvature" in selected else [])
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
-def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    x, y, layer = bank.road_at[scene.index]
+def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    x, y, layer = bank.road_at[context.index]
     dx, dy = x - view.xy[0], y - view.xy[1]
     ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
-    inside &= (jnp.abs(left) < config.road_side_m) & (layer != ROAD_NONE)
-    layers = ((config.lanes, ROAD_LANE), (config.edges, ROAD_EDGE), (config.crosswalks, ROAD_AREA))
+    inside &= (jnp.abs(left) < config.road_side_m) & (layer != RoadLayer.NONE)
+    layers = (
+        (config.lanes, RoadLayer.LANE),
+        (config.edges, RoadLayer.EDGE),
+        (config.crosswalks, RoadLayer.AREA),
+    )
     for hidden in [kind for shown, kind in layers if not shown]:
         inside &= layer != hidden
-    # Compact without sorting: the running count says where each row inside goes.
+    # Compact without sorting: the running count is the target of each row inside.
     running = running_count(inside)
     place = jnp.where(inside, running - 1, config.road)
     take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
-    rows = bank.road[scene.index, take]
-    parts = [view.point(rows[:, :2]) / POSITION_M, view.vector(rows[:, 2:4])]
-    types = (rows[:, 5:6] == jnp.asarray([ROAD_LANE, ROAD_EDGE, ROAD_AREA])).astype(jnp.float32)
-    limit = rows[:, 6:7]
+    rows = bank.road[context.index, take]
+    parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
+    types = (
+        rows[:, RoadColumn.LAYER, None] == jnp.asarray([RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA])
+    ).astype(jnp.float32)
+    limit = rows[:, RoadColumn.LIMIT, None]
     parts += [
-        rows[:, 4:5] / PIECE_M,
+        rows[:, RoadColumn.LENGTH, None] / PIECE_M,
         types,
         jnp.maximum(limit, 0.0) / SPEED_MPS,
         (limit > 0).astype(jnp.float32),
     ]
     if "curvature" in config.features.road:
-        parts.append(shown_curvature(bank.road_curvature[scene.index, take])[:, None])
+        parts.append(shown_curvature(bank.road_curvature[context.index, take])[:, None])
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
 def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
-    """How many are true up to each place: within blocks of eight, all blocks at once, then over the blocks.
+    """Return the cumulative count of true entries: within blocks of eight, then over blocks.
 
-    ``jnp.cumsum`` costs several times as much on a CPU: it adds place by place.
+    ``jnp.cumsum`` is several times slower on a CPU: it adds entry by entry.
     """
     count = inside.shape[0]
     blocks = -(-count // _BLOCK)
-    # One row per place in a block, so that additions run along the blocks.
-    ones = jnp.pad(inside.astype(jnp.float32), (0, blocks * _BLOCK - count)).reshape(blocks, _BLOCK).T
-    within = [ones[0]]
-    for row in ones[1:]:
+    # One row per position in a block: additions run along the blocks.
+    positions = jnp.pad(inside.astype(jnp.float32), (0, blocks * _BLOCK - count)).reshape(blocks, _BLOCK).T
+    within = [positions[0]]
+    for row in positions[1:]:
         within.append(within[-1] + row)
-    # Exact in any precision of a product: no factor is above eight.
+    # Exact in any matrix precision: factors are at most eight.
     before = within[-1] @ jnp.triu(jnp.ones((blocks, blocks)), 1)
     return jnp.stack([row + before for row in within], axis=-1).reshape(-1)[:count].astype(jnp.int32)
 
 
 def _lights(
-    config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, state: Int[Array, " L"]
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, state: Int[Array, " L"]
 ) -> Observation:
-    line = bank.light_line[scene.index]
-    dx, dy = line[LIGHT_X] - view.xy[0], line[LIGHT_Y] - view.xy[1]
-    # Lights whose line is well behind are passed. Those of the route come first, then the nearest.
-    seen = (state >= 0) & (dx * line[LIGHT_COS] + dy * line[LIGHT_SIN] > -_PASSED_M)
-    perception, on_route = config.perception, line[LIGHT_ARC] < NEVER_M
+    line = bank.light_line[context.index]
+    dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
+    # Lights whose line is well behind are passed. Those on the route come first, then the nearest.
+    seen = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
+    perception, on_route = config.perception, line[LightRow.ARC] < NEVER_M
     rank = jnp.sqrt(dx * dx + dy * dy) + jnp.where(on_route, 0.0, 1e4)
     chosen = _nearest(jnp.where(seen, rank, jnp.inf), config.lights)
     there = seen[chosen] & (jnp.arange(config.lights) < state.shape[0])
 
-    def place() -> Float[Array, "K 2"]:
-        middle = view.point(line[LIGHT_X : LIGHT_Y + 1, chosen].T)
+    def position() -> Float[Array, "K 2"]:
+        middle = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
-            middle = middle + moved_lights(perception, bank, scene, state.shape[0])[chosen]
+            middle = middle + moved_lights(perception, bank, context, state.shape[0])[chosen]
         return middle / POSITION_M
 
     parts = {
-        "position": place,
+        "position": position,
         "state": lambda: _colour(state[chosen]),
         "on_route": lambda: on_route[chosen, None].astype(jnp.float32),
     }
@@ -371,26 +366,26 @@ def _lights(
 
 
 def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
-    """One-hot of unknown, green, yellow, red. Flashing lights count as unknown: they are not red."""
+    """Return one-hot unknown, green, yellow, red. Flashing lights count as unknown, not red."""
     green = (state == LightState.GO) | (state == LightState.ARROW_GO)
     yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
 
 
-def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
-    rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    there &= has_route(bank, scene)
-    limit = rows[:, ROUTE_LIMIT : ROUTE_LIMIT + 1]
+    rows, there = route_ahead(bank, context.index, context.route_m, offsets)
+    there &= has_route(bank, context)
+    limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
-        return route_curvature(bank, scene.index, scene.route_m + offsets)[:, None]
+        return route_curvature(bank, context.index, context.route_m + offsets)[:, None]
 
-    goal = bank.goal[scene.index]
+    goal = bank.goal[context.index]
     parts = {
-        "position": lambda: view.point(rows[:, :2]) / POSITION_M,
-        "heading": lambda: view.vector(rows[:, 3:5])[:, ::-1],
+        "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
+        "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],
         "limit": lambda: jnp.where(limit > 0, limit / SPEED_MPS, 0.0),
         "curvature": lambda: shown_curvature(curvature()),
         "recommended_speed": lambda: recommended_speed(curvature()) / SPEED_MPS,

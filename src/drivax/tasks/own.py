@@ -1,4 +1,4 @@
-"""Names of a user's own terms and groups."""
+"""Names of users' own terms and groups."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from collections.abc import Sequence
 from typing import Any
 
 
-def own_name(function: Any, given: str = "") -> str:
-    """The name that a term goes by: the given one, or the function's, or its class's in snake_case.
+def name_of(function: Any, name: str = "") -> str:
+    """Return ``name``, or that of the function, or that of its class in snake_case.
 
     Raises:
-        ValueError: The name is no word, as that of a lambda.
+        ValueError: The name is not an identifier, as that of a lambda.
     """
-    name = given or getattr(function, "__name__", None)
-    if name is None:
+    name = name or getattr(function, "__name__", None) or ""
+    if not name:
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(function).__name__).lower()
     if not name.isidentifier():
-        raise ValueError(f"{name!r} is no name; give it one with name=")
+        raise ValueError(f"{name!r} is not a name; pass one with name=")
     return name
 
 
-def refuse_taken(where: str, names: Sequence[str], taken: Sequence[str]) -> None:
-    """Refuses names that something else bears.
+def check_unique(section: str, names: Sequence[str], taken: Sequence[str]) -> None:
+    """Refuse names that are taken or repeated.
 
     Raises:
         ValueError: Names the first.
@@ -30,5 +30,5 @@ def refuse_taken(where: str, names: Sequence[str], taken: Sequence[str]) -> None
     seen = set(taken)
     for name in names:
         if name in seen:
-            raise ValueError(f"{where} has {name!r}, a name that is taken; give another with name=")
+            raise ValueError(f"{section}: name {name!r} is taken; pass another with name=")
         seen.add(name)

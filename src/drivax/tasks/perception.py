@@ -20,13 +20,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, rotate
+from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
-from drivax.scenario.bank.scenario_bank import LIGHT_X, LIGHT_Y, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: What the key of a step is folded with, by what is drawn from it.
 _DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
@@ -34,16 +34,16 @@ _DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
 
 @dataclass(frozen=True)
 class Perception:
-    """Faults of perception; all of them are off by default, and then cost nothing.
+    """Errors of perception; all are off by default and then cost nothing.
 
     Attributes:
-        range_m: Agents and stop lines further than this from ego are not seen, m.
+        range_m: Range beyond which agents and stop lines are not seen, m.
         occlusion: Whether vehicles hide agents behind them (:func:`in_view`).
-        dropout_m: Agents and lights are seen with probability exp(-distance / dropout_m), drawn at every step; 200 m
-            as published.
-        noise_m: Standard deviation, in each direction, of the error of the places of agents, stop lines and pieces of
-            road, drawn at every step, m; 0.1 m as published.
-        seed: Of all chance.
+        dropout_m: Agents and lights are seen with probability exp(-distance / dropout_m), drawn at each step;
+            published: 200 m.
+        noise_m: Standard deviation of the position error of agents, stop lines and road pieces in each direction,
+            drawn at each step, m; published: 0.1 m.
+        seed: Random seed.
     """
 
     range_m: float | None = None
@@ -64,73 +64,72 @@ class Perception:
 
     @property
     def of_agents(self) -> bool:
-        """Whether agents are perceived otherwise than they are."""
+        """Whether agents are perceived with errors."""
         return self.occlusion or self.of_lights or self.noise_m > 0
 
     @property
     def of_lights(self) -> bool:
-        """Whether some lights are not seen."""
+        """Whether lights may be missed."""
         return self.range_m is not None or self.dropout_m is not None
 
 
 def perceived(
-    config: Perception, bank: ScenarioBank, scene: Scene, frames: Callable[[int], Frame]
+    config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[[int], Frame]
 ) -> Callable[[int], Frame]:
-    """Everyone as ego perceived them at each step; ego itself is as it is.
+    """Return the frames as ego perceived them; ego itself is exact.
 
     Args:
-        config: The faults.
+        config: The errors.
         bank: The scenarios.
-        scene: The scene.
-        frames: The truth: everyone so many steps ago.
+        context: The context of ego.
+        frames: True frame of all agents some steps ago.
 
     Returns:
-        Frames in which who was not seen is not valid, lights that were not seen are none, and places of agents have
-        their errors.
+        Frames in which unseen agents are not valid, unseen lights are -1, and positions have errors.
     """
 
     @cache
     def seen(back: int) -> Frame:
-        return _sensed(config, bank, scene, frames(back), back)
+        return _sensed(config, bank, context, frames(back), back)
 
     return seen
 
 
-def _sensed(config: Perception, bank: ScenarioBank, scene: Scene, frame: Frame, back: int) -> Frame:
-    eye, slots = scene.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
-    others, seen, place = slots != scene.slot, frame.valid, frame.box[:, :2]
+def _sensed(config: Perception, bank: ScenarioBank, context: AgentContext, frame: Frame, back: int) -> Frame:
+    eye, slots = context.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
+    others, seen, place = slots != context.slot, frame.valid, frame.box[:, :2]
     distance = norm(place - eye[:2])
-    key = _key(config, bank, scene, back)
+    key = _key(config, bank, context, back)
     seen &= _reported(config, jax.random.fold_in(key, _DROPPED), distance)
     if config.occlusion:
-        level = jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
+        level = jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
         slim = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
         seen &= in_view(eye[:2], frame.box, frame.valid & others & level & ~slim)
     if config.noise_m > 0:
-        # Drawn in the frame of ego, so that it does not depend on how the map lies.
+        # Drawn in ego's frame: invariant to rotations of the map.
         error = config.noise_m * _each(jax.random.fold_in(key, _MOVED), len(slots))
         place = place + rotate(error, jnp.cos(eye[2]), jnp.sin(eye[2]))
     place = jnp.where(others[:, None], place, frame.box[:, :2])
     box = jnp.concatenate([place, frame.box[:, 2:]], axis=-1)
     lights = frame.lights
     if config.of_lights:
-        line = bank.light_line[scene.index, LIGHT_X : LIGHT_Y + 1]
-        lights = jnp.where(lights_seen(config, bank, scene, norm(line.T - eye[:2]), back), lights, -1)
+        line = bank.light_line[context.index, LightRow.XY]
+        lights = jnp.where(lights_seen(config, bank, context, norm(line.T - eye[:2]), back), lights, -1)
     return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid), lights=lights)
 
 
 def in_view(
     eye: Float[Array, " 2"], box: Float[Array, "S 6"], blocks: Bool[Array, " S"]
 ) -> Bool[Array, " S"]:
-    """Who is in free view of a point: whose centre or any corner it sees past all others that block.
+    """Return which agents are visible from a point: those with a visible centre or corner.
 
-    A line of sight is cut by a box whose inside it passes through; touching is not cutting. Nobody hides himself, and a
-    box in which the eye itself is hides nobody. All of S x S x 5 pairs are tested: some 40 operations each.
+    A box blocks a line of sight through its inside; touching does not block. No box blocks itself, and a box
+    around the eye blocks nothing. All S x S x 5 pairs are tested, about 40 operations each.
 
     Args:
-        eye: Where it is seen from, m.
-        box: Everyone (``geometry.boxes``).
-        blocks: Who hides what is behind.
+        eye: Viewpoint, m.
+        box: All agents (``geometry.boxes``).
+        blocks: Which agents block lines of sight.
     """
     dx, dy = eye[0] - box[:, 0], eye[1] - box[:, 1]
     along, across = dx * box[:, 2] + dy * box[:, 3], dy * box[:, 2] - dx * box[:, 3]
@@ -143,32 +142,40 @@ def in_view(
 
 
 def lights_seen(
-    config: Perception, bank: ScenarioBank, scene: Scene, distance_m: Float[Array, " L"], back: int = 0
+    config: Perception,
+    bank: ScenarioBank,
+    context: AgentContext,
+    distance_m: Float[Array, " L"],
+    back: int = 0,
 ) -> Bool[Array, " L"]:
-    """Which stop lines were seen ``back`` steps ago, at these distances then."""
-    key = jax.random.fold_in(_key(config, bank, scene, back), _DROPPED_LIGHTS)
+    """Return which stop lines were seen ``back`` steps ago, at these distances."""
+    key = jax.random.fold_in(_key(config, bank, context, back), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)
 
 
-def moved_lights(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
-    """Errors of the places of this many lights in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_LIGHTS), count)
+def moved_lights(
+    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+) -> Float[Array, "count 2"]:
+    """Return position errors of lights in the ego frame, m."""
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_LIGHTS), count)
 
 
-def moved_road(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
-    """Errors of the places of this many pieces of road in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_ROAD), count)
+def moved_road(
+    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+) -> Float[Array, "count 2"]:
+    """Return position errors of road pieces in the ego frame, m."""
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_ROAD), count)
 
 
-def _key(config: Perception, bank: ScenarioBank, scene: Scene, back: int = 0) -> Array:
+def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:
     key = jax.random.key(config.seed)
-    for number in (bank.identity[scene.index], scene.step - back + HISTORY, scene.slot):
+    for number in (bank.identity[context.index], context.step - back + HISTORY, context.slot):
         key = jax.random.fold_in(key, number)
     return key
 
 
 def _reported(config: Perception, key: Array, distance_m: Float[Array, " S"]) -> Bool[Array, " S"]:
-    """Who is in range and not missed by chance."""
+    """Return which agents are in range and not dropped at random."""
     seen = jnp.ones(distance_m.shape, bool)
     if config.range_m is not None:
         seen &= distance_m <= config.range_m
@@ -179,6 +186,6 @@ def _reported(config: Perception, key: Array, distance_m: Float[Array, " S"]) ->
 
 
 def _each(key: Array, count: int) -> Float[Array, "count 2"]:
-    """Two standard normal numbers per slot, the same however many slots there are."""
+    """Return two standard normal numbers per slot, independent of the number of slots."""
     draw = jax.vmap(lambda slot: jax.random.normal(jax.random.fold_in(key, slot), (2,)))
     return draw(jnp.arange(count))

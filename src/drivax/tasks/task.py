@@ -1,4 +1,4 @@
-"""A task: action space, observation, reward and termination, as configured; what a simulator simulates."""
+"""A task: action space, observation, reward, termination and metrics."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.episode import Episode, episode_add, episode_start
-from drivax.metrics.selection import Wanted, selected
+from drivax.metrics.selection import MetricNames, select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.types import Facts, Frame, Scene, Situation, Surroundings
+from drivax.simulator.types import AgentContext, Facts, Frame, Situation, Surroundings
 from drivax.tasks.actions import ActionSpace, Physical
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
@@ -22,16 +22,16 @@ Failure = Literal["collision", "offroad", "red_light"]
 
 @dataclass(frozen=True)
 class Task:
-    """What makes driving a learning problem.
+    """Definition of a driving task.
 
     Attributes:
-        actions: The action space, and with it the dynamics.
+        actions: Action space and dynamics.
         observation: Groups and sizes.
-        rewards: Preset, weights, and terms of one's own.
-        metrics: What an episode is judged by: ``none``, ``training``, ``full``, or a list of sets, metrics and dotted
-            names of metrics of one's own. What is not named is neither measured nor carried.
+        rewards: Preset, weights and custom terms.
+        metrics: ``none``, ``training``, ``full``, or a list of sets, metrics and dotted names of custom metrics. Others
+            are neither measured nor carried.
         ends: Failures that terminate an episode.
-        to_the_end: Whether episodes go on to the end of the log whatever happens, as evaluation does.
+        to_the_end: Whether episodes continue to the end of the log after a failure, as in evaluation.
     """
 
     actions: ActionSpace = field(default_factory=Physical)
@@ -39,48 +39,48 @@ class Task:
     rewards: RewardConfig = field(default_factory=RewardConfig)
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
     to_the_end: bool = False
-    metrics: Wanted = "full"
+    metrics: MetricNames = "full"
 
     def __post_init__(self) -> None:
-        selected(self.metrics)
+        select_metrics(self.metrics)
 
     @property
     def reads(self) -> frozenset[str]:
-        """Facts that rewards, ends and metrics look at."""
+        """Facts that rewards, terminations and metrics read."""
         ends = frozenset() if self.to_the_end else frozenset({*self.ends, "left_map"})
-        return selected(self.metrics).reads | self.rewards.reads | ends
+        return select_metrics(self.metrics).reads | self.rewards.reads | ends
 
     def motion(
         self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
     ) -> Float[Array, " 4"]:
-        """Next motion for an action, by the dynamics of the action space."""
+        """Return the next motion by the dynamics of the action space."""
         return self.actions.move(motion, action, length)
 
     def actuated(
         self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
     ) -> Float[Array, " D"]:
-        """What is carried out of an action, within its bounds and the actuators' rates."""
+        """Return the executed action, within bounds and actuator rates."""
         return self.actions.actuated(motion, action, last)
 
     def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
-        """What counts as the last action when an episode begins."""
+        """Return the last action at the start of an episode."""
         return self.actions.first(history, length)
 
     def observe(
-        self, bank: ScenarioBank, scene: Scene, agents: Callable[[int], Frame], frame: Frame
+        self, bank: ScenarioBank, context: AgentContext, agents: Callable[[int], Frame], frame: Frame
     ) -> Observation:
-        """The observation of a scene; ``agents`` gives everyone's frame some steps back."""
-        return observe(self.observation, bank, scene, lambda back: agents(back) if back else frame)
+        """Return the observation of a context; ``agents`` returns the frame of all agents some steps ago."""
+        return observe(self.observation, bank, context, lambda back: agents(back) if back else frame)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
-        """Weighted terms by name."""
+        """Return weighted reward terms by name."""
         return self.rewards.weigh(before, now, around)
 
     def ended(
-        self, bank: ScenarioBank, scene: Scene, facts: Facts
+        self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Terminated by a failure; truncated where the log or the map ends."""
-        log_ends, terminated = scene.step >= bank.steps - 1, jnp.zeros((), bool)
+        """Return terminated (by a failure) and truncated (at the end of log or map)."""
+        log_ends, terminated = context.step >= bank.steps - 1, jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends
         for name in self.ends:
@@ -88,11 +88,11 @@ class Task:
         return terminated, (log_ends | facts.left_map) & ~terminated
 
     def episode_start(self) -> Episode:
-        """Empty accumulators."""
+        """Return empty metric accumulators."""
         return episode_start(self.metrics)
 
     def episode_add(
-        self, episode: Any, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+        self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Episode:
-        """Accumulators after the step that led to ``found``."""
-        return episode_add(episode, found, start, final)
+        """Return the accumulators after the step to ``situation``."""
+        return episode_add(episode, situation, start, final)

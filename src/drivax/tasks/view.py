@@ -1,4 +1,4 @@
-"""The frame and the units of observations."""
+"""Frame and units of observations."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.angles import rotate
+from drivax.geometry.vectors import rotate
 from drivax.scenario.record import record
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 
-#: What positions, speeds, sizes and the lengths of pieces of road are divided by.
+#: Units of positions, speeds, sizes and lengths of road pieces.
 POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
-#: Everyone's frame so many steps ago, 0 to 15; the number is a plain one, known when the program is compiled.
+#: Frame of all agents 0 to 15 steps ago; the number is static.
 Frames = Callable[[int], Frame]
 
 
 @record
 class View:
-    """The ego frame: x ahead, y to the left."""
+    """The ego frame: x ahead, y left."""
 
     xy: Float[Array, " 2"]
     cos: Float[Array, ""]
     sin: Float[Array, ""]
 
     @classmethod
-    def of(cls, scene: Scene) -> View:
-        """The frame of the driven agent now."""
-        now = scene.history[-1]
+    def of(cls, context: AgentContext) -> View:
+        """Return the frame of the driven agent now."""
+        now = context.history[-1]
         return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
 
     def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """A place of the world, m."""
+        """Transform a position, m."""
         return rotate(xy - self.xy, self.cos, -self.sin)
 
     def vector(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """A direction or velocity of the world."""
+        """Transform a direction or velocity."""
         return rotate(xy, self.cos, -self.sin)

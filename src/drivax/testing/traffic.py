@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.catalogue import make_traffic, prepared
 from drivax.simulator.traffic.log import alone, logged_history
-from drivax.simulator.types import Scene, Traffic
+from drivax.simulator.types import AgentContext, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task
 from drivax.testing import worlds
@@ -67,7 +68,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     index, program = jnp.arange(len(bank)), Program(what, _driven(traffic), (None, 0))
     seen: _Seen = program.check_pure(bank, index)
     _check_rows(what, seen)
-    there = seen.rows[..., AGENT_VALID] > 0
+    there = seen.rows[..., AgentColumn.VALID] > 0
 
     def told(change: Callable[[ScenarioBank], ScenarioBank]) -> Any:
         return program(prepared(traffic, change(worlds.worlds())), index).rows
@@ -75,7 +76,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     check_numbers(what, told(worlds.deserted))
     known = np.where(there[..., None], seen.rows, 0.0)
     littered = told(worlds.littered)
-    valid = littered[..., AGENT_VALID:] > 0
+    valid = littered[..., AgentColumn.VALID :] > 0
     check_same(
         what,
         known,
@@ -87,7 +88,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     check_same(
         what,
         known,
-        np.where(longer[..., AGENT_VALID:] > 0, longer, 0.0),
+        np.where(longer[..., AgentColumn.VALID :] > 0, longer, 0.0),
         "there are more empty slots",
         "mask with frame.valid, also before a mean",
     )
@@ -96,7 +97,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     check_same(
         what,
         wanted,
-        np.where(mixed[..., AGENT_VALID:] > 0, mixed, 0.0),
+        np.where(mixed[..., AgentColumn.VALID :] > 0, mixed, 0.0),
         "the agents stand in another order",
         "let no agent's motion follow from its slot",
     )
@@ -109,18 +110,18 @@ def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
     simulator = Simulator(Task(), traffic)
 
     def drive(bank: ScenarioBank, index: Any) -> _Seen:
-        def step(scene: Scene, _: None) -> tuple[Scene, _Seen]:
-            frame = simulator.frame(bank, scene, alone(scene), 0)
+        def step(context: AgentContext, _: None) -> tuple[AgentContext, _Seen]:
+            frame = simulator.frame(bank, context, alone(context), 0)
             moved = replace(
-                scene,
-                step=scene.step + 1,
-                history=logged_history(bank, index, scene.step + 1, 0),
-                traffic=traffic.advance(bank, scene, frame),
+                context,
+                step=context.step + 1,
+                history=logged_history(bank, index, context.step + 1, 0),
+                traffic=traffic.advance(bank, context, frame),
             )
-            rows, remembered = traffic.agents(bank, scene, 0), traffic.agents(bank, moved, 1)
-            return moved, _Seen(rows, remembered, View.of(scene))
+            rows, remembered = traffic.agents(bank, context, 0), traffic.agents(bank, moved, 1)
+            return moved, _Seen(rows, remembered, View.of(context))
 
-        return jax.lax.scan(step, simulator.scene(bank, index, _BEGIN), None, _STEPS)[1]
+        return jax.lax.scan(step, simulator.context(bank, index, _BEGIN), None, _STEPS)[1]
 
     return drive
 
@@ -129,7 +130,7 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     simulator = Simulator(Task(), traffic)
 
     def told(bank: ScenarioBank) -> Any:
-        return traffic.agents(bank, simulator.scene(bank, 0, _BEGIN), 0)
+        return traffic.agents(bank, simulator.context(bank, 0, _BEGIN), 0)
 
     rows, shape = jax.eval_shape(told, bank), bank.agents.shape[2:]
     expect(
@@ -139,9 +140,9 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     )
 
     def following(bank: ScenarioBank) -> tuple[Any, Any]:
-        scene = simulator.scene(bank, 0, _BEGIN)
-        frame = simulator.frame(bank, scene, alone(scene), 0)
-        return scene.traffic, traffic.advance(bank, scene, frame)
+        context = simulator.context(bank, 0, _BEGIN)
+        frame = simulator.frame(bank, context, alone(context), 0)
+        return context.traffic, traffic.advance(bank, context, frame)
 
     first, second = jax.eval_shape(following, bank)
     forms = [
@@ -163,7 +164,7 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
 def _check_rows(what: str, seen: _Seen) -> None:
     check_numbers(what, seen.rows)
     rows, remembered = seen.rows[:, :, 1:], seen.remembered[:, :, 1:]
-    valid = rows[..., AGENT_VALID]
+    valid = rows[..., AgentColumn.VALID]
     expect(np.isin(valid, (0.0, 1.0)).all(), f"{what} has agents that are half valid", "let valid be 0 or 1")
     there = valid > 0
     length = np.hypot(rows[..., 3], rows[..., 4])
@@ -173,10 +174,10 @@ def _check_rows(what: str, seen: _Seen) -> None:
         "columns 3 and 4 are cosine and sine of the heading",
     )
     expect(
-        (remembered[..., AGENT_VALID] == valid).all()
+        (remembered[..., AgentColumn.VALID] == valid).all()
         and np.allclose(remembered[there], rows[there], rtol=CLOSE, atol=1e-2),
         f"{what} says another thing of the past than it said then",
-        "let agents(bank, scene, back) tell where everyone was 'back' steps ago",
+        "let agents(bank, context, back) tell where everyone was 'back' steps ago",
     )
     both = there[:, 1:] & there[:, :-1]
     leap = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1)[both]
@@ -197,6 +198,11 @@ def _from_ego(seen: _Seen) -> Any:
         return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
 
     offset = rows[..., :2] - np.asarray(seen.view.xy)[:, :, None]
-    parts = [ahead(offset), ahead(rows[..., 3:5]), ahead(rows[..., 5:7]), rows[..., AGENT_VALID:]]
-    told = np.concatenate(parts, axis=-1) * rows[..., AGENT_VALID:]
+    parts = [
+        ahead(offset),
+        ahead(rows[..., AgentColumn.HEADING]),
+        ahead(rows[..., AgentColumn.VELOCITY]),
+        rows[..., AgentColumn.VALID :],
+    ]
+    told = np.concatenate(parts, axis=-1) * rows[..., AgentColumn.VALID :]
     return told.reshape(-1, *told.shape[2:])

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from drivax.geometry.angles import wrap
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, ScenarioBank, as_words
+from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.columns import AgentColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank, as_words
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.record import record
 from drivax.scenario.recording import Recording
@@ -107,15 +108,15 @@ def _moments(bank: ScenarioBank) -> Moments:
 def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Situation:
     """What is measured when ego has driven like its log, but aside, askew and at another speed."""
     simulator = Simulator(Task())
-    scene = simulator.scene(bank, index, step)
-    x, y, heading, speed = jnp.moveaxis(scene.history, -1, 0)
+    context = simulator.context(bank, index, step)
+    x, y, heading, speed = jnp.moveaxis(context.history, -1, 0)
     aside, askew, pace = place
     shifted = jnp.stack([x - aside * jnp.sin(heading), y + aside * jnp.cos(heading)], axis=-1)
     moved = jnp.stack([wrap(heading + askew), speed * pace], axis=-1)
-    scene = replace(scene, history=jnp.concatenate([shifted, moved], axis=-1))
-    now, previous = (simulator.frame(bank, scene, alone(scene), back) for back in (0, 1))
+    context = replace(context, history=jnp.concatenate([shifted, moved], axis=-1))
+    now, previous = (simulator.frame(bank, context, alone(context), back) for back in (0, 1))
     apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
-    return measure(bank, scene, now, previous, apart, remember_lights(bank, scene), FACTS | ON_REQUEST)[0]
+    return measure(bank, context, now, previous, apart, remember_lights(bank, context), FACTS | ON_REQUEST)[0]
 
 
 def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:
@@ -160,7 +161,7 @@ def with_frame(moments: Moments, frame: Frame) -> Moments:
     """The same moments with everyone's frame replaced."""
     around = moments.found.surroundings
     around = Surroundings(frame, around.lanes, around.route)
-    return replace(moments, found=Situation(moments.found.scene, moments.found.facts, around))
+    return replace(moments, found=Situation(moments.found.context, moments.found.facts, around))
 
 
 def extremes(moments: Moments) -> Moments:
@@ -182,7 +183,7 @@ def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
             lambda path, fact: fact if path[0].name in reads else None, facts
         )
 
-    found = Situation(moments.found.scene, kept(moments.found.facts), moments.found.surroundings)
+    found = Situation(moments.found.context, kept(moments.found.facts), moments.found.surroundings)
     return Moments(kept(moments.before), found, moments.start)
 
 
@@ -216,8 +217,8 @@ def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
 
 def littered(bank: ScenarioBank) -> ScenarioBank:
     """The same scenarios; rows of agents that are not there hold garbage."""
-    there = bank.agents[..., AGENT_VALID] > 0
-    agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AGENT_VALID].set(there)
+    there = bank.agents[..., AgentColumn.VALID] > 0
+    agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AgentColumn.VALID].set(there)
     ever = (bank.parked_when > 0).any(axis=1)[..., None]
     return replace(bank, agents=agents, parked=jnp.where(ever, bank.parked, GARBAGE))
 
@@ -225,7 +226,7 @@ def littered(bank: ScenarioBank) -> ScenarioBank:
 def deserted(bank: ScenarioBank) -> ScenarioBank:
     """The same roads with nobody on them but ego."""
     others = jnp.arange(bank.agents.shape[2]) > 0
-    agents = bank.agents.at[..., AGENT_VALID].multiply(~others)
+    agents = bank.agents.at[..., AgentColumn.VALID].multiply(~others)
     return replace(bank, agents=agents, parked_when=jnp.zeros_like(bank.parked_when))
 
 
@@ -235,8 +236,8 @@ def forgotten(bank: ScenarioBank, step: int) -> ScenarioBank:
     Others go somewhere else, lights turn, and the log's own path is gone. Route and goal remain: they are told to ego.
     """
     later = jnp.arange(bank.steps) > step
-    moved = bank.agents.at[..., :2].add(13.0).at[..., 5:7].multiply(-1.0)
-    moved = moved.at[..., AGENT_VALID].set(1.0 - bank.agents[..., AGENT_VALID])
+    moved = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
+    moved = moved.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
     return replace(
         bank,
         agents=jnp.where(later[None, :, None, None], moved, bank.agents),

@@ -20,7 +20,7 @@ from drivax.learning.sampler import draw
 from drivax.networks.actor_critic import Critic, NetworkConfig
 from drivax.networks.distributions import Actions
 from drivax.networks.encoders import GroupSpec
-from drivax.networks.normalised import Statistics, tell_statistics
+from drivax.networks.normalised import Statistics, set_statistics
 from drivax.rl.temporal_difference import polyak, td_target
 
 
@@ -82,7 +82,7 @@ class FittedQ:
         """
         network_key, key = jax.random.split(jax.random.key(0))
         critic = self._critic(self.environment.shapes(data.data), network_key)
-        tell_statistics(critic, statistics)
+        set_statistics(critic, statistics)
         graph, first = nnx.split(critic, nnx.Param)
         config = self.config
         optimiser = clipped_adam(config.rate, config.gradient_norm, updates=config.updates)

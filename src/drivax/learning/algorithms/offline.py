@@ -28,7 +28,7 @@ from drivax.networks.normalised import (
     NormalisedConfig,
     Statistics,
     feature_statistics,
-    tell_statistics,
+    set_statistics,
 )
 from drivax.planners.network_planner import NetworkPlanner
 from drivax.rl.temporal_difference import polyak
@@ -203,7 +203,7 @@ class Offline:
         if self.settings.normalise and isinstance(data, Experience):
             statistics = self._statistics(data)
             for network in networks.values():
-                tell_statistics(network, statistics)
+                set_statistics(network, statistics)
         trained = {name: nnx.state(made, nnx.Param) for name, made in networks.items()}
         trained |= {name: jnp.asarray(number, jnp.float32) for name, number in self.numbers().items()}
         return OfflineState(

@@ -12,16 +12,9 @@ from drivax.geometry.boxes import COS, SIN, gap, overlap
 from drivax.geometry.vectors import norm
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.tracking import Reference
+from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import (
-    ROUTE_COS,
-    ROUTE_LIMIT,
-    ROUTE_SIN,
-    ROUTE_X,
-    ROUTE_Y,
-    ROUTE_Z,
-    ScenarioBank,
-)
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
@@ -81,17 +74,19 @@ class Lines:
         def rows(ways: Float[Array, " M"]) -> Float[Array, "M 7"]:
             inside = jnp.clip(ways, 0.0, jnp.maximum(left_m, 0.0))
             row, _ = route_ahead(bank, index, along_m, inside)
-            straight = jnp.zeros(7).at[:2].set(me[:2]).at[ROUTE_COS : ROUTE_SIN + 1].set(me[COS : SIN + 1])
+            straight = (
+                jnp.zeros(7).at[RouteColumn.XY].set(me[:2]).at[RouteColumn.HEADING].set(me[COS : SIN + 1])
+            )
             row = jnp.where(there, row, straight)
-            heading = row[:, ROUTE_COS : ROUTE_SIN + 1]
+            heading = row[:, RouteColumn.HEADING]
             heading = heading / jnp.maximum(norm(heading), 1e-6)[:, None]
-            xy = row[:, : ROUTE_Y + 1] + (ways - inside)[:, None] * heading
-            return row.at[:, : ROUTE_Y + 1].set(xy).at[:, ROUTE_COS : ROUTE_SIN + 1].set(heading)
+            xy = row[:, RouteColumn.XY] + (ways - inside)[:, None] * heading
+            return row.at[:, RouteColumn.XY].set(xy).at[:, RouteColumn.HEADING].set(heading)
 
         ways = jnp.arange(POINTS, dtype=jnp.float32)
         base = rows(ways)
         points = jnp.stack([_line(rows, base, ways, offset) for offset in offsets_m])
-        return cls(points, base[::_EVERY], left_m, jnp.where(there, base[0, ROUTE_LIMIT], 0.0))
+        return cls(points, base[::_EVERY], left_m, jnp.where(there, base[0, RouteColumn.LIMIT], 0.0))
 
     def at(self, way: Float[Array, "P *T"]) -> Float[Array, "P *T 7"]:
         """Rows at ways along each line."""
@@ -128,8 +123,8 @@ def _line(
     """One line, at evenly spaced points along itself."""
 
     def shifted(row: Float[Array, "M 7"]) -> Float[Array, "M 2"]:
-        normal = jnp.stack([-row[:, ROUTE_SIN], row[:, ROUTE_COS]], axis=-1)
-        return row[:, : ROUTE_Y + 1] + offset * normal
+        normal = jnp.stack([-row[:, RouteColumn.SIN], row[:, RouteColumn.COS]], axis=-1)
+        return row[:, RouteColumn.XY] + offset * normal
 
     place = ways
     if offset:
@@ -137,13 +132,22 @@ def _line(
         arc = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
         place = jnp.interp(ways, arc, ways) + jnp.maximum(ways - arc[-1], 0.0)
     row = rows(place) if offset else base
-    cos, sin = row[:, ROUTE_COS], row[:, ROUTE_SIN]
+    cos, sin = row[:, RouteColumn.COS], row[:, RouteColumn.SIN]
     c0, s0, c1, s1 = cos[: -2 * _BEND], sin[: -2 * _BEND], cos[2 * _BEND :], sin[2 * _BEND :]
     bend = jnp.arctan2(c0 * s1 - s0 * c1, c0 * c1 + s0 * s1) / (2.0 * _BEND)
-    height = row[:, ROUTE_Z] - base[0, ROUTE_Z]
+    height = row[:, RouteColumn.Z] - base[0, RouteColumn.Z]
     xy = shifted(row)
     return jnp.stack(
-        [xy[:, ROUTE_X], xy[:, ROUTE_Y], cos, sin, jnp.pad(bend, _BEND, mode="edge"), place, height], 1
+        [
+            xy[:, RouteColumn.X],
+            xy[:, RouteColumn.Y],
+            cos,
+            sin,
+            jnp.pad(bend, _BEND, mode="edge"),
+            place,
+            height,
+        ],
+        1,
     )
 
 

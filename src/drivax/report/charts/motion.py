@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.metrics.comfort import (
     JERK_MPS3,
     LATERAL_MPS2,
     LONGITUDINAL_MPS2,
     WINDOW,
     YAW_RATE_RPS,
-    filter_operator,
+    savgol_matrix,
 )
 from drivax.scenario.schema import DT_S
 
@@ -87,7 +87,7 @@ def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
     turned = np.asarray(wrap(np.diff(path[:, 2])))
     along, middle = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
     samples = end - first - 1
-    smooth, slope = filter_operator(samples, 8, 2, 0), filter_operator(samples, WINDOW, 2, 1) / DT_S
+    smooth, slope = savgol_matrix(samples, 8, 2, 0), savgol_matrix(samples, WINDOW, 2, 1) / DT_S
     rate = slope @ np.cumsum(turned)
     found["acceleration"][at] = smooth @ along
     found["lateral"][at] = smooth @ (middle * turned / DT_S)

@@ -123,7 +123,7 @@ def draw_moment(
 ) -> Figure:
     """Draws what the ego of a scenario sees at a step of its log."""
     simulator = Simulator(task)
-    observe = jax.jit(lambda bank: simulator.observe(bank, simulator.scene(bank, row, step)))
+    observe = jax.jit(lambda bank: simulator.observe(bank, simulator.context(bank, row, step)))
     return draw_observation(task.observation, observe(bank), title)
 
 

@@ -1,6 +1,6 @@
 """From which lane to which a car passes: lane changes and merges, step by step.
 
-A car is on a strand of lanes (``scenario.build.lane_codes``) until its centre is 0.3 m nearer to the middle of
+A car is on a strand of lanes (``scenario.bank.strands``) until its centre is 0.3 m nearer to the middle of
 another than
 the line between them, so that one that drives along the line does not change lanes with every step.
 """
@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import norm, root
+from drivax.scenario.bank.columns import StrandColumn
 from drivax.scenario.bank.queries import LANE_CUTOFF_M, aligned_lanes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.scenario.build.lane_codes import STRAND, STRAND_END_X, STRAND_LEFT, STRAND_ONTO, STRAND_RIGHT
 from drivax.scenario.record import record
 
 #: A passage counts once the centre is so far beyond the line between two lanes, m.
@@ -60,7 +60,7 @@ def lane_passage(
     """
     lane, squared, side = aligned_lanes(bank, index, xy, heading, z)
     codes = bank.lane_codes[index]
-    strand = jnp.where(lane >= 0, codes[lane, STRAND], -1.0).astype(jnp.int32)
+    strand = jnp.where(lane >= 0, codes[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
     best = first_smallest(squared)
     own = jnp.where((strand == before) & (strand >= 0), squared, _FAR)
     held = first_smallest(own)
@@ -68,11 +68,11 @@ def lane_passage(
     stays = kept & (root(own[held]) - root(squared[best]) <= 2 * BEYOND_M)
     now = jnp.where(stays, before, jnp.where(near, strand[best], -1))
     old, new = codes[lane[held]], codes[lane[best]]
-    beside = (new[STRAND_LEFT] == before) | (new[STRAND_RIGHT] == before)
-    beside = (beside | (old[STRAND_LEFT] == now) | (old[STRAND_RIGHT] == now)) & kept
+    beside = (new[StrandColumn.LEFT] == before) | (new[StrandColumn.RIGHT] == before)
+    beside = (beside | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & kept
     passed = (before >= 0) & (now >= 0) & (now != before)
     changed = passed & beside & (jnp.abs(side[held] - side[best]) >= SIDE_BY_SIDE_M)
     left = codes[before]
-    ending = norm(xy - left[STRAND_END_X:]) <= MERGE_M
-    merged = passed & ending & (changed | (left[STRAND_ONTO] == now))
+    ending = norm(xy - left[StrandColumn.END]) <= MERGE_M
+    merged = passed & ending & (changed | (left[StrandColumn.ONTO] == now))
     return Passage(now.astype(jnp.int16), changed, merged)

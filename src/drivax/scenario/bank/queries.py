@@ -7,24 +7,17 @@ grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import root
-from drivax.scenario.bank.nearby import edges_around, lanes_around, to_segments
-from drivax.scenario.bank.scenario_bank import (
-    LIGHT_COS,
-    LIGHT_HALF,
-    LIGHT_SIN,
-    LIGHT_X,
-    LIGHT_Y,
-    LIGHT_Z,
-    ROUTE_LIMIT,
-    ScenarioBank,
-)
+from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.scenario.build.sides import NOT_DRIVABLE, SPLIT
+from drivax.scenario.build.grid import NOT_DRIVABLE, SPLIT
 from drivax.scenario.record import record
 
 EDGE_CUTOFF_M = 3.0
@@ -37,6 +30,8 @@ LANE_MARGIN_M = 0.2
 #: A car follows a lane whose centre is this near, m.
 _FOLLOWED_M = 2.5
 _FAR = 1e9
+_WINDOW = 40
+_WINDOW_BEHIND = 6
 
 
 def left_of_edges(
@@ -53,13 +48,78 @@ def left_of_edges(
     """
     rows, inside = edges_around(bank, index, centre)
     squared, side = to_segments(rows, points)
-    squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
+    squared = jnp.where(inside & _level(rows[EdgeRow.Z], z), squared, _FAR)
     nearest = squared.min(axis=1)
     tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
     left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
     right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
     distance = root(nearest)
     return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
+
+
+def edges_around(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]
+) -> tuple[Float[Array, "5 K"], Bool[Array, " K"]]:
+    """Rows of ``bank.edges`` in the 3 x 3 cells around a point, and which of them count."""
+    return _around(bank, bank.grid_edge, bank.edges, bank.edge_run, index, xy)
+
+
+def lanes_around(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]
+) -> tuple[Float[Array, "8 K"], Bool[Array, " K"]]:
+    """Rows of ``bank.lanes`` in the 3 x 3 cells around a point, and which of them count."""
+    return _around(bank, bank.grid_lane, bank.lanes, bank.lane_run, index, xy)
+
+
+def _around(
+    bank: ScenarioBank, start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int,
+    index: Int[Array, ""], xy: Float[Array, " 2"],
+) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
+    """Three contiguous reads of fixed length; a grid of one cell is read whole (``scenario.bank.exhaustive``)."""
+    grid = round((start.shape[1] - 1) ** 0.5)
+    if grid == 1:
+        return rows[index], jnp.arange(rows.shape[2]) < start[index, 1]
+    # Clamped so that the 3 x 3 block lies in the grid.
+    cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
+    cell = jnp.clip(cell, 1, grid - 2)
+    features, inside = [], []
+    for below in (-1, 0, 1):
+        first = (cell[1] + below) * grid + cell[0] - 1
+        bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
+        block = jax.lax.dynamic_slice(rows, (index, jnp.int32(0), bounds[0]), (1, rows.shape[1], run))[0]
+        features.append(block)
+        inside.append(jnp.arange(run) < bounds[3] - bounds[0])
+    # Read once: without the barrier XLA repeats the reads in every operation that uses them.
+    return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
+
+
+def to_segments(
+    rows: Float[Array, "F K"] | Sequence[Float[Array, " K"]], points: Float[Array, "P 2"]
+) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
+    """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
+    ax, ay, bx, by = (rows[k] for k in (EdgeRow.X_A, EdgeRow.Y_A, EdgeRow.X_B, EdgeRow.Y_B))
+    ux, uy = bx - ax, by - ay
+    wx, wy = points[:, 0:1] - ax, points[:, 1:2] - ay
+    squared = jnp.maximum(ux * ux + uy * uy, 1e-9)
+    along = jnp.clip((wx * ux + wy * uy) / squared, 0.0, 1.0)
+    dx, dy = wx - along * ux, wy - along * uy
+    return dx * dx + dy * dy, (ux * wy - uy * wx) * jax.lax.rsqrt(squared)
+
+
+def _level(height: Float[Array, " K"], z: Float[Array, ""]) -> Bool[Array, " K"]:
+    """Whether segments lie on the level of a height."""
+    return jnp.abs(height - z) <= LEVEL_M
+
+
+def _chord(rows: Float[Array, "F K"]) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
+    """Components of the vectors from the beginnings to the ends of segments."""
+    return rows[LaneRow.X_B] - rows[LaneRow.X_A], rows[LaneRow.Y_B] - rows[LaneRow.Y_A]
+
+
+def _runs_along(rows: Float[Array, "F K"], heading: Float[Array, " 2"]) -> Bool[Array, " K"]:
+    """Whether segments lead less than 90 degrees away from a heading."""
+    ux, uy = _chord(rows)
+    return ux * heading[0] + uy * heading[1] > 0.0
 
 
 @record
@@ -106,11 +166,11 @@ def around_lanes(
         z: Its height.
     """
     rows, inside = lanes_around(bank, index, centre)
-    inside = inside & (jnp.abs(rows[4] - z) <= LEVEL_M)
+    inside = inside & _level(rows[LaneRow.Z], z)
     squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
     squared = jnp.where(inside, squared, _FAR)
-    half, limit = rows[5], rows[6]
-    ux, uy = rows[2] - rows[0], rows[3] - rows[1]
+    half, limit = rows[LaneRow.HALF_WIDTH], rows[LaneRow.LIMIT]
+    ux, uy = _chord(rows)
     aligned_cos = (ux * heading[0] + uy * heading[1]) * jax.lax.rsqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     aligned, against = aligned_cos > 0.0, aligned_cos < -(0.5**0.5)
     own, corner = squared[0], squared[1:]
@@ -130,14 +190,16 @@ def around_lanes(
     return LaneHits(
         near=near,
         points_near=points_near,
-        on_corridor=((rows[7] > jnp.floor(rows[7])) & (own <= (half + LANE_MARGIN_M) ** 2)).any(),
+        on_corridor=(
+            (rows[LaneRow.LANE] > jnp.floor(rows[LaneRow.LANE])) & (own <= (half + LANE_MARGIN_M) ** 2)
+        ).any(),
         wrong_way=(opposed < _FAR / 2) & (opposed < friendly),
         straddling=outside.any(),
         leaving_lane=has_lane & leaving.any(),
         limit=jnp.where(has_lane, limit[best], -1.0),
-        lane=jnp.where(has_lane, jnp.floor(rows[7, best]), -1.0).astype(jnp.int32),
+        lane=jnp.where(has_lane, jnp.floor(rows[LaneRow.LANE, best]), -1.0).astype(jnp.int32),
         offset=jnp.where(has_lane, side[0, best], 0.0),
-        z=jnp.where(near, rows[4, nearest], z),
+        z=jnp.where(near, rows[LaneRow.Z, nearest], z),
     )
 
 
@@ -151,9 +213,12 @@ def aligned_lanes(
     """
     rows, inside = lanes_around(bank, index, xy)
     squared, side = to_segments(rows, xy[None])
-    aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
-    counts = inside & aligned & (jnp.abs(rows[4] - z) <= LEVEL_M)
-    return jnp.where(counts, rows[7], -1.0).astype(jnp.int32), jnp.where(counts, squared[0], _FAR), side[0]
+    counts = inside & _runs_along(rows, heading) & _level(rows[LaneRow.Z], z)
+    return (
+        jnp.where(counts, rows[LaneRow.LANE], -1.0).astype(jnp.int32),
+        jnp.where(counts, squared[0], _FAR),
+        side[0],
+    )
 
 
 def lane_distance(
@@ -162,7 +227,7 @@ def lane_distance(
     """Distance to the nearest lane centre, whichever way it runs, m; infinite where none is within the cut-off."""
     rows, inside = lanes_around(bank, index, xy)
     squared = to_segments(rows, xy[None])[0][0]
-    nearest = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR).min()
+    nearest = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR).min()
     return jnp.where(nearest <= LANE_CUTOFF_M**2, root(nearest), jnp.inf)
 
 
@@ -183,7 +248,8 @@ def vertex_distances(
 def _nearest_vertex(
     rows: Float[Array, "F K"], inside: Bool[Array, " K"], xy: Float[Array, " 2"], spacing_m: float
 ) -> Float[Array, ""]:
-    u, w = rows[2:4] - rows[0:2], xy[:, None] - rows[0:2]
+    begin, end = rows[EdgeRow.A], rows[EdgeRow.B]
+    u, w = end - begin, xy[:, None] - begin
     length = root(jnp.sum(u * u, axis=0))
     along = jnp.sum(u * w, axis=0) / jnp.maximum(length, 1e-6)
     across = (u[0] * w[1] - u[1] * w[0]) / jnp.maximum(length, 1e-6)
@@ -210,9 +276,9 @@ def _corner_lanes(
     """For a corner that its box's own cells may not reach: whether a lane is near, and whether it is outside all."""
     rows, inside = lanes_around(bank, index, point)
     squared = to_segments(rows, point[None])[0]
-    squared = jnp.where(inside & (jnp.abs(rows[4] - z) <= LEVEL_M), squared, _FAR)
-    aligned = (rows[2] - rows[0]) * heading[0] + (rows[3] - rows[1]) * heading[1] > 0.0
-    return squared.min() <= LANE_CUTOFF_M**2, _outside_lanes(squared, aligned, rows[5])[0]
+    squared = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR)
+    outside = _outside_lanes(squared, _runs_along(rows, heading), rows[LaneRow.HALF_WIDTH])
+    return squared.min() <= LANE_CUTOFF_M**2, outside[0]
 
 
 def offroad_distance(
@@ -235,7 +301,7 @@ def offroad_distance(
 
 
 def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array, "P 2"]) -> Int[Array, " P"]:
-    """Code of the side cell of each point (``scenario.build.sides.packed``); 0 outside the grid."""
+    """Code of the side cell of each point (``scenario.build.grid.packed``); 0 outside the grid."""
     grid = round(bank.grid_side.shape[1] ** 0.5)
     fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
     inside = ((fine >= 0) & (fine < grid * SPLIT)).all(axis=1)
@@ -265,10 +331,6 @@ class RouteHit:
     heading: Float[Array, " 2"]
 
 
-_WINDOW = 40
-_WINDOW_BEHIND = 6
-
-
 def project_on_route(
     bank: ScenarioBank,
     index: Int[Array, ""],
@@ -291,22 +353,22 @@ def project_on_route(
     first = jnp.clip(near_m.astype(jnp.int32) - _WINDOW_BEHIND, 0, max(count - _WINDOW, 0))
     size = min(_WINDOW, count)
     window = jax.lax.dynamic_slice(
-        bank.routes, (index, jnp.int32(route), first, jnp.int32(0)), (1, 1, size, 5)
+        bank.routes, (index, jnp.int32(route), first, jnp.int32(0)), (1, 1, size, RouteColumn.LIMIT)
     )[0, 0]
     a, b = window[:-1], window[1:]
     place = first + jnp.arange(size - 1)
     real = (place + 1 < bank.route_points[index, route]) & (place <= near_m + ahead_m)
-    rows = [a[:, 0], a[:, 1], b[:, 0], b[:, 1]]
-    squared, side = to_segments(rows, xy[None])
+    ends = [end[:, column] for end in (a, b) for column in (RouteColumn.X, RouteColumn.Y)]
+    squared, side = to_segments(ends, xy[None])
     k = first_smallest(jnp.where(real, squared[0], _FAR))
-    u, w = b[k, :2] - a[k, :2], xy - a[k, :2]
+    u, w = b[k, RouteColumn.XY] - a[k, RouteColumn.XY], xy - a[k, RouteColumn.XY]
     part = jnp.clip(jnp.sum(u * w) / jnp.maximum(jnp.sum(u * u), 1e-9), 0.0, 1.0)
     distance = root(squared[0, k])
     return RouteHit(
         along_m=(first + k).astype(jnp.float32) + part,
         lateral_m=jnp.where(side[0, k] >= 0, distance, -distance),
         distance_m=distance,
-        heading=window[k, 3:5],
+        heading=window[k, RouteColumn.HEADING],
     )
 
 
@@ -319,7 +381,7 @@ def route_ahead(
     last = bank.route_points[index, route] - 1
     low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
     # Lanes and limits are not numbers to blend.
-    part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < ROUTE_LIMIT)
+    part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < RouteColumn.LIMIT)
     rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
     return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
 
@@ -337,16 +399,16 @@ def light_crossing(
     finite segment. The distance is infinite for lines of other lanes (more than 2 m beside the segment) and levels.
     """
     line = bank.light_line[index]
-    cos, sin, half = line[LIGHT_COS], line[LIGHT_SIN], line[LIGHT_HALF]
+    cos, sin, half = line[LightRow.COS], line[LightRow.SIN], line[LightRow.HALF]
 
     def split(point: Float[Array, " 2"]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
-        dx, dy = point[0] - line[LIGHT_X], point[1] - line[LIGHT_Y]
+        dx, dy = point[0] - line[LightRow.X], point[1] - line[LightRow.Y]
         return dx * cos + dy * sin, dy * cos - dx * sin
 
     (s0, t0), (s1, t1) = split(before), split(now)
     share = -s0 / jnp.where(s1 > s0, s1 - s0, 1.0)
     through = jnp.abs(t0 + (t1 - t0) * share) <= half
-    level = jnp.abs(line[LIGHT_Z] - z) <= LEVEL_M
+    level = jnp.abs(line[LightRow.Z] - z) <= LEVEL_M
     before_m = jnp.where(level & (jnp.abs(t1) <= half + 2.0), -s1, jnp.inf)
     return (s0 < 0.0) & (s1 >= 0.0) & through & level, before_m
 
@@ -365,11 +427,11 @@ def lane_course(
     """
     rows, inside = lanes_around(bank, index, xy)
     squared, side = to_segments(rows, xy[None])
-    ux, uy = rows[2] - rows[0], rows[3] - rows[1]
+    ux, uy = _chord(rows)
     length = jnp.sqrt(jnp.maximum(ux * ux + uy * uy, 1e-9))
     cos = (ux * heading[0] + uy * heading[1]) / length
     sin = (ux * heading[1] - uy * heading[0]) / length
-    fits = inside & (jnp.abs(rows[4] - z) <= LEVEL_M) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
+    fits = inside & _level(rows[LaneRow.Z], z) & (cos > 0.5) & (squared[0] <= _FOLLOWED_M**2)
     best = first_smallest(jnp.where(fits, squared[0] + (4.0 * sin) ** 2, _FAR))
     direction = jnp.stack([ux[best], uy[best]]) / length[best]
     return direction, side[0, best], fits[best]

@@ -7,40 +7,141 @@ segments feature-major (a grid query is three contiguous reads per feature).
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt, UInt32
 
-from drivax.errors import DataError
-from drivax.geometry.angles import wrap
-from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.sizes import Sizes, last_used
-from drivax.scenario.build.lane_codes import corridor_lanes, lane_codes
+from drivax.errors import DataError, DrivaxError
+from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.columns import RoadLayer, SizeColumn
+from drivax.scenario.bank.strands import corridor_lanes, lane_codes
 from drivax.scenario.record import record, static
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
+from drivax.scenario.schema import (
+    EDGE_KINDS,
+    LANE_KINDS,
+    POLYGON_KINDS,
+    Capacity,
+    Flag,
+    RoadKind,
+    Scenario,
+    among,
+)
 
+#: Sizes are multiples of this, so that banks of similar scenarios share programs.
+_MULTIPLE = 8
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
 #: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
 CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
-
-AGENT_X, AGENT_Y, AGENT_Z, AGENT_COS, AGENT_SIN, AGENT_VX, AGENT_VY, AGENT_VALID = range(8)
-ROUTE_X, ROUTE_Y, ROUTE_Z, ROUTE_COS, ROUTE_SIN, ROUTE_LIMIT, ROUTE_LANE = range(7)
-#: A stop line: middle, direction of its lane there, half length, height, direction of the lane's end, whether that end
-#: is more than 45 deg to the right, arc length along route 0 where a lane of that leads over it (else very large).
-(
-    LIGHT_X, LIGHT_Y, LIGHT_COS, LIGHT_SIN, LIGHT_HALF, LIGHT_Z, LIGHT_EXIT_COS, LIGHT_EXIT_SIN, LIGHT_RIGHT, LIGHT_ARC,
-) = range(10)  # fmt: skip
+#: Arc length of stop lines that are not on the route.
 NEVER_M = 1e6
 #: Steps in a word of ``parked_when``.
 WORD = 32
-#: Layers of observed pieces of road; rows that hold none are on no layer.
-ROAD_LANE, ROAD_EDGE, ROAD_AREA, ROAD_NONE = range(4)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much of each axis is kept; banks of the same sizes run the same compiled programs.
+
+    Attributes:
+        agents: Moving agents.
+        slots: Slots of a frame: moving and parked agents.
+        lights: Stop lines.
+        edges, lanes: Segments of road edges and of car lanes.
+        edge_run, lane_run: Longest run of a row of three grid cells.
+        graphs: Lanes of the graph.
+        road: Pieces of road to observe.
+        long_ego: Whether some ego reaches further than the grid's guarantee from its centre.
+    """
+
+    agents: int
+    slots: int
+    lights: int
+    edges: int
+    lanes: int
+    edge_run: int
+    lane_run: int
+    graphs: int
+    road: int
+    long_ego: bool
+
+    @classmethod
+    def whole(cls, capacity: Capacity) -> Sizes:
+        """All of a capacity."""
+        return cls(
+            agents=capacity.agents,
+            slots=capacity.agents + capacity.parked,
+            lights=capacity.lights,
+            edges=capacity.segments,
+            lanes=capacity.segments,
+            edge_run=capacity.edge_run,
+            lane_run=capacity.lane_run,
+            graphs=capacity.lanes,
+            road=capacity.road_rows,
+            long_ego=False,
+        )
+
+    @classmethod
+    def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
+        """As much as scenarios of one capacity use.
+
+        Raises:
+            DrivaxError: There are none.
+        """
+        found = [_needed(scenario) for scenario in scenarios]
+        if not found:
+            raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
+        return cls(*(max(getattr(one, field.name) for one in found) for field in fields(cls)))
+
+
+def last_used(mask: Any) -> np.ndarray[Any, Any]:
+    """One more than the last column that each row of ``mask [N, columns]`` uses."""
+    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
+
+
+def _needed(scenario: Scenario) -> Sizes:
+    capacity, record = scenario.capacity, scenario.record
+    masks = {
+        "agents": record["agent_valid"].any(0), "parked": record["parked_valid"].any(0),
+        "lights": (record["light_state"] >= 0).any(0), "graphs": record["lane_length"] > 0,
+    }  # fmt: skip
+    ends = {name: int(last_used(np.asarray(mask)[None])[0]) for name, mask in masks.items()}
+    agents = max(1, _rounded(ends["agents"], capacity.agents))
+    slots = _rounded(ends["agents"] + ends["parked"], capacity.agents + capacity.parked)
+    _, edges, segments = (int(number) for number in record["segment_blocks"][:3])
+    half_m = float(np.hypot(*record["agent_size"][0, :2])) / 2
+    return Sizes(
+        agents=agents,
+        slots=max(slots, agents),
+        lights=max(1, _rounded(ends["lights"], capacity.lights)),
+        edges=edges,
+        lanes=segments - edges,
+        edge_run=_longest_run(record["grid_edge"], capacity.grid),
+        lane_run=_longest_run(record["grid_lane"], capacity.grid),
+        graphs=max(1, _rounded(ends["graphs"], capacity.lanes)),
+        road=max(1, int(record["road_rows"])),
+        # Edges count up to 3 m from a corner, and the 3 x 3 block is exact within a cell less half a segment.
+        long_ego=half_m + 3.0 > capacity.cell_m - 2.0,
+    )
+
+
+def _rounded(count: int, most: int) -> int:
+    return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
+
+
+def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
+    """Longest run over three neighbouring cells of a grid row, at least 8, rounded up to 8."""
+    begin = start[:-1].reshape(grid, grid).astype(np.int64)
+    end = start[1:].reshape(grid, grid).astype(np.int64)
+    longest = max(int((end[:, 2:] - begin[:, :-2]).max()), 1)
+    return -(-longest // _MULTIPLE) * _MULTIPLE
 
 
 @record
@@ -51,26 +152,25 @@ class ScenarioBank:
     as many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
 
     Attributes:
-        agents: x, y, z, cos, sin, vx, vy, valid of moving agents; slot 0 is ego.
-        agent_box: Length, width, height, kind of everyone.
-        parked: Rows like those of ``agents``, for the slots of parked ones.
-        parked_when: When each of them is there: bit ``t % 32`` of word ``t // 32``; never for slots of moving agents.
-        light_line: Stop lines, see ``LIGHT_X`` to ``LIGHT_ARC``.
-        edges: x, y, x, y, z of road-edge segments (drivable side on the left), sorted by grid cell.
-        lanes: x, y, x, y, z, half width, limit (-1 undefined), lane index of car-lane segments, sorted by cell. Half is
-            added to the index of lanes of the corridor: the route's lanes and their same-direction neighbours.
-        lane_codes: Strand, neighbours and end of every lane of the graph (``scenario.build.lane_codes``).
+        agents: Moving agents, :class:`AgentColumn`; slot 0 is ego.
+        agent_box: Size and kind of all agents, :class:`SizeColumn`.
+        parked: Parked agents in their slots, :class:`AgentColumn`.
+        parked_when: Steps at which parked agents are observed: bit ``t % 32`` of word ``t // 32``.
+        light_line: Stop lines, :class:`LightRow`.
+        edges: Road-edge segments (drivable side on the left) sorted by grid cell, :class:`EdgeRow`.
+        lanes: Car-lane segments sorted by grid cell, :class:`LaneRow`.
+        lane_codes: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
-        grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.build.sides.packed``).
+        grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.build.grid.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
-        routes: Row 0 to the goal, row 1 the log's own: x, y, z, cos, sin, limit, lane at 1 m.
+        routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
         log_progress: Arc length of the logged ego along route 0.
         log_ahead: Distance that the logged ego still drives.
-        road: Observation pieces in order of rank: x, y, direction, length, layer (``ROAD_LANE``, ...), limit (-1).
-        road_at: What decides which of them are seen: x, y, layer.
+        road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
+        road_at: x, y and layer of the same pieces.
         road_curvature: Turn of each piece per metre, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
-        identity: What chance in a scenario follows from, whatever row it has (``scenario.bank.identity``).
+        identity: What chance in a scenario follows from, whatever row it has (``scenario.bank.scenario_bank``).
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
         paths: Paths of agents that react (``simulator.traffic.agent_paths.with_paths``), None where nobody does.
         driver: Planner that drives others than ego (``planners.planner_traffic.with_driver``), None where nobody does.
@@ -127,6 +227,14 @@ class ScenarioBank:
         """Bytes that the bank takes on the device."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
 
+    def length_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+        """Length of an agent, m."""
+        return self.agent_box[index, slot, SizeColumn.LENGTH]
+
+    def height_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+        """Height of an agent, m."""
+        return self.agent_box[index, slot, SizeColumn.HEIGHT]
+
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
         """Some of the scenarios as a bank; the driver is everyone's."""
         return replace(jax.tree.map(lambda leaf: leaf[rows], replace(self, driver=None)), driver=self.driver)
@@ -172,6 +280,24 @@ class ScenarioBank:
             long_ego=own.long_ego or sizes.long_ego,
             trimmed=trim is True,
         )
+
+
+def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
+    """A number for each scenario.
+
+    It is the first four bytes of BLAKE2b over data set, id and how many of the same name came before, so that copies
+    of a scenario differ. Two scenarios that share a number by chance share nothing but their random numbers.
+
+    Args:
+        names: Data set and id of each.
+    """
+    seen: Counter[tuple[str, str]] = Counter()
+    numbers = []
+    for name in names:
+        text = "\0".join((*name, str(seen[name])))
+        numbers.append(int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "little"))
+        seen[name] += 1
+    return np.array(numbers, np.uint32)
 
 
 def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
@@ -342,7 +468,7 @@ def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.nda
     )
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
     there = np.arange(used) < rows[:, None]
-    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), ROAD_NONE)
+    layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), RoadLayer.NONE)
     columns = [xy, direction, length[..., None], layer[..., None], limit[..., None]]
     return {
         "road": np.concatenate(columns, -1, dtype=np.float32),

@@ -5,34 +5,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.errors import DataError, UsageError
-from drivax.scenario.build.checks import check, step_seconds
+from drivax.errors import DataError
 from drivax.scenario.build.filling import EVENT_ACTORS, Parts, fill
-from drivax.scenario.build.grid import GridSegments, arrange
+from drivax.scenario.build.grid import GridSegments, arrange, cell_sides
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, select
 from drivax.scenario.build.lights import place_lights, place_stops
 from drivax.scenario.build.roads import road_rows
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
 from drivax.scenario.build.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
-from drivax.scenario.build.sides import cell_sides
 from drivax.scenario.build.tracks import LocalTracks, extend, local_tracks, place
-from drivax.scenario.recording import Recording
+from drivax.scenario.recording import Recording, check, step_seconds
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
-    CURRENT_STEP,
     EDGE_KINDS,
     LANE_KINDS,
     LINE_KINDS,
-    STEPS,
-    AgentKind,
     Capacity,
     Flag,
     RoadKind,
@@ -50,7 +45,6 @@ MARGIN_M = 100.0
 MAP_M = 500_000.0
 #: Steps may differ from the median step by this much before a recording counts as jittered.
 JITTER_S = 0.002
-STRIDE = 40
 #: Heights that differ by less are one level: the source has no elevation.
 FLAT_M = 0.01
 #: Flags that are decided here, whatever the reader said. That lights are known is not among them: a source may know
@@ -89,93 +83,6 @@ def count_source(recording: Recording) -> SourceCounts:
         map_features={name: int(among(kinds, group).sum()) for name, group in _COUNTED.items()},
         map_points=sum(len(feature.points) for feature in recording.features),
         lights=len({light.lane_id for light in recording.lights}),
-    )
-
-
-def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
-    """Cuts a long recording into windows of 91 steps that share its segment.
-
-    A recording of at most 91 steps is its own window. Of a longer one, window ``k`` holds the steps from ``k * stride``
-    on, so with the default stride 51 of 91 steps are in the next window too; steps at the end that fill no window are
-    left out (110 steps are one window, 199 are three). Windows in which the ego is not there at the current step are
-    left out and counted in the others' ``lost`` as ``windows_without_ego``.
-
-    Args:
-        recording: Any recording.
-        stride: Steps between the starts of two windows.
-
-    Raises:
-        UsageError: The stride is not positive.
-        DataError: The ego is not there at the current step of any window.
-    """
-    if stride < 1:
-        raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
-    steps = len(recording.timestamps_s)
-    if steps <= STEPS:
-        yield recording
-        return
-    starts = range(0, steps - STEPS + 1, stride)
-    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
-    if not usable:
-        raise DataError(
-            f"the ego is not valid at the current step of any of {len(starts)} windows",
-            record=recording.scenario_id,
-            cure="skip the recording",
-        )
-    lost = dict(recording.lost)
-    if len(usable) < len(starts):
-        lost["windows_without_ego"] = len(starts) - len(usable)
-    for start in usable:
-        yield replace(_window(recording, start), lost=lost)
-
-
-def _window(recording: Recording, start: int) -> Recording:
-    """The 91 steps from ``start`` on, with the current step at its usual place."""
-    part = slice(start, start + STEPS)
-    tracks = recording.tracks
-    time_fields = ("xy", "z", "heading", "velocity", "size", "valid")
-    events = (replace(e, start=e.start - start, end=e.end - start) for e in recording.events)
-    return replace(
-        recording,
-        scenario_id=f"{recording.scenario_id}@{start}",
-        timestamps_s=recording.timestamps_s[part],
-        current_step=CURRENT_STEP,
-        tracks=replace(tracks, **{name: getattr(tracks, name)[:, part] for name in time_fields}),
-        seen=None if recording.seen is None else recording.seen[:, part],
-        lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
-        events=tuple(
-            replace(e, start=max(e.start, 0), end=min(e.end, STEPS - 1))
-            for e in events
-            if e.end >= 0 and e.start < STEPS
-        ),
-    )
-
-
-def with_ego(recording: Recording, row: int) -> Recording:
-    """The same recording with another logged vehicle as the ego.
-
-    What was known of the former ego's route, and of what its sensors saw, is dropped.
-
-    Raises:
-        UsageError: The row is no vehicle that is valid at the current step.
-    """
-    tracks = recording.tracks
-    good = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
-    if not good or not tracks.valid[row, recording.current_step]:
-        raise UsageError(
-            f"track row {row} is no vehicle that is valid at step {recording.current_step}",
-            record=recording.scenario_id,
-            cure="choose the row of a vehicle that is there at the current step",
-        )
-    if row == recording.ego:
-        return recording
-    return replace(
-        recording,
-        scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
-        ego=row,
-        seen=None,
-        route_lanes=(),
-        route_corridor=(),
     )
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.scenario.build.checks import step_seconds
 from drivax.scenario.build.grid import GridSegments
 from drivax.scenario.build.lanes import LaneGraph, lane_of_feature
 from drivax.scenario.build.lights import Lights, Stops
@@ -16,7 +15,7 @@ from drivax.scenario.build.roads import RoadRows
 from drivax.scenario.build.routes import RouteSet
 from drivax.scenario.build.segments import RoadLines
 from drivax.scenario.build.tracks import EGO_BIT, INTEREST_BIT, PREDICT_BIT, LocalTracks, Placement
-from drivax.scenario.recording import Event, Recording
+from drivax.scenario.recording import Event, Recording, step_seconds
 from drivax.scenario.schema import Capacity, Flag, record_dtype
 
 Array = np.ndarray[Any, Any]

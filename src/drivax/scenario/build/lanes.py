@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import Polylines, point_to_segment
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among

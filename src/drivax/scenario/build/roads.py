@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import cut_counts
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lanes import known_limit
 from drivax.scenario.build.segments import RoadLines, inside_box, path_distance
 from drivax.scenario.recording import MapFeature

@@ -3,11 +3,12 @@
 Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the log's route
 see the ego's poses up to the current step and the goal region only; among routes that reach the goal equally well
 the one nearest to the log is taken. Routes come from this project's search of the lane graph (``graph``), or from
-the published one (``published``, :mod:`drivax.scenario.build.route_published`); both are drawn by the same code.
+the published one (``published``, :mod:`drivax.scenario.build.routes`); both are drawn by the same code.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -18,6 +19,10 @@ from jaxtyping import Bool, Float, Int
 from drivax.geometry.polylines import arc_lengths, headings, project, project_monotone, resample
 from drivax.scenario.build.lane_paths import (
     CHANGE_M,
+    REACH_M,
+    SAME_TURN_RAD,
+    LaneSearch,
+    Way,
     continue_straight,
     follow,
     is_change,
@@ -25,17 +30,28 @@ from drivax.scenario.build.lane_paths import (
     trace,
     walk,
 )
-from drivax.scenario.build.lane_search import REACH_M, SAME_TURN_RAD, LaneSearch, Way
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
-from drivax.scenario.build.route_published import LEAST_M, published_ways
-from drivax.scenario.build.route_start import join
 from drivax.scenario.build.segments import thin_path
 
+#: A line may run this far beside where the ego drove; what it is further away is taken back.
+BESIDE_M = 1.0
+#: Driven poses closer together than this say nothing about the direction across the line.
+_APART_M = 1.0
+#: The ego drifts across a line by at most this many metres per metre (a change of 3.5 m within 12 m).
+_MOST_SLOPE = 0.3
+#: The line goes over to the ego's poses within this distance behind the first of them.
+_BEHIND_M = 20.0
+#: Lanes within this distance of the ego at the start of the log are where ways begin, m.
+PUBLISHED_REACH_M = 2.5
+LEAST_M, MOST_WAYS = 250.0, 10
+#: A lane that turns by more than this is a turn.
+TURN_RAD = np.deg2rad(30.0)
+CHANGE_WEIGHT, TURN_WEIGHT, LENGTH_WEIGHT, CURVATURE_WEIGHT = -0.3, -0.2, 0.1, -0.1
+#: Ways that are looked at before the search gives up.
+MOST_EXPANSIONS = 5000
 Array = np.ndarray[Any, Any]
-
 #: How candidates are made: by the search of this project, or as published.
 RouteStyle = Literal["graph", "published"]
-
 SPACING_M = 1.0
 #: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
 AHEAD_M, AHEAD_S = 200.0, 12.0
@@ -54,7 +70,7 @@ CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
 STEP_M, STANDS_M = 0.5, 2.0
 #: The log's route goes on this far beyond the log.
 LOG_AHEAD_M = 100.0
-#: Its lanes are looked up at every so manyth of its points (0.5 to 3 m apart).
+#: Its lanes are looked up at every n-th of its points (0.5 to 3 m apart).
 LABEL_EVERY = 4
 
 
@@ -200,6 +216,52 @@ def _published(
     return _best(ego, others, GOAL_M), others
 
 
+def published_ways(search: LaneSearch) -> list[Way]:
+    """The first ten ways of a breadth-first search that are long enough, the best score first.
+
+    A way is followed to the first of its lanes that ends 250 m or more ahead. From a lane the search goes to its
+    successors, the straightest first, then to its left and right neighbour where there is room for a change; ways never
+    use a lane twice and change lanes at most twice. Where the map ends too early for ten such ways, ways to its end
+    stand in for the missing ones.
+
+    Args:
+        search: Starts at the ego's pose at the start of the log, with ``need_m`` = :data:`LEAST_M`; only starts within
+            2.5 m are used.
+    """
+    queue = deque(way for way in search.ways if way.lateral <= PUBLISHED_REACH_M)
+    complete: list[Way] = []
+    ended: list[Way] = []
+    for _ in range(MOST_EXPANSIONS):
+        if not queue or len(complete) >= MOST_WAYS:
+            break
+        way = queue.popleft()
+        if search.reach(way) >= search.need_m:
+            complete.append(way)
+            continue
+        following = search.following(way)
+        if not any(not is_change(search.graph, way.lanes[-1], child.lanes[-1]) for child in following):
+            ended.append(way)
+        queue.extend(following)
+    return sorted([*complete, *ended][:MOST_WAYS], key=lambda way: -score(search, way))
+
+
+def score(search: LaneSearch, way: Way) -> float:
+    """-0.3 lane changes - 0.2 turns + 0.1 length - 0.1 curvature.
+
+    Lane changes and turns (lanes whose heading changes by more than 30 degrees from end to end) are numbers, the length
+    ahead of the ego is in metres, and curvature is the heading change of all lanes from end to end per metre of that
+    length, rad/m. With these units a metre of length outweighs most of the rest, as published.
+    """
+    length = max(search.reach(way), 1.0)
+    bend = search.bend[list(way.lanes)]
+    return float(
+        CHANGE_WEIGHT * way.changes
+        + TURN_WEIGHT * int((bend > TURN_RAD).sum())
+        + LENGTH_WEIGHT * length
+        + CURVATURE_WEIGHT * float(bend.sum()) / length
+    )
+
+
 def _same(one: Route, other: Route) -> bool:
     return len(one.xyz) == len(other.xyz) and bool(np.abs(one.xyz - other.xyz).max() < 0.1)
 
@@ -265,6 +327,60 @@ class _Drawer:
         xyz, label = continue_straight(line, 0.0, missing)
         points, index = resample(xyz, SPACING_M, self.most)
         return Route.along(points if self.plain else join(points, driven, change_m), label[index], self.most)
+
+
+def join(
+    xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"], ahead_m: float
+) -> Float[Array, "point 3"]:
+    """Bends a line so that it passes within a metre of where the ego drove.
+
+    At each driven pose the line is shifted across by what its distance exceeds a metre; between the poses the shift
+    is interpolated along the line, and ahead of the last of them it fades out by a cubic polynomial that goes on in the
+    ego's direction (Hermite: its shift and slope at the ego, zero and zero at the end).
+
+    Args:
+        xyz: Points of the line, about 1 m apart.
+        driven: Positions of the ego up to now, in order.
+        ahead_m: How far ahead of the ego the line is on its lane again.
+    """
+    first = int(arc_lengths(driven)[-1] + 2 * _BEHIND_M) + 2
+    s, shift = _shifts(xyz[: max(first, 2)], driven)
+    if not shift.any():
+        return xyz
+    arc = arc_lengths(xyz)
+    across = np.interp(arc, s, shift)
+    back = slice(0, int(np.searchsorted(arc, s[0])))
+    ahead = slice(int(np.searchsorted(arc, s[-1], side="right")), len(arc))
+    slope = np.clip(np.diff(shift) / np.diff(s), -_MOST_SLOPE, _MOST_SLOPE) if len(s) > 1 else np.zeros(1)
+    across[back] = _fade(s[0] - arc[back], shift[0], -slope[0], _BEHIND_M)
+    across[ahead] = _fade(arc[ahead] - s[-1], shift[-1], slope[-1], ahead_m)
+    result = xyz.copy()
+    result[:, :2] += across[:, None] * _left(headings(xyz))
+    return result
+
+
+def _shifts(xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"]) -> tuple[Array, Array]:
+    """Arc lengths of driven poses along a line, increasing, and how far the line has to go to its left there."""
+    s, _ = project(xyz, driven)
+    keep = [len(s) - 1]
+    for i in range(len(s) - 2, -1, -1):
+        if s[i] <= s[keep[-1]] - _APART_M:
+            keep.append(i)
+    rows = np.array(keep[::-1])
+    arc, course = arc_lengths(xyz), np.unwrap(headings(xyz))
+    foot = np.stack([np.interp(s[rows], arc, xyz[:, axis]) for axis in (0, 1)], axis=-1)
+    offset = np.einsum("ij,ij->i", driven[rows] - foot, _left(np.interp(s[rows], arc, course)))
+    return s[rows], np.sign(offset) * np.maximum(np.abs(offset) - BESIDE_M, 0.0)
+
+
+def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
+    """A cubic from a shift and its slope to zero and level at ``length``, zero beyond."""
+    t = np.clip(distance / length, 0.0, 1.0)
+    return shift * (1.0 + t**2 * (2.0 * t - 3.0)) + slope * length * t * (1.0 - t) ** 2
+
+
+def _left(heading: Array) -> Array:
+    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)
 
 
 def log_route(graph: LaneGraph, on: LaneSegments, ego: EgoLog, most_points: int) -> Route:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lane_paths import walk
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
 from drivax.scenario.recording import Tracks

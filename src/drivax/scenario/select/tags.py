@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import arc_lengths
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.filling import Parts
 from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
 from drivax.scenario.build.routes import STEP_M, Route

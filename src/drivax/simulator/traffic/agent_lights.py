@@ -7,20 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
-from drivax.scenario.bank.scenario_bank import (
-    LIGHT_COS,
-    LIGHT_EXIT_COS,
-    LIGHT_EXIT_SIN,
-    LIGHT_HALF,
-    LIGHT_SIN,
-    LIGHT_X,
-    LIGHT_Y,
-    LIGHT_Z,
-    NEVER_M,
-    ScenarioBank,
-)
+from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 
 #: Stop lines of a path that are kept, the first ones.
 STOPS = 4
@@ -52,7 +42,7 @@ def light_arcs(
     arcs = np.full((len(scenario), STOPS), NEVER_M)
     lights = np.zeros((len(scenario), STOPS), np.int64)
     line, state = np.asarray(bank.light_line, np.float64), np.asarray(bank.light_state)
-    exits = np.arctan2(line[:, LIGHT_EXIT_SIN], line[:, LIGHT_EXIT_COS])
+    exits = np.arctan2(line[:, LightRow.EXIT_SIN], line[:, LightRow.EXIT_COS])
     for row in np.unique(scenario):
         seen = np.flatnonzero((state[row] >= 0).any(axis=0))
         mine = np.flatnonzero(scenario == row)
@@ -69,14 +59,14 @@ def light_arcs(
 
 def _crossings(line: Array, points: Array, spacing: Array) -> Float[np.ndarray, "V L"]:
     """Arc length at which each path first passes forwards through each stop line; infinite where it does not."""
-    cos, sin = line[LIGHT_COS], line[LIGHT_SIN]
-    dx, dy = (points[:, :, None, i] - line[at] for i, at in ((0, LIGHT_X), (1, LIGHT_Y)))
+    cos, sin = line[LightRow.COS], line[LightRow.SIN]
+    dx, dy = (points[:, :, None, i] - line[at] for i, at in ((0, LightRow.X), (1, LightRow.Y)))
     ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
     before, after = ahead[:, :-1], ahead[:, 1:]
     share = -before / np.where(after > before, after - before, 1.0)
-    through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= line[LIGHT_HALF]
+    through = np.abs(left[:, :-1] + share * np.diff(left, axis=1)) <= line[LightRow.HALF]
     facing = points[:, :-1, None, 2] * cos + points[:, :-1, None, 3] * sin > _ASKEW_COS
-    level = np.abs(points[:, :-1, None, 4] - line[LIGHT_Z]) <= LEVEL_M
+    level = np.abs(points[:, :-1, None, 4] - line[LightRow.Z]) <= LEVEL_M
     crosses = (before < 0.0) & (after >= 0.0) & through & facing & level
     first = np.argmax(crosses, axis=1)
     arc = (first + np.take_along_axis(share, first[:, None], axis=1)[:, 0]) * spacing[:, None]

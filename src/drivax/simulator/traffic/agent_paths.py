@@ -13,20 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import overlap
 from drivax.geometry.polylines import Polylines, arc_lengths, point_to_segment
+from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.columns import AgentColumn, LaneRow, SizeColumn
 from drivax.scenario.bank.queries import LANE_CUTOFF_M, LEVEL_M
-from drivax.scenario.bank.scenario_bank import (
-    AGENT_COS,
-    AGENT_SIN,
-    AGENT_VALID,
-    AGENT_VX,
-    AGENT_VY,
-    AGENT_Z,
-    WORD,
-    ScenarioBank,
-)
+from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
 from drivax.simulator.traffic.agent_lights import light_arcs
@@ -161,17 +153,22 @@ def _candidates(bank: ScenarioBank, kinds: tuple[int, ...]) -> _Logs:
     """Logs of the agents that may react: of these kinds, moving more than 2 m, never backwards."""
     agents, kind = (
         np.asarray(bank.agents, np.float64),
-        np.asarray(bank.agent_box[:, : bank.agents.shape[2], 3]),
+        np.asarray(bank.agent_box[:, : bank.agents.shape[2], SizeColumn.KIND]),
     )
-    valid = agents[..., AGENT_VALID] > 0
+    valid = agents[..., AgentColumn.VALID] > 0
     there = np.argwhere(np.isin(kind, kinds) & valid.any(axis=1))
     scenario, slot = there[:, 0], there[:, 1]
     rows = agents[scenario, :, slot]
-    heading = np.arctan2(rows[..., AGENT_SIN], rows[..., AGENT_COS])
-    along = rows[..., AGENT_VX] * rows[..., AGENT_COS] + rows[..., AGENT_VY] * rows[..., AGENT_SIN]
+    heading = np.arctan2(rows[..., AgentColumn.SIN], rows[..., AgentColumn.COS])
+    along = (
+        rows[..., AgentColumn.VX] * rows[..., AgentColumn.COS]
+        + rows[..., AgentColumn.VY] * rows[..., AgentColumn.SIN]
+    )
     seen = valid[scenario, :, slot]
     extension = np.asarray(bank.extension, np.float64)[scenario, slot]
-    logs = _Logs(scenario, slot, rows[..., :2], rows[..., AGENT_Z], heading, along, seen, extension)
+    logs = _Logs(
+        scenario, slot, rows[..., AgentColumn.XY], rows[..., AgentColumn.Z], heading, along, seen, extension
+    )
     key = _keys(logs.xy, logs.valid)
     last, _ = _neighbours(key)
     xy, turned = (np.take_along_axis(x, last[..., None], 1) for x in (logs.xy, logs.heading[..., None]))
@@ -248,12 +245,12 @@ def _log_arcs(
 def _heights(bank: ScenarioBank, logs: _Logs, beyond: Numbers, end: Numbers) -> Float[np.ndarray, "V X"]:
     """Heights of the box centre beyond the log: of the lanes below, on one level with the point before."""
     flags, lanes = np.asarray(bank.flags), np.asarray(bank.lanes)
-    half = np.asarray(bank.agent_box[:, :, 2])[logs.scenario, logs.slot] / 2
+    half = np.asarray(bank.agent_box[:, :, SizeColumn.HEIGHT])[logs.scenario, logs.slot] / 2
     height = np.repeat(logs.z[np.arange(len(end)), end][:, None], beyond.shape[1], axis=1)
     used = np.asarray(bank.grid_lane[:, -1])
     for scenario in np.unique(logs.scenario[(flags[logs.scenario] & int(Flag.ELEVATION)) != 0]):
         mine = np.flatnonzero(logs.scenario == scenario)
-        segments = lanes[scenario, :5, : int(used[scenario])].astype(np.float64)
+        segments = lanes[scenario, : LaneRow.HALF_WIDTH, : int(used[scenario])].astype(np.float64)
         ground = height[mine, 0] - half[mine]
         for point in range(beyond.shape[1]):
             ground = _ground(segments, beyond[mine, point], ground)
@@ -339,6 +336,6 @@ def _logged_boxes(tables: _Tables, scenario: int) -> tuple[Numbers, Numbers, Num
     there = (when[step // WORD] >> (step % WORD).astype(np.uint32)[:, None]) & 1 > 0
     rows = np.pad(agents, ((0, 0), (0, len(box) - agents.shape[1]), (0, 0)))
     rows = np.where(there[..., None], parked, rows)
-    size = np.broadcast_to(box[None, :, :2], (len(rows), len(box), 2))
-    boxes = np.concatenate([rows[..., :2], rows[..., 3:5], size], axis=-1)
-    return boxes, rows[..., AGENT_Z], rows[..., AGENT_VALID] > 0
+    size = np.broadcast_to(box[None, :, SizeColumn.FOOTPRINT], (len(rows), len(box), 2))
+    boxes = np.concatenate([rows[..., AgentColumn.XY], rows[..., AgentColumn.HEADING], size], axis=-1)
+    return boxes, rows[..., AgentColumn.Z], rows[..., AgentColumn.VALID] > 0

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.scenario.bank.scenario_bank import AGENT_COS, AGENT_SIN, AGENT_VALID, AGENT_Z, WORD, ScenarioBank
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.scenario.bank.columns import AgentColumn, SizeColumn
+from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
+from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,13 @@ class LogTraffic:
         """Nothing: the bank and the step say it all."""
         return ()
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> tuple[()]:
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> tuple[()]:
         """Nothing."""
         return ()
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """The logged rows ``back`` steps ago; steps before the recording repeat its first one."""
-        return bank.agents[scene.index, jnp.clip(scene.step - back, 0, bank.steps - 1)]
+        return bank.agents[context.index, jnp.clip(context.step - back, 0, bank.steps - 1)]
 
 
 def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "16 4"]:
@@ -44,21 +45,23 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
     """
     at = step - jnp.arange(HISTORY - 1, -1, -1)
     rows = bank.agents[index, jnp.clip(at, 0, bank.steps - 1), slot]
-    known = (rows[:, AGENT_VALID] > 0) & (at >= 0)
+    known = (rows[:, AgentColumn.VALID] > 0) & (at >= 0)
     # The earliest row of the unbroken stretch that ends now.
     unbroken = jnp.flip(jnp.cumprod(jnp.flip(known.astype(jnp.int32)))) > 0
     first = jnp.minimum(HISTORY - jnp.sum(unbroken), HISTORY - 1)
     base = rows[first]
     missing = (first - jnp.arange(HISTORY))[:, None] * 0.1
-    heading = jnp.arctan2(rows[:, AGENT_SIN], rows[:, AGENT_COS])
-    speed = jnp.sum(rows[:, 5:7] * rows[:, 3:5], axis=-1)
-    own = jnp.stack([rows[:, 0], rows[:, 1], heading, jnp.maximum(speed, 0.0)], axis=-1)
+    heading = jnp.arctan2(rows[:, AgentColumn.SIN], rows[:, AgentColumn.COS])
+    speed = jnp.sum(rows[:, AgentColumn.VELOCITY] * rows[:, AgentColumn.HEADING], axis=-1)
+    own = jnp.stack(
+        [rows[:, AgentColumn.X], rows[:, AgentColumn.Y], heading, jnp.maximum(speed, 0.0)], axis=-1
+    )
     extended = own[first] - missing * jnp.stack([base[5], base[6], jnp.zeros(()), jnp.zeros(())])
     return jnp.where(unbroken[:, None], own, extended)
 
 
 def frame_of(
-    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: Scene, back: int
+    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: AgentContext, back: int
 ) -> Frame:
     """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
 
@@ -77,26 +80,28 @@ def frame_of(
     rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
     rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
     # Before the recording nobody else was seen.
-    agents = agents.at[:, AGENT_VALID].mul(step >= back)
-    z = agents[:, AGENT_Z].at[cast.slot].set(cast.z, mode="drop")
+    agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
+    z = agents[:, AgentColumn.Z].at[cast.slot].set(cast.z, mode="drop")
     agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
     box = bank.agent_box[index]
     at = jnp.clip(step - back, 0, bank.steps - 1)
     bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
     there = (bit & 1 > 0) & (step >= back)
     parked, more = bank.parked[index], len(box) - len(agents)
-    z = jnp.where(there, parked[:, AGENT_Z], jnp.pad(z, (0, more)))
+    z = jnp.where(there, parked[:, AgentColumn.Z], jnp.pad(z, (0, more)))
     agents = jnp.where(there[:, None], parked, jnp.pad(agents, ((0, more), (0, 0))))
     return Frame(
-        box=jnp.concatenate([agents[:, 0:2], agents[:, 3:5], box[:, :2]], axis=-1),
-        velocity=agents[:, 5:7],
+        box=jnp.concatenate(
+            [agents[:, AgentColumn.XY], agents[:, AgentColumn.HEADING], box[:, SizeColumn.FOOTPRINT]], axis=-1
+        ),
+        velocity=agents[:, AgentColumn.VELOCITY],
         z=z,
-        valid=agents[:, 7] > 0,
-        kind=box[:, 3].astype(jnp.int32),
+        valid=agents[:, AgentColumn.VALID] > 0,
+        kind=box[:, SizeColumn.KIND].astype(jnp.int32),
         lights=jnp.where(step >= back, bank.light_state[index, at], -1),
     )
 
 
-def alone(scene: Scene) -> Scene:
+def alone(context: AgentContext) -> AgentContext:
     """The cast of a scenario with one driven agent."""
-    return jax.tree.map(lambda leaf: leaf[None], scene)
+    return jax.tree.map(lambda leaf: leaf[None], context)

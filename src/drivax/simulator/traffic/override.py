@@ -11,12 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
+from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import around_lanes
-from drivax.scenario.bank.scenario_bank import AGENT_VALID, AGENT_Z, ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.traffic.log import LogTraffic, logged_history
-from drivax.simulator.types import Scene, Traffic
+from drivax.simulator.types import AgentContext, Traffic
 
 #: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
 Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"]]
@@ -70,19 +71,19 @@ class OverrideTraffic:
             )
         return self.base.start(bank, index, step)
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Any) -> Any:
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Any) -> Any:
         """State of ``base`` one step later."""
-        return self.base.advance(bank, scene, frame)
+        return self.base.advance(bank, context, frame)
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of ``base``, with those of the overridden agents as given."""
-        rows, given = self.base.agents(bank, scene, back), bank.given
-        step = jnp.clip(scene.step - back, 0, bank.steps - 1)
-        motion, valid = given.motion[scene.index, step], given.valid[scene.index, step]
+        rows, given = self.base.agents(bank, context, back), bank.given
+        step = jnp.clip(context.step - back, 0, bank.steps - 1)
+        motion, valid = given.motion[context.index, step], given.valid[context.index, step]
         cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
-        parts = [motion[:, 0], motion[:, 1], given.z[scene.index, step], cos, sin]
+        parts = [motion[:, 0], motion[:, 1], given.z[context.index, step], cos, sin]
         parts += [motion[:, 3] * cos, motion[:, 3] * sin, valid.astype(cos.dtype)]
-        slot = given.slot[scene.index]
+        slot = given.slot[context.index]
         slot = jnp.where(slot >= 0, slot, rows.shape[0])
         return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
 
@@ -108,8 +109,8 @@ def with_given(
 
     def heights(index: Array, slot: Array, line: Float[Array, "T 4"]) -> Float[Array, " T"]:
         at = jnp.maximum(slot, 0)
-        seen = jnp.argmax(bank.agents[index, :, at, AGENT_VALID] > 0)
-        half = bank.agent_box[index, at, 2] / 2
+        seen = jnp.argmax(bank.agents[index, :, at, AgentColumn.VALID] > 0)
+        half = bank.height_m(index, at) / 2
 
         def climb(ground: Array, pose: Array) -> tuple[Array, Array]:
             heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
@@ -117,7 +118,7 @@ def with_given(
             return ground, ground + half
 
         line = jax.lax.stop_gradient(line)
-        return jax.lax.scan(climb, bank.agents[index, seen, at, AGENT_Z] - half, line)[1]
+        return jax.lax.scan(climb, bank.agents[index, seen, at, AgentColumn.Z] - half, line)[1]
 
     z = jax.vmap(jax.vmap(heights, (None, 0, 1), 1))(jnp.arange(len(bank)), slots, motion)
     return replace(bank, given=Given(slots, motion, z, valid))
@@ -148,7 +149,7 @@ def motions_of_actions(
     def drive(index: Array, slot: Array, acts: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
         at = jnp.maximum(slot, 0)
         past = logged_history(bank, index, begin, at)
-        size = bank.agent_box[index, at, 0]
+        size = bank.length_m(index, at)
 
         def one(motion: Array, action: Array) -> tuple[Array, Array]:
             after = move(motion, action, size)

@@ -1,0 +1,68 @@
+"""Pages that mkdocs generates: the API reference, lists of decisions and log entries, and files of the root."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+_DOCS = Path(__file__).resolve().parent
+_PACKAGE = _DOCS.parent / "src" / "drivax"
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages."""
+    index = [
+        "# API reference",
+        "",
+        _docstring(_PACKAGE / "__init__.py"),
+        "",
+        "| package | content |",
+        "|---|---|",
+    ]
+    for stub in sorted(_PACKAGE.rglob("__init__.pyi")):
+        package = ".".join(stub.parent.relative_to(_PACKAGE.parent).parts)
+        uri = f"reference/{package}.md"
+        summary = _docstring(stub.with_suffix(".py"))
+        names = [f"::: {name}" for name in public_names(stub, package)]
+        page = "\n\n".join([f"# {package}", summary, *names]) + "\n"
+        files.append(File.generated(config, uri, content=page))
+        index.append(f"| [`{package}`]({package}.md) | {summary.splitlines()[0]} |")
+    files.append(File.generated(config, "reference/index.md", content="\n".join(index) + "\n"))
+    for name, folder, title in (("decisions", "decisions", "Decisions"), ("log", "log", "Experiment log")):
+        rows = [
+            f"- [{_title(page)}](../{folder}/{page.name})" for page in sorted((_DOCS / folder).glob("*.md"))
+        ]
+        content = "\n".join([f"# {title}", "", *rows]) + "\n"
+        files.append(File.generated(config, f"project/{name}.md", content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Show a file of the repository's root in place of the page that links to it, with links that hold here."""
+    uri = page.file.src_uri
+    if uri in ("project/changelog.md", "project/contributing.md", "project/credits.md"):
+        root = _DOCS.parent / f"{Path(uri).stem.upper()}.md"
+        return root.read_text(encoding="utf-8").replace("](docs/", "](../")
+    return markdown
+
+
+def public_names(stub: Path, package: str) -> list[str]:
+    """Return the full names that a package exports, from the stub that lists them."""
+    names = []
+    for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom):
+            module = f"{package}.{node.module}" if node.level else node.module
+            names += [f"{module}.{alias.name}" for alias in node.names]
+    return names
+
+
+def _docstring(module: Path) -> str:
+    return ast.get_docstring(ast.parse(module.read_text(encoding="utf-8"))) or ""
+
+
+def _title(page: Path) -> str:
+    return page.read_text(encoding="utf-8").split("\n", 1)[0].lstrip("# ")
