@@ -61,7 +61,7 @@ def load(
     Args:
         data: Folder of a scenario set, or scenarios.
         limit: Only the first ``limit`` of those that the other options leave.
-        filters: Conditions that scenarios of a set must meet, as ``type=turn_left`` (``scenario.select.choice``).
+        filters: Conditions that scenarios of a set must meet, as ``type=turn_left`` (``scenario.select.selection``).
         scenarios: Ids of scenarios of a set, or files with one id per line.
 
     Raises:
@@ -70,7 +70,7 @@ def load(
     """
     if isinstance(data, str | Path):
         stored = ScenarioSet.open(data)
-        kept = [stored[row] for row in chosen(stored, filters, scenarios, limit)]
+        kept = [stored[row] for row in select_scenarios(stored, filters, scenarios, limit)]
         # The scenarios that are loaded have been verified; of the others only the sizes are read.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:

@@ -16,7 +16,7 @@ from drivax.planners.simple import Expert
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Light, windows
 from drivax.scenario.schema import CURRENT_STEP, Flag, LightState
-from drivax.scenario.select.filters import FINDINGS
+from drivax.scenario.select.selection import FINDINGS
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.task import Task

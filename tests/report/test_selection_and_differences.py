@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import comparable, mismatch
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.report.episode_selection import choose, outcome

@@ -54,7 +54,6 @@ def run(args: Compare) -> int:
     from drivax.evaluation.comparison import compare
     from drivax.evaluation.episode_table import EpisodeTable
     from drivax.evaluation.plan import ComparisonPlan
-    from drivax.evaluation.stored import open_driven_set, read_seeds
     from drivax.files import check_output, write_text
     from drivax.report.comparison import comparison_text
     from drivax.report.pages.comparison import write_comparison

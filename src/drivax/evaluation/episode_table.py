@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16, Int64
 
 from drivax.errors import DataError
-from drivax.metrics.catalogue import EVENTS, METRICS, Metric
+from drivax.metrics.catalogue import EVENTS, METRICS, Column, names_of
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
@@ -25,48 +25,32 @@ from drivax.tracking.run_folder import RunFolder, existing
 
 #: Columns of ``episodes.csv`` before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
-#: Metrics that are shares of episodes: their interval is Wilson's.
-RATES = (
-    "accuracy", "accuracy_at_fault", "success", "success_moving", "collision", "at_fault_collision", "offroad",
-    "left_map", "off_route", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal", "crashed",
-)  # fmt: skip
-#: Metrics between 0 and 1.
-SHARES = (*RATES, "vmax_score", "nuplan_score", "vmax_score_partial", "nuplan_score_partial")
-#: Codes and counts without a meaningful mean.
-NOT_SUMMARISED = ("collision_type", "steps")
-#: Metrics that are 0 in an episode whose planner crashed.
-FAILED = (
-    "accuracy", "accuracy_at_fault", "success", "success_moving", "vmax_score", "nuplan_score", "vmax_score_partial",
-    "nuplan_score_partial",
-)  # fmt: skip
+#: Columns that an evaluation adds to the metrics.
+ADDED = {
+    "crashed": Column(
+        "-", "low", "the planner raised an error, or its action was not finite: a failed episode", kind="rate"
+    ),
+    "action_jerk": Column(
+        "-",
+        "low",
+        "standard deviation of the change of the action from step to step; 0.82 for random actions",
+    ),
+}
+_COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
+#: Columns of zeros and ones: their interval is Wilson's.
+RATES = names_of(_COLUMNS, "rate")
+#: Columns that lie between 0 and 1.
+SHARES = names_of(_COLUMNS, "rate", "score")
+#: Columns without a mean.
+NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.summarised)
+#: Columns that are 0 in an episode in which the planner crashed.
+FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
 #: What to do about a damaged run folder.
 _RERUN = "run drivax evaluate again"
 
 Array = np.ndarray[Any, Any]
 #: ``(dataset, scenario_id)``.
 ScenarioKey = tuple[str, str]
-
-
-@dataclass(frozen=True)
-class ColumnInfo:
-    """Unit, direction (``high``, ``low``, ``-``) and a line of text of a column outside of the metric catalogue."""
-
-    unit: str
-    better: str
-    text: str
-
-
-#: Columns that an evaluation adds to the metrics.
-ADDED = {
-    "crashed": ColumnInfo(
-        "-", "low", "the planner raised an error or its action was not finite: a failed episode"
-    ),
-    "action_jerk": ColumnInfo(
-        "-",
-        "low",
-        "standard deviation of the change of the action from step to step; 0.82 for uniform random actions",
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -165,11 +149,12 @@ class EpisodeTable:
         return str(self.info.get("traffic", "log"))
 
     @property
-    def own_metrics(self) -> Mapping[str, ColumnInfo]:
+    def own_metrics(self) -> Mapping[str, Column]:
         """Unit, direction and text of user-defined metrics."""
         info = self.info.get("own_metrics") or {}
         return {
-            name: ColumnInfo(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in info.items()
+            name: Column(str(m["unit"]), cast(Direction, str(m["better"])), str(m["text"]))
+            for name, m in info.items()
         }
 
     @property
@@ -193,6 +178,11 @@ class EpisodeTable:
         """Cluster of every episode: its segment, or its scenario where no segment is known."""
         return recordings(*(self.keys[name] for name in ("dataset", "segment", "scenario_id")))
 
+    @property
+    def crash_by_scenario(self) -> dict[ScenarioKey, Crash]:
+        """The crash of each scenario whose planner crashed."""
+        return {(crash.dataset, crash.scenario_id): crash for crash in self.crashes}
+
     @cached_property
     def trajectories(self) -> Trajectories:
         """Trajectories of the episodes, in their order.
@@ -208,7 +198,7 @@ class EpisodeTable:
             self.folder / "trajectories.npz", self.keys["scenario_id"], self.traffic == "log"
         )
 
-    def metric(self, name: str) -> Metric | ColumnInfo | None:
+    def metric(self, name: str) -> Column | None:
         """Unit and direction of a metric; None where unknown."""
         return METRICS.get(name) or ADDED.get(name) or self.own_metrics.get(name)
 

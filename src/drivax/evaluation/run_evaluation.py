@@ -40,7 +40,7 @@ class EvaluationConfig:
     Attributes:
         planner, traffic: Their names.
         noisy_start, start_step: How episodes start, and at which step of the log.
-        filter, scenarios, limit: Which scenarios are evaluated (``scenario.select.choice``).
+        filter, scenarios, limit: Which scenarios are evaluated (``scenario.select.selection``).
         seed: Seed of all random numbers.
         metrics: Metrics to print in addition to the headline; user-defined ones are added to all built-in ones.
         sample: Whether a trained policy samples its actions.
@@ -83,7 +83,7 @@ def run_evaluation(
         sizes: Sizes that the whole set uses, if they are known already.
         overwrite: Replace an existing run folder.
     """
-    scenarios = [data[row] for row in chosen(data, config.filter, config.scenarios, config.limit)]
+    scenarios = [data[row] for row in select_scenarios(data, config.filter, config.scenarios, config.limit)]
     RunFolder.check(Path(out), overwrite, "evaluation")
     with Progress(f"evaluating {planner.name}", "scenarios", len(scenarios)) as bar:
         table = evaluate(
@@ -133,7 +133,7 @@ def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
         names: Metric sets, metrics and user-defined metrics (``metrics.selection``).
     """
     metrics = summary["metrics"]
-    rows = {name: metrics[name] for name in selected(names).names if name in metrics}
+    rows = {name: metrics[name] for name in select_metrics(names).names if name in metrics}
     width = max(map(len, ("metric", *rows)))
     lines = [f"{'metric':<{width}}  {'mean':>9}  {'95 % interval':>20}  {'n':>7}"]
     for name, row in rows.items():

@@ -101,7 +101,7 @@ def evaluate(
                 cure="name every scenario of the bank",
             )
         no_future = np.asarray(scenarios.flags) & Flag.NO_FUTURE != 0
-        present = np.asarray(scenarios.agents[:, start_step, 0, AGENT_VALID]) > 0
+        present = np.asarray(scenarios.agents[:, start_step, 0, AgentColumn.VALID]) > 0
         identity = np.asarray(scenarios.identity)
     else:
         names = scenario_names(scenarios)
@@ -173,7 +173,7 @@ class _Evaluation:
                 cure="use expert_actions",
             )
         task = judging(task)
-        metrics = catalogue(task.metrics)
+        metrics = metric_specs(task.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
         return cls(replace(simulator, task=task), planner, start_step, seed, metrics)
@@ -203,7 +203,7 @@ class _Evaluation:
         columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
         columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
         own = {
-            name: {"unit": metric.unit, "better": metric.better, "text": metric.text}
+            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
             for name, metric in self.metrics.items()
             if name not in METRICS
         }

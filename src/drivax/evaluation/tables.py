@@ -11,8 +11,17 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey, interval_of
-from drivax.evaluation.pairing import Pairs, comparable
+from drivax.evaluation.episode_table import (
+    ADDED,
+    NOT_SUMMARISED,
+    RATES,
+    EpisodeTable,
+    ScenarioKey,
+    interval_of,
+)
+from drivax.evaluation.pairing import Pairs, mismatch
+from drivax.metrics.catalogue import METRICS
+from drivax.metrics.catalogue import headline as headline_metrics
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
 from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
@@ -119,15 +128,15 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
     return paired_bootstrap(values, others, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
-def paired_differences(one: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """:func:`paired_difference` of evaluations on the same scenarios.
+def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
+    """Return :func:`paired_difference` of two evaluations in memory.
 
     Raises:
-        UsageError: They are not the same.
+        UsageError: If their scenarios differ.
     """
-    if set(one.scenarios) != set(other.scenarios):
-        raise UsageError("evaluations on different scenarios", cure="evaluate both on one set")
-    return paired_difference(one, other, metric)
+    if set(results.scenarios) != set(other.scenarios):
+        raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
+    return paired_difference(results, other, metric)
 
 
 @dataclass(frozen=True)
@@ -167,7 +176,7 @@ def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Tabl
     best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, columns, strict=True)]
     rows = []
     for place, run in enumerate(runs):
-        label = Cell(run.name, note=f"{run.episodes} episodes, {run.traffic} traffic")
+        label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
         cells = [
             _cell(runs, name, column[place], {"run": run.name, "metric": name}, top)
             for name, column, top in zip(metrics, columns, best, strict=True)
@@ -330,13 +339,13 @@ def _set_name(entry: Mapping[str, Any]) -> str:
 
 
 def _planner_key(run: EpisodeTable) -> str:
-    """Who drove: what the command called it, or else the planner's name."""
+    """Return the planner as the command named it, or else its own name."""
     return str(run.settings.get("planner") or run.planner)
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """A name for each planner by its key: its own, or where two share that, as much of their paths as it takes."""
-    own = {_planner_key(run): str(run.planner) for run in runs}
+    """Return a name for each planner by its key: its own, or the shortest end of its path that is unique."""
+    own = {_planner_key(run): run.planner for run in runs}
     named = {}
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]

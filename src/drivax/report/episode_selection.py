@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.report.runs import Evaluation
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).
@@ -119,11 +120,10 @@ def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
 
 
 def _first_rows(run: Evaluation) -> dict[ScenarioKey, int]:
-    """Return the first episode of each scenario with a stored trajectory."""
+    """Return the first episode of each scenario."""
     rows: dict[ScenarioKey, int] = {}
-    for row, (key, dataset) in enumerate(zip(run.occurrences, run.keys["dataset"], strict=True)):
-        if key in run.trajectories.rows:
-            rows.setdefault((dataset, key[0]), row)
+    for row, key in enumerate(run.scenarios):
+        rows.setdefault(key, row)
     return rows
 
 

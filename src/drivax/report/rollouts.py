@@ -69,17 +69,18 @@ def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
     steps, start = int(scenario.steps), int(stored.start[row])
     ego = np.full((steps, 4), np.nan)
     ego[:start] = logged_motion(scenario)[:start]
-    motion = stored.ego[place, : steps - start]
+    motion = stored.ego[row, : steps - start]
     ego[start : start + len(motion)] = motion
-    events = {name: int(at[place]) for name, at in stored.events.items()}
-    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
+    events = {name: int(at[row]) for name, at in stored.events.items()}
+    crash = run.crash_by_scenario.get(run.scenarios[row])
+    events["crashed"] = -1 if crash is None else crash.step
     action = np.full((steps, COMMANDED), np.nan)
-    commands = stored.action[place, : steps - start, :COMMANDED]
+    commands = stored.action[row, : steps - start, :COMMANDED]
     action[start : start + len(commands), : commands.shape[1]] = commands
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(motion)] = unpacked(stored.others[place, : steps - start])
+        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
     return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.results import ADDED
-from drivax.evaluation.stored import comparable
+from drivax.evaluation.episode_table import ADDED
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import (
     collisions_table,
     differences_table,
