@@ -34,7 +34,7 @@ class Polylines:
 
     @classmethod
     def of(cls, lines: Sequence[Float[Array, "_ dim"]], dim: int = 3) -> Polylines:
-        """Joins separate polylines; ``dim`` names the width where there are none."""
+        """Concatenate polylines; ``dim`` is the width where there are none."""
         counts = np.array([len(line) for line in lines], dtype=np.int64)
         points = np.concatenate(list(lines)) if len(lines) else np.zeros((0, dim))
         start = np.concatenate(([0], np.cumsum(counts)))
@@ -135,7 +135,7 @@ def point_to_segment(
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
-    """Which points to keep so that no dropped point is further than the tolerance from what remains.
+    """Mask of points to keep so that no dropped point is further than the tolerance from the rest.
 
     Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
@@ -183,7 +183,7 @@ def _chord_distance(axes: Sequence[Array], point: Array, a: Array, b: Array) -> 
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
-    """Into how many equal pieces to cut segments so that none is longer than ``longest_m``; at least one."""
+    """Number of equal pieces of segments so that none is longer than ``longest_m``; at least one."""
     return np.maximum(np.ceil(length / longest_m - 1e-9), 1).astype(np.int64)
 
 
@@ -236,7 +236,7 @@ def project_monotone(
     window_m: Float[Array, " query"],
     first_window_m: float = np.inf,
 ) -> Float[Array, " query"]:
-    """Arc lengths of successive positions along a polyline that never run backwards nor jump to another branch.
+    """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
     position is searched in ``[0, first_window_m]``.
