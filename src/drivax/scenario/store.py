@@ -314,7 +314,9 @@ class ScenarioSet(Sequence[Scenario]):
         if out is None:
             out = np.empty(index.size, self._dtype)
         if out.shape != index.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
-            raise UsageError("out does not have the size and type of the records", file=self.path, cure="leave it out")
+            raise UsageError(
+                "out does not have the size and type of the records", file=self.path, cure="leave it out"
+            )
         data = out.view(np.uint8).reshape(index.size, self._dtype.itemsize)
         shards = np.searchsorted(self._starts, index, side="right") - 1
         # A contiguous copy right after the test that brought the record into the cache; take() is slower.

@@ -139,8 +139,7 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     gap = np.fmin(left_gap, right_gap)
     measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
     given = np.array(
-        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes],
-        dtype=np.float64,
+        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes], dtype=np.float64
     )
     return LaneGraph(
         lines=lines,

@@ -49,11 +49,7 @@ class RoadRows:
 
 
 def road_rows(
-    roads: RoadLines,
-    features: Sequence[MapFeature],
-    path: Float[Array, "step 2"],
-    margin_m: float,
-    most: int,
+    roads: RoadLines, features: Sequence[MapFeature], path: Float[Array, "step 2"], margin_m: float, most: int
 ) -> RoadRows:
     """Cuts lanes, road edges and crosswalks into pieces and ranks them.
 

@@ -313,13 +313,7 @@ class _Drawer:
         speed = float(ego.speed[ego.current])
         change_m = max(CHANGE_M, CHANGE_S * speed)
         line = trace(
-            graph,
-            lanes,
-            max(begin, 0.0),
-            -way.s - length,
-            (REACTION_S * speed, way.until),
-            place,
-            change_m,
+            graph, lanes, max(begin, 0.0), -way.s - length, (REACTION_S * speed, way.until), place, change_m
         )
         line = continue_straight(line, max(-begin, 0.0), PAST_GOAL_M)
         arc, _ = project(line[0], ego.seen[-1:, :2])
