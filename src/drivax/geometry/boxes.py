@@ -104,15 +104,10 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
     On each separating axis the centre distance is linear in time, so the boxes overlap on that axis during one
     interval; they overlap in the plane during the intersection of the four (swept separating axis theorem).
 
-    Args:
-        a: Box ``[..., 6]``.
-        velocity_a: Velocity of its centre ``[..., 2]``, m/s.
-        b: Box ``[..., 6]``.
-        velocity_b: Velocity ``[..., 2]``, m/s.
-        horizon_s: Longest time of interest, seconds.
+    Velocities ``[..., 2]`` are those of the centres, m/s.
 
     Returns:
-        Seconds ``[...]``: 0 where they overlap now, ``horizon_s`` where they do not within the horizon.
+        Seconds ``[...]``: 0 for boxes that overlap now, ``horizon_s`` for those that do not within the horizon.
     """
     xp = a.__array_namespace__()
     dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
@@ -124,10 +119,10 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
         speed = vx * axis_x + vy * axis_y
         moving = abs(speed) > 1e-9
         inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
-        one, other = (-reach - distance) * inverse, (reach - distance) * inverse
+        first, second = (-reach - distance) * inverse, (reach - distance) * inverse
         inside = abs(distance) < reach
         never = xp.full_like(dx, horizon_s)
-        enter = xp.where(moving, xp.minimum(one, other), xp.where(inside, xp.zeros_like(dx), never))
-        leave = xp.where(moving, xp.maximum(one, other), never)
+        enter = xp.where(moving, xp.minimum(first, second), xp.where(inside, xp.zeros_like(dx), never))
+        leave = xp.where(moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
     return xp.where(begin < end, begin, xp.full_like(dx, horizon_s))

@@ -1,8 +1,7 @@
-"""Polylines: arc length, simplification, cutting, resampling and projection, for many polylines at once.
+"""Polylines: arc length, simplification, cutting, resampling and projection.
 
-A set of polylines is one array of points and one array of row starts (:class:`Polylines`), so that a whole map is
-handled without a Python loop over its features. Arc length is measured in the plane (x, y); a third coordinate is
-carried along. numpy only: this runs when scenarios are written, not when they are simulated.
+:class:`Polylines` holds many polylines in one array of points, so that a map needs no Python loop over its features.
+Arc length is measured in the plane (x, y); a third coordinate is carried along. NumPy only.
 """
 
 from __future__ import annotations
@@ -73,8 +72,8 @@ class Polylines:
         Every polyline needs two points. Arc lengths beyond an end give fractions outside [0, 1] of the first or
         the last segment: evaluation there continues straight on.
         """
-        wanted = np.clip(s, 0.0, self.length[row]) + self._base[row]
-        index = np.searchsorted(self._key, wanted, side="right") - 1
+        key = np.clip(s, 0.0, self.length[row]) + self._base[row]
+        index = np.searchsorted(self._key, key, side="right") - 1
         index = np.clip(index, self.start[row], self.start[row + 1] - 2)
         span = self.arc[index + 1] - self.arc[index]
         return index, (s - self.arc[index]) / np.where(span > 0.0, span, 1.0)
