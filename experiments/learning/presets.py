@@ -28,7 +28,7 @@ from drivax import settings
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
 from drivax.learning.policies import pack_policy
-from drivax.report.loaded_runs import read_runs
+from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.tracking.run_folder import RunFolder, seed_folders, versions

@@ -1,4 +1,4 @@
-"""Which episodes a report shows: the policy's failures first, each kind in turn, then some successes."""
+"""Episodes that a report shows: the policy's failures first, each kind in turn, then some successes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable
-from drivax.report.loaded_runs import Evaluation
+from drivax.report.runs import Evaluation
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).
 FAILURES = (
@@ -21,18 +21,18 @@ FAILURES = (
     ("left the map", "left_map", 1.0),
     ("goal not reached", "reached_goal", 0.0),
 )
-#: Share of the shown episodes that successes get where there are failures enough.
+#: Share of successes among the shown episodes where there are enough failures.
 _SUCCESS_SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class Choice:
-    """One episode to show.
+class EpisodeGroup:
+    """The episodes of all runs in one scenario.
 
     Attributes:
         dataset, scenario_id: The scenario.
         rows: Episode of that scenario in each run, None where the run lacks it.
-        outcome: What happened to the policy: a kind of failure, or ``success``.
+        outcome: Outcome of the policy: a kind of failure, or ``success``.
     """
 
     dataset: str
@@ -40,89 +40,87 @@ class Choice:
     rows: tuple[int | None, ...]
     outcome: str
 
+    @property
+    def key(self) -> ScenarioKey:
+        """The scenario."""
+        return self.dataset, self.scenario_id
+
 
 def outcome(run: EpisodeTable, row: int) -> str:
-    """The gravest kind of failure of an episode, ``success``, or ``unjudged`` where nothing is defined."""
-    judged = False
+    """Return the gravest failure of an episode, ``success``, or ``unjudged`` where nothing is defined."""
+    defined = False
     for words, metric, bad in FAILURES:
         value = _value(run, metric, row)
-        judged |= not np.isnan(value)
+        defined |= not np.isnan(value)
         if value == bad:
             return words
-    return "success" if judged else "unjudged"
+    return "success" if defined else "unjudged"
 
 
 def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]:
-    """Rows of a run, worst episode first: by how grave the failure is, then by score.
+    """Return the rows of a run, worst episode first: by failure, then by score.
 
-    Among equals those come first that more of the others drove without failure, then by scenario id.
+    Among equals those come first that more of the other runs completed without failure, then by scenario id.
     """
     order = [words for words, _, _ in FAILURES]
     rank = {words: place for place, words in enumerate([*order, "unjudged", "success"])}
-    done: Counter[ScenarioKey] = Counter()
+    completed: Counter[ScenarioKey] = Counter()
     for other in others:
         if comparable(run, other):
-            done.update({key for row, key in enumerate(other.scenarios) if outcome(other, row) == "success"})
+            keys = enumerate(other.scenarios)
+            completed.update({key for row, key in keys if outcome(other, row) == "success"})
     scenarios = run.scenarios
 
     def key(row: int) -> tuple[int, float, int, str, int]:
         score = _value(run, "vmax_score", row)
         known = 1.0 if np.isnan(score) else score
-        return rank[outcome(run, row)], known, -done[scenarios[row]], scenarios[row][1], row
+        return rank[outcome(run, row)], known, -completed[scenarios[row]], scenarios[row][1], row
 
     return sorted(range(run.episodes), key=key)
 
 
-def choose(runs: Sequence[Evaluation], count: int) -> list[Choice]:
-    """Pick episodes of the last run: failures of every kind in turn, worst score first, and some successes.
+def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
+    """Return episodes of the last run: failures of every kind in turn, worst score first, and some successes.
 
-    Among equally bad failures those come first that another planner drove well; among successes those where
-    others failed, so that the picture tells planners apart.
+    Among equal failures those come first that another planner completed; among successes those where others failed.
     """
-    groups: dict[str, list[Choice]] = {}
-    for choice in ranked(runs):
-        groups.setdefault(choice.outcome, []).append(choice)
-    successes = sorted(groups.pop("success", []), key=lambda one: (_driven_well(runs, one), one.scenario_id))
-    failures = _in_turn(list(groups.values()))
-    wanted = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
-    picked = failures[:wanted] + successes[: count - min(wanted, len(failures))]
-    return picked[:count]
+    kinds: dict[str, list[EpisodeGroup]] = {}
+    for group in ranked(runs):
+        kinds.setdefault(group.outcome, []).append(group)
+    successes = sorted(
+        kinds.pop("success", []), key=lambda group: (_completed(runs, group), group.scenario_id)
+    )
+    failures = _in_turn(list(kinds.values()))
+    most = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
+    return (failures[:most] + successes[: count - min(most, len(failures))])[:count]
 
 
-def _in_turn(groups: list[list[Choice]]) -> list[Choice]:
-    """One of each group, then the second of each, and so on."""
-    longest = max(map(len, groups), default=0)
-    return [group[place] for place in range(longest) for group in groups if place < len(group)]
+def _in_turn(kinds: list[list[EpisodeGroup]]) -> list[EpisodeGroup]:
+    """Return the first of each kind, then the second of each, and so on."""
+    longest = max(map(len, kinds), default=0)
+    return [groups[place] for place in range(longest) for groups in kinds if place < len(groups)]
 
 
-def _driven_well(runs: Sequence[Evaluation], choice: Choice) -> int:
-    """How many of the runs drove it without failure."""
-    rows = zip(runs, choice.rows, strict=True)
+def _completed(runs: Sequence[Evaluation], group: EpisodeGroup) -> int:
+    """Return the number of runs without a failure."""
+    rows = zip(runs, group.rows, strict=True)
     return sum(outcome(run, row) == "success" for run, row in rows if row is not None)
 
 
-def ranked(runs: Sequence[Evaluation]) -> list[Choice]:
-    """All scenarios of the last run whose drive is stored, worst first."""
-    choices = {places[-1]: _choice(runs, places) for places in _places(runs)}
-    return [choices[row] for row in worst_first(runs[-1], runs[:-1]) if row in choices]
-
-
-def _choice(runs: Sequence[Evaluation], rows: tuple[int | None, ...]) -> Choice:
-    policy, row = runs[-1], rows[-1] or 0
-    keys = policy.keys
-    return Choice(keys["dataset"][row], keys["scenario_id"][row], rows, outcome(policy, row))
-
-
-def _places(runs: Sequence[Evaluation]) -> list[tuple[int | None, ...]]:
-    """Row of every scenario of the last run in each run; None where a run lacks it or is not comparable."""
+def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
+    """Return all scenarios of the last run with a stored trajectory, worst first."""
     policy = runs[-1]
     others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
-    return [(*(rows.get(key) for rows in others), row) for key, row in _first_rows(policy).items()]
+    groups = {
+        row: EpisodeGroup(*key, (*(rows.get(key) for rows in others), row), outcome(policy, row))
+        for key, row in _first_rows(policy).items()
+    }
+    return [groups[row] for row in worst_first(policy, runs[:-1]) if row in groups]
 
 
-def _first_rows(run: Evaluation) -> dict[tuple[str, str], int]:
-    """(data set, scenario id) -> first episode of that scenario whose trajectory is stored."""
-    rows: dict[tuple[str, str], int] = {}
+def _first_rows(run: Evaluation) -> dict[ScenarioKey, int]:
+    """Return the first episode of each scenario with a stored trajectory."""
+    rows: dict[ScenarioKey, int] = {}
     for row, (key, dataset) in enumerate(zip(run.occurrences, run.keys["dataset"], strict=True)):
         if key in run.trajectories.rows:
             rows.setdefault((dataset, key[0]), row)
@@ -130,5 +128,5 @@ def _first_rows(run: Evaluation) -> dict[tuple[str, str], int]:
 
 
 def _value(run: EpisodeTable, metric: str, row: int) -> float:
-    """A metric of an episode; NaN where it is undefined or missing."""
+    """Return a metric of an episode; NaN where it is undefined or missing."""
     return float(run.metrics[metric][row]) if metric in run.metrics else float("nan")

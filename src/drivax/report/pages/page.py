@@ -1,19 +1,16 @@
-"""The frame of every page: one HTML file that carries its styles, scripts and data, written whole or not at all."""
+"""The frame of every page: one HTML file that carries its styles, scripts and data."""
 
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import metadata, resources
-from pathlib import Path
 from string import Template
 from typing import Any
 
-from drivax.errors import UsageError
 from drivax.report.pictures.palette import THEMES
+from drivax.table import Cell, Column, Table
 
 
 def page(
@@ -24,20 +21,20 @@ def page(
     data: Iterable[str] = (),
     scripts: Iterable[str] = (),
 ) -> str:
-    """A whole page.
+    """Return a whole page.
 
     Args:
         title: Its heading, as plain text.
         lead: HTML below the heading.
         sections: HTML of its parts; empty ones are left out.
-        style: CSS beside that of all pages.
+        style: CSS in addition to that of all pages.
         data: Script elements that hold data.
         scripts: Programs, in order.
     """
     return Template(asset("report.html.template")).substitute(
         title=escape(title),
         version=escape(metadata.version("drivax")),
-        style=colours() + asset("player.css") + style,
+        style=_colours() + asset("player.css") + style,
         lead=lead,
         sections="\n".join(filter(None, sections)),
         data="\n".join(data),
@@ -46,17 +43,16 @@ def page(
 
 
 def data_element(value: Any, **attributes: str) -> str:
-    """A script element that holds JSON and cannot be ended by it."""
+    """Return a script element that holds JSON, with every ``<`` escaped."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     named = "".join(f' {name}="{escape(words)}"' for name, words in attributes.items())
     return f'<script type="application/json"{named}>{text}</script>'
 
 
-def colours() -> str:
-    """The palette as CSS variables, light and dark."""
-    light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
-                   for name in ("light", "dark"))  # fmt: skip
-    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
+def facts_html(headings: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Return a table of texts: a label and the facts about it in each row."""
+    columns = tuple(Column(heading, label=not place) for place, heading in enumerate(headings))
+    return Table("facts", columns, tuple((Cell(label), *map(Cell, facts)) for label, facts in rows)).html()
 
 
 def asset(name: str) -> str:
@@ -64,28 +60,8 @@ def asset(name: str) -> str:
     return resources.files("drivax.report.pages").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def refuse_page(out: Path, overwrite: bool) -> None:
-    """Refuses a page that may not be written, before any work is done.
-
-    Raises:
-        UsageError: ``out`` is a folder, or exists and ``overwrite`` is not given.
-    """
-    if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name a file in it" if out.is_dir() else "choose another name or pass --overwrite"
-        raise UsageError("exists already", file=out, cure=cure)
-
-
-def publish(out: Path, text: str) -> None:
-    """Write beside the target, make it durable, then rename: never half a page under its name."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-        Path(name).replace(out)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+def _colours() -> str:
+    """Return the palette as CSS variables, light and dark."""
+    light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
+                   for name in ("light", "dark"))  # fmt: skip
+    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"

@@ -1,4 +1,4 @@
-"""The player as HTML: what it is fed with, its controls, its legend and the plots below it."""
+"""The player as HTML: its data, controls, legend, and the plots below it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 
 from drivax.report.charts.motion import COMMANDS, SIGNALS
 from drivax.report.pages.page import asset, data_element
+from drivax.report.pictures.drawing import EVENT_WORDS, GOAL_M, LIGHTS, STOP_M, WIDTHS
 from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
 
 KEYS = (
     ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
-    ("+ −", "zoom"), ("f", "follow or whole drive"), ("n p", "next and previous episode"),
+    ("+ −", "zoom"), ("f", "follow or whole episode"), ("n p", "next and previous episode"),
 )  # fmt: skip
 _CONTROLS = """<div class=controls>
 <button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
@@ -25,43 +26,46 @@ _CONTROLS = """<div class=controls>
 <option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
 <option value=2>2×</option><option value=4>4×</option></select>
 <button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
-<button type=button data-control=fit aria-pressed=false title="show the whole drive (f)">whole</button>
+<button type=button data-control=fit aria-pressed=false title="show the whole episode (f)">whole</button>
 <button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
 <button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
 </div>"""
 
 
 def player_html() -> str:
-    """Stage, controls, legend, keys and plots."""
+    """Return stage, controls, legend, keys and plots."""
     legend = "".join(_legend_item(name, words) for name, words in LEGEND)
     keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
     return (
         f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
-        "<noscript><p>The drives need JavaScript, which this page carries with it.</p></noscript>"
-        "<h3>How it drove</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the filters "
-        "of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are what was "
-        "carried out: acceleration (or metres ahead) and steering (or metres to the left), as shares of the most "
-        "that the action space allows.</small></p>"
+        "<noscript><p>The player needs JavaScript, which this page carries with it.</p></noscript>"
+        "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
+        "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
+        "the executed ones: acceleration (or metres ahead) and steering (or metres to the left), as shares of the "
+        "maximum of the action space.</small></p>"
     )
 
 
 def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return script elements with palette, signals and packed episodes (``report.pictures.episode``)."""
-    themes = {name: dict(theme) for name, theme in THEMES.items()}
-    signals = [
-        {"words": one.title, "unit": one.unit, "step": one.step, "limits": one.limits}
-        for one in (*SIGNALS, *COMMANDS)
-    ]
-    strokes = [[one.colour, one.dash, one.key] for one in STROKES]
-    head = [
-        data_element(themes, id="palette"),
-        data_element({"signals": signals, "strokes": strokes}, id="signals"),
-    ]
-    return head + [data_element(episode, **{"class": "episode"}) for episode in episodes]
+    """Return script elements with styles, signals and packed episodes (``report.pictures.player_data``)."""
+    style = {
+        "themes": {name: dict(theme) for name, theme in THEMES.items()},
+        "widths": dict(WIDTHS),
+        "radii": {"stop": STOP_M, "goal": GOAL_M},
+        "lights": LIGHTS,
+        "events": dict(EVENT_WORDS),
+        "signals": [
+            {"words": signal.title, "unit": signal.unit, "step": signal.step, "limits": signal.limits}
+            for signal in (*SIGNALS, *COMMANDS)
+        ],
+        "strokes": [[stroke.colour, stroke.dash, stroke.key] for stroke in STROKES],
+    }
+    packed = (data_element(episode, **{"class": "episode"}) for episode in episodes)
+    return [data_element(style, id="style"), *packed]
 
 
 def player_scripts() -> list[str]:
-    """The programs of player and plots; the plots listen to the player, so that they come first."""
+    """Return the programs of plots and player; the plots listen to the player, so they come first."""
     return [asset("plots.js"), asset("player.js")]
 
 

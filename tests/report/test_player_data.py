@@ -6,9 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from drivax.report.pictures.episode import ABSENT, Drive, Scale, pack_episode
+from drivax.report.pictures.drawing import Rollout
+from drivax.report.pictures.player_data import ABSENT, Scale, pack_episode
 
-from .conftest import drive_off, make_scenario
+from .conftest import make_scenario, offset_path
 
 
 def shorts(text, *shape):
@@ -22,9 +23,9 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def drive(scenario):
-    ego = drive_off(scenario, 3.0).astype(np.float64)
+    ego = offset_path(scenario, 3.0).astype(np.float64)
     ego[80:] = np.nan
-    return Drive("policy", ego, 10, {"collision": 40, "offroad": -1, "red_light": 3}, "collision")
+    return Rollout("policy", ego, 10, {"collision": 40, "offroad": -1, "red_light": 3}, "collision")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def packed(scenario, drive):
 
 
 def test_drives_come_back_within_half_a_unit(packed, drive):
-    stored = packed["drives"][0]
+    stored = packed["rollouts"][0]
     pose = shorts(stored["pose"], 91, 3)
     xy = pose[:80, :2] * packed["unit"] + packed["centre"]
     assert np.abs(xy - drive.ego[:80, :2]).max() <= packed["unit"] / 2 + 1e-9

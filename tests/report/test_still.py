@@ -9,7 +9,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.report.pictures.palette import DARK, LEGEND, LIGHT
 
-from .conftest import drive_off, make_scenario
+from .conftest import make_scenario, offset_path
 
 pytest.importorskip("matplotlib")
 
@@ -60,9 +60,9 @@ def test_a_driven_path_moves_the_ego_and_leaves_the_log_dashed():
     from drivax.report.pictures.still import draw_scenario
 
     scenario = make_scenario(0)
-    ego = drive_off(scenario, 20.0)
+    ego = offset_path(scenario, 20.0)
     image = pixels(draw_scenario(scenario, 60, ego))
-    plain = pixels(draw_scenario(scenario, 60, drive_off(scenario, 0.0)))
+    plain = pixels(draw_scenario(scenario, 60, offset_path(scenario, 0.0)))
     assert share(image, "log", near=25) > share(plain, "log", near=25) + 20 and share(image, "ego") > 50
     gone = ego.copy()
     gone[60:] = np.nan

@@ -1,4 +1,4 @@
-"""Drives of evaluations in the scenarios that they drove, for player and video."""
+"""Rollouts of evaluations in their scenarios, for player and video."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from drivax.errors import DataError
 from drivax.evaluation.stored import ScenarioKey, open_driven_set
 from drivax.evaluation.traffic_trajectories import unpacked
 from drivax.report.charts.motion import COMMANDED
-from drivax.report.episode_selection import Choice, outcome
-from drivax.report.loaded_runs import Evaluation
-from drivax.report.pictures.episode import Drive
+from drivax.report.episode_selection import EpisodeGroup, outcome
+from drivax.report.pictures.drawing import Rollout
+from drivax.report.runs import Evaluation
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 
 
-class DrivenSet:
-    """The scenarios that an evaluation drove.
+class EvaluatedSet:
+    """The scenarios of an evaluation.
 
     Args:
         run: The evaluation.
-        data: Where its scenario set is, if it has moved.
+        data: Path of its scenario set, if it has moved.
 
     Raises:
-        DataError: It is not there, or another one is.
+        DataError: The set is missing, or has another hash.
     """
 
     def __init__(self, run: Evaluation, data: Path | None = None) -> None:
@@ -38,7 +38,7 @@ class DrivenSet:
         }
 
     def scenario(self, key: ScenarioKey) -> Scenario:
-        """A scenario by data set and id.
+        """Return a scenario by data set and id.
 
         Raises:
             DataError: It is not in the set.
@@ -54,37 +54,38 @@ class DrivenSet:
         return self.scenarios[row]
 
     def tags(self) -> dict[ScenarioKey, Mapping[str, str]]:
-        """The tags of every scenario."""
+        """Return the tags of every scenario."""
         return {key: self.scenarios.entries[row]["tags"] for key, row in self._rows.items()}
 
 
-def drives_of(runs: Sequence[Evaluation], choice: Choice, scenario: Scenario) -> list[Drive]:
-    """What each run that drove the chosen scenario did there."""
-    rows = zip(runs, choice.rows, strict=True)
-    return [_drive(run, place, scenario) for run, place in rows if place is not None]
+def rollouts_of(runs: Sequence[Evaluation], group: EpisodeGroup, scenario: Scenario) -> list[Rollout]:
+    """Return the rollout of each run that has an episode in the group."""
+    rows = zip(runs, group.rows, strict=True)
+    return [_rollout(run, row, scenario) for run, row in rows if row is not None]
 
 
-def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
+def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
     stored = run.trajectories
     place = stored.rows[run.occurrences[row]]
     steps, start = int(scenario.steps), int(stored.start[place])
     ego = np.full((steps, 4), np.nan)
-    ego[:start] = logged_drive(scenario)[:start]
-    driven = stored.ego[place, : steps - start]
-    ego[start : start + len(driven)] = driven
+    ego[:start] = logged_motion(scenario)[:start]
+    motion = stored.ego[place, : steps - start]
+    ego[start : start + len(motion)] = motion
     events = {name: int(at[place]) for name, at in stored.events.items()}
     events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
-    action, asked = np.full((steps, COMMANDED), np.nan), stored.action[place, : steps - start, :COMMANDED]
-    action[start : start + len(asked), : asked.shape[1]] = asked
+    action = np.full((steps, COMMANDED), np.nan)
+    commands = stored.action[place, : steps - start, :COMMANDED]
+    action[start : start + len(commands), : commands.shape[1]] = commands
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(driven)] = unpacked(stored.others[place, : steps - start])
-    return Drive(run.name, ego, start, events, outcome(run, row), action, others)
+        others[start : start + len(motion)] = unpacked(stored.others[place, : steps - start])
+    return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 
-def logged_drive(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
-    """The logged ego: position, heading, speed; NaN where it was not valid."""
+def logged_motion(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
+    """Return position, heading and speed of the logged ego; NaN where it is not valid."""
     steps = int(scenario.steps)
     speed = np.linalg.norm(scenario.agent_velocity[:steps, 0], axis=-1)
     pose = np.column_stack((scenario.agent_xy[:steps, 0], scenario.agent_heading[:steps, 0], speed))

@@ -1,4 +1,4 @@
-"""Run folders read back: evaluations (episodes, trajectories) and trainings (learning curves)."""
+"""Run folders for a report: evaluations (episodes, trajectories) and trainings (learning curves)."""
 
 from __future__ import annotations
 
@@ -23,16 +23,15 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Where the judged car drove, one row per episode, in each scenario's local frame.
+    """Trajectories of the evaluated agent, one row per episode, in each scenario's local frame.
 
     Attributes:
-        rows: (scenario id, how many rows of that scenario came before) -> row.
+        rows: (scenario id, number of earlier rows of that scenario) -> row.
         ego: Position [m], heading [rad] and speed [m/s] at every step from ``start`` on.
-        action: What was asked of it from ``start`` on; without numbers in a run that does not tell.
+        action: Its actions from ``start`` on; NaN in a run without them.
         start: Step of the log at which the planner took over.
-        events: Step of the first event by name (:data:`EVENTS`), -1 where there was none.
-        others: Where everyone was from ``start`` on (``evaluation.traffic_trajectories``); None where the log was
-            replayed.
+        events: Step of the first event by name (:data:`EVENTS`), -1 for none.
+        others: All agents from ``start`` on (``evaluation.traffic_trajectories``); None in log traffic.
     """
 
     rows: Mapping[tuple[str, int], int]
@@ -45,11 +44,11 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class Evaluation(EpisodeTable):
-    """One planner driven through one scenario set; its name is made unique by :func:`read_runs`.
+    """Episodes of one planner with their trajectories; :func:`read_runs` makes its name unique.
 
     Attributes:
-        trajectories: What was driven.
-        crashes: Of the scenarios in which the planner crashed, the step and what it raised.
+        trajectories: The trajectories.
+        crashes: Step and error by scenario, where the planner crashed.
     """
 
     trajectories: Trajectories
@@ -57,18 +56,13 @@ class Evaluation(EpisodeTable):
 
     @property
     def occurrences(self) -> list[tuple[str, int]]:
-        """(scenario id, how many episodes of that scenario came before), by episode: the key of trajectories."""
-        seen: dict[str, int] = {}
-        keys = []
-        for scenario_id in self.keys["scenario_id"]:
-            keys.append((scenario_id, seen.get(scenario_id, 0)))
-            seen[scenario_id] = seen.get(scenario_id, 0) + 1
-        return keys
+        """The key of each episode in ``trajectories.rows``."""
+        return _occurrences(self.keys["scenario_id"])
 
 
 @dataclass(frozen=True)
 class Training:
-    """One training run: what was logged on the way.
+    """The log of one training run.
 
     Attributes:
         folder: The run folder.
@@ -84,9 +78,9 @@ class Training:
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]]:
-    """Read run folders of either kind; names that repeat get the folder's name as a suffix.
+    """Read run folders of either kind; repeated names get the folder's name as a suffix.
 
-    The folder of several agents stands for those of all of them.
+    A folder with one run per seed stands for all of them.
 
     Raises:
         DataError: A folder or file is missing or damaged, or is no run.
@@ -97,7 +91,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]
     if not folders or len(set(resolved)) < len(resolved):
         raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")
     evaluations, trainings = [], []
-    # A training and the evaluation of its policy may share a name: they never stand in one table.
+    # A training and the evaluation of its policy may share a name: no table holds both.
     names: set[str] = set()
     charts: set[str] = set()
     for folder in folders:
@@ -116,6 +110,14 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]
     return evaluations, trainings
 
 
+def read_evaluations(folders: Sequence[Path]) -> list[Evaluation]:
+    """Read run folders, at least one of them an evaluation; see :func:`read_runs`."""
+    evaluations, _ = read_runs(folders)
+    if not evaluations:
+        raise UsageError("no evaluation was given", cure="name run folders of drivax evaluate")
+    return evaluations
+
+
 def _unique(name: str, folder: Path, names: set[str]) -> str:
     candidate, number = name, 2
     while candidate in names:
@@ -127,14 +129,13 @@ def _unique(name: str, folder: Path, names: set[str]) -> str:
 
 def _evaluation(folder: Path, name: str, about: Mapping[str, Any]) -> Evaluation:
     columns = read_episodes(folder)
-    driven = _trajectories(
-        present(folder / "trajectories.npz"), replayed=about.get("traffic", "log") == "log"
-    )
-    return Evaluation(folder, name, about, *columns, driven, _crashes(folder / "crashes.json"))
+    replayed = about.get("traffic", "log") == "log"
+    trajectories = _trajectories(present(folder / "trajectories.npz"), replayed)
+    return Evaluation(folder, name, about, *columns, trajectories, _crashes(folder / "crashes.json"))
 
 
 def _crashes(path: Path) -> dict[ScenarioKey, tuple[int, str]]:
-    """What ``crashes.json`` tells; nothing where the planner never crashed."""
+    """Return the contents of ``crashes.json``; nothing where the planner never crashed."""
     if not path.is_file():
         return {}
     try:
@@ -147,7 +148,7 @@ def _crashes(path: Path) -> dict[ScenarioKey, tuple[int, str]]:
 def _trajectories(path: Path, replayed: bool) -> Trajectories:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            ids = [_text(value) for value in stored["scenario_id"]]
+            ids = [_decoded(value) for value in stored["scenario_id"]]
             ego = stored["ego"].astype(np.float32)
             action = (stored["action"] if "action" in stored else ego[:, 1:, :0]).astype(np.float32)
             start = stored["start"].astype(np.int64)
@@ -164,15 +165,21 @@ def _trajectories(path: Path, replayed: bool) -> Trajectories:
         others.ndim != 4 or others.shape[:2] != ego.shape[:2] or others.shape[3] != 3 or others.dtype != np.int16
     )):  # fmt: skip
         raise DataError("its arrays disagree in shape", file=path, cure=AGAIN)
-    seen: dict[str, int] = {}
-    rows = {}
-    for row, scenario_id in enumerate(ids):
-        rows[scenario_id, seen.get(scenario_id, 0)] = row
-        seen[scenario_id] = seen.get(scenario_id, 0) + 1
+    rows = {key: row for row, key in enumerate(_occurrences(ids))}
     return Trajectories(rows, ego, action, start, events, others)
 
 
-def _text(value: Any) -> str:
+def _occurrences(ids: Sequence[str]) -> list[tuple[str, int]]:
+    """Return each scenario id with the number of its earlier occurrences."""
+    seen: dict[str, int] = {}
+    keys = []
+    for scenario_id in ids:
+        keys.append((scenario_id, seen.get(scenario_id, 0)))
+        seen[scenario_id] = seen.get(scenario_id, 0) + 1
+    return keys
+
+
+def _decoded(value: Any) -> str:
     return value.rstrip(b"\0").decode() if isinstance(value, bytes) else str(value)
 
 
@@ -189,10 +196,6 @@ def _curves(folder: Path) -> dict[str, Array]:
                 continue
             raise DataError("is no row of metrics", file=path, record=number, cure="train again") from None
         for name, value in row.items():
-            if name not in ("step", "time_s") and _finite(value):
+            if name not in ("step", "time_s") and isinstance(value, int | float) and math.isfinite(value):
                 points.setdefault(name, []).append((step, float(value)))
     return {name: np.array(values) for name, values in points.items()}
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)

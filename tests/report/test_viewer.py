@@ -49,20 +49,20 @@ def test_the_logs_are_in_the_page(page, data):
     stored = [json.loads(one) for one in re.findall(r'class="episode">(.*?)</script>', text)]
     assert [one["id"] for one in stored] == ["calm", "bad", "new"] == [one["title"] for one in stored]
     for one, scenario in zip(stored, data, strict=True):
-        (drive,) = one["drives"]
+        (drive,) = one["rollouts"]
         pose = np.frombuffer(base64.b64decode(drive["pose"]), "<i2").reshape(-1, 3)
         xy = pose[:, :2] * one["unit"] + np.array(one["centre"])
         np.testing.assert_allclose(xy, scenario.agent_xy[:, 0], atol=0.02)
         speed = np.frombuffer(base64.b64decode(drive["speed"]), "<i2") / 100
         np.testing.assert_allclose(speed, np.linalg.norm(scenario.agent_velocity[:, 0], axis=-1), atol=0.01)
-    assert [one["drives"][0]["events"] for one in stored] == [{}, {"offroad": 30}, {}]
-    assert [one["drives"][0]["outcome"] for one in stored] == ["", "collides, runs red, off-road", ""]
+    assert [one["rollouts"][0]["events"] for one in stored] == [{}, {"offroad": 30}, {}]
+    assert [one["rollouts"][0]["outcome"] for one in stored] == ["", "collides, runs red, off-road", ""]
 
 
 def test_what_is_known_stands_beside_it(page):
     text = page.read_text()
     assert "<h1>roads &amp; more</h1>" in text
-    assert "<b>3</b> recorded drives; the audit finds fault with 1 of 2." in text
+    assert "<b>3</b> recorded scenarios; the audit finds violations in 1 of 2." in text
     calm, bad, new = re.findall(r"<div hidden>(.*?)</div>", text, re.S)
     assert "<dt>log runs red</dt><dd>undefined</dd>" in calm
     assert "<dt>first offroad step</dt><dd>never</dd>" in calm
@@ -91,9 +91,9 @@ def test_select(data):
 
 def test_what_is_refused(page, data, tmp_path):
     before = page.read_bytes()
-    with pytest.raises(UsageError, match="exists already; choose another name or pass --overwrite"):
+    with pytest.raises(UsageError, match="output file already exists; choose another or pass --overwrite"):
         write_player(list(data)[:1], page)
-    with pytest.raises(UsageError, match="name a file in it"):
+    with pytest.raises(UsageError, match="name a file to write"):
         write_player(list(data), tmp_path, overwrite=True)
     with pytest.raises(UsageError, match="there is no scenario to show"):
         write_player([], tmp_path / "none.html")

@@ -15,9 +15,9 @@ from markdown_it import MarkdownIt
 
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
-from drivax.evaluation.tables import Row, Table
-from drivax.report.exports import latex, tex, write_tables
 from drivax.report.pages.report import write_report
+from drivax.report.table_files import write_tables
+from drivax.table import Cell, Column, Table
 
 LATEX = next(filter(None, map(shutil.which, ("pdflatex", "xelatex", "tectonic"))), None)
 NASTY = r"50% of_a & b #1 {x} $y^2$ ~ \cmd <i>|é|😀"
@@ -126,19 +126,11 @@ def test_latex_is_sound(written):
                 assert len(re.findall(r"(?<!\\)&", line)) == columns - 1, (name, line)
 
 
-def test_special_characters_by_hand():
-    assert tex("a_b & 5 %") == r"a\_b \& 5 \%"
-    assert tex("[0.5]") == "{[}0.5]", "behind the end of a row a bracket would begin an option"
-    assert tex("−1.5 m/s²") == r"$-$1.5 m/s$^2$"
-    assert tex("\\x{}") == r"\textbackslash{}x\{\}"
-    assert tex("é😀\n") == r"é\texttt{U+1F600}\texttt{U+000A}"
-
-
 @pytest.mark.skipif(LATEX is None, reason="no LaTeX on this machine")
 def test_latex_compiles(written, tmp_path):
     inputs = "\n\n".join(rf"\input{{{file}}}" for name, file in written.items() if name.endswith(".tex"))
-    rows = tuple(Row((name,), (None,)) for name in (NASTY, HARD, "[b]"))
-    inputs += latex(Table("names", "Names", ("planner",), "metric", ("success",), rows), ())
+    rows = tuple((Cell(name), Cell()) for name in (NASTY, HARD, "[b]"))
+    inputs += Table("names", (Column("planner", label=True), Column("success")), rows, "Names").latex()
     paper = tmp_path / "paper.tex"
     paper.write_text("\\documentclass{article}\n\\begin{document}\n" + inputs + "\n\\end{document}\n")
     command = [
@@ -156,7 +148,7 @@ def test_what_is_refused(runs, tmp_path, hand_set, capsys):
     assert main(["report", *map(str, runs), "--tables", "--out", str(out)]) == 0
     assert "results.csv" in capsys.readouterr().out
     assert main(["report", *map(str, runs), "--tables", "--out", str(out)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert main(["report", *map(str, runs), "--tables", "--out", str(out), "--overwrite"]) == 0
     assert main(["report", str(runs[0]), "--tables", "--video", "all"]) == 2
     assert "one at a time" in capsys.readouterr().err
@@ -182,6 +174,6 @@ def test_transfer_needs_two_sets(runs, tmp_path):
     told = {(r["planner"], r["trained_on"], r["evaluated_on"]): float(r["mean"]) for r in rows}
     page = write_report(runs, tmp_path / "report.html").read_text()
     transfer = page[page.index("<h2>Transfer") : page.index("<h2>Kinds")]
-    behind = {json.loads(unescape(found))["run"] for found in re.findall(r'data-behind="(.*?)"', transfer)}
+    behind = {json.loads(unescape(found))["run"] for found in re.findall(r'data-link="(.*?)"', transfer)}
     assert behind == {"expert", "constant", "policy"}
     assert told["expert", "b", "b"] == 1.0 and math.isclose(told["policy", "–", "hand-made roads"], 3 / 8)

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from drivax.evaluation.stored import comparable, mismatch
-from drivax.evaluation.tables import summarise
+from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
 from drivax.metrics.catalogue import METRICS
-from drivax.report.comparison import difference
 from drivax.report.episode_selection import choose, outcome
-from drivax.report.glossary import HEADLINE, headline, note, ordered
-from drivax.report.html_tables import bounds, number
-from drivax.report.loaded_runs import read_runs
+from drivax.report.runs import read_runs
 from drivax.stats.intervals import NOTHING, Interval, bootstrap_mean, rate
 
 SEGMENTS = [f"hand/road-{number // 2}" for number in range(8)]
@@ -108,11 +105,13 @@ def test_a_run_that_lacks_a_scenario_or_is_not_comparable_is_left_out(evaluation
     assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 3, 3)
 
 
-def test_glossary():
-    assert set(HEADLINE) <= set(METRICS) and all(note(name).explanation for name in METRICS)
-    assert note("at_fault_collision").better == "down" and note("at_fault_collision").unit == "rate"
-    assert note("vmax_score").unit == "share" and note("max_jerk").label == "max jerk [m/s³]"
-    assert note("my_metric").label == "my metric" and note("my_metric").better == "none"
+def test_metric_labels_and_order():
+    assert all(metric_label(name).explanation for name in METRICS)
+    assert metric_label("at_fault_collision").better == "low"
+    assert metric_label("at_fault_collision").unit == "rate" and metric_label("vmax_score").unit == "share"
+    assert metric_label("max_jerk").text == "max jerk [m/s³]"
+    assert metric_label("my_metric").text == "my metric" and metric_label("my_metric").better == "-"
+    assert metric_label("success").heading == "success ↑" and metric_label("offroad").heading == "off-road ↓"
     assert headline(["mine", "offroad", "success"]) == ["success", "offroad"]
     assert ordered(["mine", "steps", "offroad", "yours", "success"]) == [
         "success",
@@ -120,24 +119,3 @@ def test_glossary():
         "mine",
         "yours",
     ]
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "signed", "text"),
-    [
-        (0.625, "rate", False, "62.5"), (-0.0417, "rate", True, "−4.2"), (0.0, "rate", True, "0.0"),
-        (-0.0001, "rate", True, "0.0"), (0.9, "share", False, "0.900"), (0.25, "share", True, "+0.250"),
-        (3.14159, "m", False, "3.14"), (31.4159, "m", False, "31.4"), (31415.9, "m", False, "31416"),
-        (None, "m", False, "–"),
-    ],
-)  # fmt: skip
-def test_numbers(value, unit, signed, text):
-    assert number(value, unit, signed) == text
-
-
-def test_bounds():
-    assert bounds(Interval(0.5, 0.25, 0.75, 4), "rate") == "25.0–75.0"
-    assert bounds(Interval(-0.5, -0.75, 0.25, 4), "rate", signed=True) == "−75.0 to +25.0"
-    assert bounds(Interval(-1.0, -2.0, 1.5, 4), "m") == "−2.00 to 1.50"
-    assert bounds(Interval(1.0, None, None, 1), "m") == "no interval"
-    assert bounds(Interval(1.0, 1.0, 1.0, 9), "m") == "all alike" and bounds(NOTHING, "m") == ""

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.errors import UsageError
+from drivax.report.charts.distributions import BINS, bins, histogram
 from drivax.report.inspection import Inspection
-from drivax.report.pages.inspection import BINS, bins, histogram, write_histograms
+from drivax.report.pages.inspection import write_histograms
 from drivax.scenario.select.selection import Selection
 
 NUMBERS = st.one_of(
@@ -98,8 +99,8 @@ def test_an_existing_page_is_kept(hand_set, tmp_path):
     one = Inspection.open(hand_set, Selection())
     page = tmp_path / "page.html"
     page.write_text("mine")
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         write_histograms([one], page)
     assert page.read_text() == "mine"
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="is a folder"):
         write_histograms([one], tmp_path)

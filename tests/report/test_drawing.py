@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from drivax.report.pictures.drawing import LAYERS, Drawing, road_lines, surroundings
 from drivax.report.pictures.palette import DARK, LEGEND, LIGHT, agent_colour, light_colour, road_layer
-from drivax.report.pictures.roads import LAYERS, light_rows, road_lines, route, stop_signs
 from drivax.scenario.schema import AgentKind, LightState, RoadKind
 
-from .conftest import RADIUS_M, on_arc
+from .conftest import RADIUS_M, offset_path, on_arc
 
 
 def test_shuffled_segments_become_whole_lines_again(scenarios):
@@ -30,13 +32,36 @@ def test_a_box_cuts_lines_where_they_leave_it(scenarios):
 
 
 def test_padding_is_not_drawn(scenarios):
+    drawing = Drawing.of(scenarios[0], surroundings(scenarios[0], []))
+    assert drawing.light_line.shape == (1, 2, 2) and drawing.light_state.shape == (91, 1)
+    assert drawing.stops.shape == (1, 2) and drawing.goal.shape == (1, 2)
+    assert drawing.route.shape == (100, 2)
+    np.testing.assert_allclose(
+        np.linalg.norm(drawing.route - (0, RADIUS_M), axis=1), RADIUS_M + 1.8, atol=1e-4
+    )
+    record = scenarios[0].record.copy()
+    record["route_points"][:] = 0
+    assert Drawing.of(replace(scenarios[0], record=record), surroundings(scenarios[0], [])).route.shape == (
+        0,
+        2,
+    )
+
+
+def test_shapes_of_a_step_hold_each_present_agent_once(scenarios):
     scenario = scenarios[0]
-    assert light_rows(scenario).tolist() == [0]
-    assert stop_signs(scenario).shape == (1, 2)
-    points = route(scenario)
-    assert points.shape == (100, 2)
-    np.testing.assert_allclose(np.linalg.norm(points - (0, RADIUS_M), axis=1), RADIUS_M + 1.8, atol=1e-4)
-    assert route(scenario, 1).shape == (0, 2)
+    drawing = Drawing.of(scenario, surroundings(scenario, []))
+    outlines = {shape.fill: len(shape.lines) for shape in drawing.traffic(30) if shape.level == 4}
+    assert outlines == {"parked": 1, "vehicle": 1, "pedestrian": 1, "cyclist": 1}, (
+        "the far vehicle is left out"
+    )
+    lights = {shape.line: len(shape.lines) for shape in drawing.traffic(30) if shape.level == 3}
+    assert lights == {"unknown": 0, "red": 1, "amber": 0, "green": 0}
+    path = offset_path(scenario, 20.0)
+    trail, log, ego, arrow = drawing.ego(path, 60)
+    assert len(trail.lines[0]) == 61 and (log.line, ego.fill, arrow.fill) == ("log", "ego", "outline")
+    np.testing.assert_allclose(ego.lines[0][:4].mean(axis=0), path[60, :2], atol=1e-5)
+    path[60] = np.nan
+    assert [shape.line for shape in drawing.ego(path, 60)] == ["ego", "log"], "an absent ego has no box"
 
 
 def test_every_kind_has_a_colour_in_both_themes():
