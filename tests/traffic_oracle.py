@@ -24,16 +24,16 @@ EQUALLY_NEAR_M = 0.3
 def _rolled(bank, index):
     """Ego replays; before every step the frame that everybody looked at, and the state of traffic."""
 
-    def one(scene, _):
-        frame = SIMULATOR.frame(bank, scene, alone(scene), 0)
-        at = bank.agents[index, jnp.minimum(scene.step + 1, bank.steps - 1), 0]
+    def one(context, _):
+        frame = SIMULATOR.frame(bank, context, alone(context), 0)
+        at = bank.agents[index, jnp.minimum(context.step + 1, bank.steps - 1), 0]
         motion = jnp.stack([at[0], at[1], jnp.arctan2(at[4], at[3]), jnp.hypot(at[5], at[6])])
-        history = jnp.concatenate([scene.history[1:], motion[None]])
-        traffic = TRAFFIC.advance(bank, scene, frame)
-        after = replace(scene, step=scene.step + 1, history=history, traffic=traffic)
-        return after, (frame, scene.traffic)
+        history = jnp.concatenate([context.history[1:], motion[None]])
+        traffic = TRAFFIC.advance(bank, context, frame)
+        after = replace(context, step=context.step + 1, history=history, traffic=traffic)
+        return after, (frame, context.traffic)
 
-    return jax.lax.scan(one, SIMULATOR.scene(bank, index, 10), None, length=STEPS)[1]
+    return jax.lax.scan(one, SIMULATOR.context(bank, index, 10), None, length=STEPS)[1]
 
 
 rolled = jax.jit(jax.vmap(_rolled, (None, 0)))

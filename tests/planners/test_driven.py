@@ -53,7 +53,7 @@ def bank():
         car(25, 0, 0, 7), car(60, 3.7, 0, 10), car(90, 0, 0, 10),
     ]  # fmt: skip
     bank = bank_of(straight_road(cars))
-    seen = jax.eval_shape(lambda b: Simulator(TASK).observe(b, Simulator(TASK).scene(b, 0, 10)), bank)
+    seen = jax.eval_shape(lambda b: Simulator(TASK).observe(b, Simulator(TASK).context(b, 0, 10)), bank)
     width = sum(int(np.prod(leaf.shape)) for leaf in seen.values())
     graph, weights = nnx.split(Untrained(width, nnx.Rngs(4)), nnx.Param)
     return with_driver(bank, NetworkPlanner(weights, graph))
@@ -89,7 +89,7 @@ def test_they_drive_as_agents_that_are_stepped_together(bank):
     def as_traffic(bank):
         def one(state, _):
             after, _ = simulator.step(bank, state, ego)
-            return after, simulator.frame(bank, after.scene, alone(after.scene), 0)
+            return after, simulator.frame(bank, after.context, alone(after.context), 0)
 
         return jax.lax.scan(one, simulator.reset(bank, 0), None, STEPS)[1]
 
@@ -103,8 +103,8 @@ def test_they_drive_as_agents_that_are_stepped_together(bank):
             act = jax.vmap(lambda groups: network(groups).mode())
             actions = act(seen).at[0].set(ego)
             after, _ = stacked.step_together(bank, states, actions)
-            first = jax.tree.map(lambda leaf: leaf[0], after.scene)
-            return after, stacked.frame(bank, first, after.scene, 0)
+            first = jax.tree.map(lambda leaf: leaf[0], after.context)
+            return after, stacked.frame(bank, first, after.context, 0)
 
         return jax.lax.scan(one, stacked.reset_together(bank, 0, slots), None, STEPS)[1]
 

@@ -89,7 +89,7 @@ def test_it_copes_with_a_person_an_obstacle_a_cut_in_and_a_red_light():
         straight_road([car(0, 0, 0, 10), car(10, 3.7, -0.15, 8.0)]),
         straight_road([car(0, 0, 0, 10)], light=RED),
     ]
-    scenarios = [assemble(scene, SMALL) for scene in scenes]
+    scenarios = [assemble(recording, SMALL) for recording in scenes]
     bank = ScenarioBank.from_scenarios(scenarios, trim=False)
     found = evaluate(SearchPlanner(), bank, scenario_names(scenarios), task=TASK).metrics
     assert found["accuracy"].tolist() == [1.0, 1.0, 1.0, 1.0]

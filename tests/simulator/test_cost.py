@@ -41,7 +41,7 @@ def operations(bank, simulator=None):
 
     def one(bank, state, action):
         after, transition = simulator.step(bank, state, action)
-        return transition.reward, after.episode, simulator.observe(bank, after.scene)
+        return transition.reward, after.episode, simulator.observe(bank, after.context)
 
     state = jax.eval_shape(jax.vmap(simulator.reset, (None, 0)), bank, jnp.zeros(BATCH, jnp.int32))
     traced = jax.jit(jax.vmap(one, (None, 0, 0))).lower(bank, state, jnp.zeros((BATCH, 2)))
@@ -65,8 +65,8 @@ def test_a_step_costs_at_most_in_proportion_to_agents(bank, plain):
 @pytest.mark.slow
 def test_the_count_would_see_pairs_of_agents(bank):
     class Pairs(Simulator):
-        def observe(self, bank, scene, cast=None):
-            xy = bank.agents[scene.index, scene.step, :, :2]
+        def observe(self, bank, context, cast=None):
+            xy = bank.agents[context.index, context.step, :, :2]
             return {"apart": jnp.sum((xy[:, None] - xy) ** 2)}
 
     few = operations(bank, Pairs(Task(metrics="none")))

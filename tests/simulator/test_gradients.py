@@ -94,7 +94,7 @@ def together():
 
         def one(states, both):
             states, _ = simulator.step_together(bank, states, both)
-            return states, states.scene.history[:, -1]
+            return states, states.context.history[:, -1]
 
         return jax.lax.scan(one, pair, actions)[1]
 
@@ -136,7 +136,7 @@ def test_reactive_traffic_differentiates_with_respect_to_ego():
     def followers(bank, actions):
         def one(state, action):
             state, _ = simulator.step(bank, state, action)
-            return state, simulator.frame(bank, state.scene, alone(state.scene), 0).box[1, :2]
+            return state, simulator.frame(bank, state.context, alone(state.context), 0).box[1, :2]
 
         return jax.lax.scan(one, simulator.reset(bank, 0), actions)[1]
 
@@ -166,8 +166,8 @@ def test_rewards_facts_and_observations_have_finite_gradients(speed):
     def slope(actions):
         def one(state, action):
             state, transition = simulator.step(bank, state, action)
-            seen = simulator.observe(bank, state.scene)
-            leaves = jax.tree.leaves((state.facts, transition.reward, seen, state.scene.history))
+            seen = simulator.observe(bank, state.context)
+            leaves = jax.tree.leaves((state.facts, transition.reward, seen, state.context.history))
             return state, sum(leaf.sum() for leaf in leaves if leaf.dtype == jnp.float32)
 
         return jax.lax.scan(one, simulator.reset(bank, 0), actions)[1].sum()

@@ -38,12 +38,12 @@ def _frames(bank, motion, valid):
     """Everyone at every step from 10 on, when slot 1 does what it is told; ego stands."""
     told = with_given(bank, jnp.asarray([[1, -1]]), motion, valid)
 
-    def one(scene, _):
-        frame = SIMULATOR.frame(told, scene, alone(scene), 0)
-        traffic = SIMULATOR.traffic.advance(told, scene, frame)
-        return replace(scene, step=scene.step + 1, traffic=traffic), frame
+    def one(context, _):
+        frame = SIMULATOR.frame(told, context, alone(context), 0)
+        traffic = SIMULATOR.traffic.advance(told, context, frame)
+        return replace(context, step=context.step + 1, traffic=traffic), frame
 
-    return jax.lax.scan(one, SIMULATOR.scene(told, 0, 10), None, length=STEPS)[1]
+    return jax.lax.scan(one, SIMULATOR.context(told, 0, 10), None, length=STEPS)[1]
 
 
 frames_of = jax.jit(_frames)
@@ -133,7 +133,7 @@ def test_gradients_reach_the_actions_of_others(bank):
 
 def test_a_bank_that_tells_nobody_what_to_do_is_refused(bank):
     with pytest.raises(UsageError, match="overridden"):
-        SIMULATOR.scene(bank, 0, 10)
+        SIMULATOR.context(bank, 0, 10)
     assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")
 
 

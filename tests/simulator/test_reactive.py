@@ -35,19 +35,19 @@ SIMULATOR = Simulator(Task(), TRAFFIC)
 def _drive(traffic_model, bank, index, motions):
     """Ego goes where it is put; the frames, and the state of traffic, of every step from the first on."""
     simulator = Simulator(Task(), traffic_model)
-    scene = simulator.scene(bank, index, 10)
+    context = simulator.context(bank, index, 10)
 
-    def one(scene, motion):
-        out = (simulator.frame(bank, scene, alone(scene), 0), scene.traffic)
-        traffic = traffic_model.advance(bank, scene, out[0])
-        history = jnp.concatenate([scene.history[1:], motion[None]])
-        return replace(scene, step=scene.step + 1, history=history, traffic=traffic), out
+    def one(context, motion):
+        out = (simulator.frame(bank, context, alone(context), 0), context.traffic)
+        traffic = traffic_model.advance(bank, context, out[0])
+        history = jnp.concatenate([context.history[1:], motion[None]])
+        return replace(context, step=context.step + 1, history=history, traffic=traffic), out
 
-    return jax.lax.scan(one, scene, motions)[1]
+    return jax.lax.scan(one, context, motions)[1]
 
 
 class Run:
-    """What came of a scene: boxes, speeds and who is there, by car; time 0 is the current step.
+    """What came of a context: boxes, speeds and who is there, by car; time 0 is the current step.
 
     Attributes:
         row: Path of each car, -1 for none.
@@ -281,8 +281,8 @@ def test_at_the_first_step_everyone_is_where_the_log_has_them():
 
     @jax.jit
     def past(bank):
-        scene = SIMULATOR.scene(bank, 0, 10)
-        return jnp.stack([TRAFFIC.agents(bank, scene, back) for back in range(10)])
+        context = SIMULATOR.context(bank, 0, 10)
+        return jnp.stack([TRAFFIC.agents(bank, context, back) for back in range(10)])
 
     np.testing.assert_array_equal(past(bank), np.asarray(bank.agents[0, 10:0:-1]))
 
@@ -293,9 +293,9 @@ def test_the_past_of_a_vehicle_is_what_it_drove():
 
     @jax.jit
     def rows(bank, traffic, step):
-        scene = replace(SIMULATOR.scene(bank, 0, 10), step=10 + step)
-        scene = replace(scene, traffic=jax.tree.map(lambda leaf: leaf[step], traffic))
-        return jnp.stack([TRAFFIC.agents(bank, scene, back) for back in (0, 1, 4, 9)])
+        context = replace(SIMULATOR.context(bank, 0, 10), step=10 + step)
+        context = replace(context, traffic=jax.tree.map(lambda leaf: leaf[step], traffic))
+        return jnp.stack([TRAFFIC.agents(bank, context, back) for back in (0, 1, 4, 9)])
 
     for place, back in enumerate((1, 4, 9), 1):
         np.testing.assert_array_equal(rows(bank, traffic, 30)[place], rows(bank, traffic, 30 - back)[0])
@@ -335,7 +335,7 @@ def test_in_random_traffic_everyone_does_what_the_law_says(seed):
 def test_a_bank_without_paths_is_refused_and_one_with_paths_is_kept():
     bank = bank_of(straight_road([EGO, car(0, 0, 0, 8)]))
     with pytest.raises(UsageError, match="no paths"):
-        SIMULATOR.scene(bank, 0, 10)
+        SIMULATOR.context(bank, 0, 10)
     ready = TRAFFIC.prepare(bank)
     assert TRAFFIC.prepare(ready) is ready
 

@@ -71,7 +71,7 @@ def test_a_state_is_small_however_many_react(bank):
     rows = bank.paths.slot.shape[1]
     whole, traffic = (
         sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(part))
-        for part in (state, state.scene.traffic)
+        for part in (state, state.context.traffic)
     )
     # As if all 128 agents of the largest capacity reacted.
     assert whole - traffic + traffic / rows * 128 <= 16384

@@ -231,7 +231,7 @@ def _episode(
 
     def look(now: Any, keys: Array) -> tuple[Any, Any]:
         state, carry, hit = now
-        seen = state, carry, keys[0], dict(simulator.observe(bank, state.scene)), hit
+        seen = state, carry, keys[0], dict(simulator.observe(bank, state.context)), hit
         return jax.lax.scan(step, now, keys)[0], seen
 
     whole = actions - actions % every

@@ -24,7 +24,7 @@ from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_o
 from drivax.evaluation.results import ADDED, KEYS, Crash, Results, with_crashes
 from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
 from drivax.metrics.catalogue import METRICS, Metric
-from drivax.metrics.selection import catalogue
+from drivax.metrics.selection import metric_specs
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
@@ -198,7 +198,7 @@ class _Trial:
                 cure="use expert_actions",
             )
         judged = judging(task)
-        metrics = catalogue(judged.metrics)
+        metrics = metric_specs(judged.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
         return cls(replace(simulator, task=judged), planner, start_step, seed, metrics)

@@ -24,7 +24,7 @@ from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
 from drivax.simulator.starts import LogStart
-from drivax.simulator.types import Beginning, Frame, Scene, SimState
+from drivax.simulator.types import AgentContext, Beginning, Frame, SimState
 from drivax.tasks.actions import Discrete
 from drivax.tasks.task import Task
 
@@ -88,7 +88,7 @@ class Driving:
         # How an episode begins changes no shape; as logged is the quickest to trace.
         simulator = replace(self.simulator, start=LogStart())
         seen = jax.eval_shape(
-            lambda bank: simulator.observe(bank, simulator.scene(bank, 0, CURRENT_STEP)), data
+            lambda bank: simulator.observe(bank, simulator.context(bank, 0, CURRENT_STEP)), data
         )
         return {name: tuple(value.shape) for name, value in seen.items()}
 
@@ -96,24 +96,24 @@ class Driving:
         """Environments at random steps of the log, so that their ends are staggered."""
         index, step, keys = _draw(data, key, count, self.earliest_start, data.steps - 3)
         state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
-        observation = self.observe_all(data, state.scene)
+        observation = self.observe_all(data, state.context)
         return Environments(state, jnp.zeros(count, bool), observation)
 
-    def stored(self, state: SimState) -> Scene:
-        """The scene: index, step, history, and the traffic where it reacts."""
-        return state.scene
+    def stored(self, state: SimState) -> AgentContext:
+        """The context: index, step, history, and the traffic where it reacts."""
+        return state.context
 
-    def observe(self, data: ScenarioBank, stored: Scene) -> dict[str, Array]:
-        """The task's observation of a scene."""
+    def observe(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
+        """The task's observation of a context."""
         return dict(self.simulator.observe(data, stored))
 
-    def observe_all(self, data: ScenarioBank, stored: Scene) -> dict[str, Array]:
-        """The task's observations of a batch of scenes."""
+    def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
+        """The task's observations of a batch of contexts."""
         return jax.vmap(self.observe, (None, 0))(data, stored)
 
     def look(self, data: ScenarioBank, state: SimState) -> Frame:
         """Everyone: the next step moves on from the frame that the present observation was made of."""
-        return jax.vmap(self.simulator.now, (None, 0))(data, state.scene)
+        return jax.vmap(self.simulator.now, (None, 0))(data, state.context)
 
     def step(
         self, data: ScenarioBank, now: Environments, looked: Frame, action: Float[Array, "B D"], key: Array
@@ -132,7 +132,7 @@ class Driving:
             looked=self.look(data, state),
             totals=_totals(data, state, made.reward_terms, over, now.over),
         )
-        return Environments(state, over, self.observe_all(data, state.scene)), outcome
+        return Environments(state, over, self.observe_all(data, state.context)), outcome
 
     def _beginning(self, data: ScenarioBank, index: Array, step: Array, key: Array) -> Beginning:
         return self.simulator.beginning(data, index, step, 0, key)
@@ -152,8 +152,8 @@ class Driving:
         index, step, _ = _draw(data, key, count, CURRENT_STEP, data.steps - 3)
 
         def one(index: Array, step: Array) -> tuple[dict[str, Array], Array, Array]:
-            scene = self._moment(data, index, step)
-            return (dict(self._logged.observe(data, scene)), *self._did(data, scene))
+            context = self._moment(data, index, step)
+            return (dict(self._logged.observe(data, context)), *self._did(data, context))
 
         return jax.vmap(one)(index, step)
 
@@ -185,26 +185,26 @@ class Driving:
         """The simulator with everyone as logged, without metrics, which nobody looks at here."""
         return Simulator(replace(self.task, metrics="none"))
 
-    def _moment(self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]) -> Scene:
+    def _moment(self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]) -> AgentContext:
         """A logged moment as if the expert had driven there."""
-        scene, before = (self._logged.scene(bank, index, at) for at in (step, jnp.maximum(step - 1, 0)))
-        return replace(scene, action=self._did(bank, before)[0])
+        context, before = (self._logged.context(bank, index, at) for at in (step, jnp.maximum(step - 1, 0)))
+        return replace(context, action=self._did(bank, before)[0])
 
-    def _did(self, bank: ScenarioBank, scene: Scene) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
+    def _did(self, bank: ScenarioBank, context: AgentContext) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
         """What the expert does, as carried out, and whether it took clipping."""
         space = self.task.actions
-        action = expert_action(bank, scene, space)
-        return space.actuated(scene.history[-1], action, scene.action), space.clipped(action)
+        action = expert_action(bank, context, space)
+        return space.actuated(context.history[-1], action, context.action), space.clipped(action)
 
     def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
         """What the expert did in one scenario from the current step on: action, reward, both ends, whether clipped."""
         simulator = self._logged
         begun = simulator.reset(bank, index)
-        begun = replace(begun, scene=self._moment(bank, index, begun.start))
+        begun = replace(begun, context=self._moment(bank, index, begun.start))
 
         def step(state: SimState, _: None) -> tuple[SimState, tuple[Array, ...]]:
-            action, clipped = self._did(bank, state.scene)
-            after, made = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
+            action, clipped = self._did(bank, state.context)
+            after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
             return after, (action, made.reward, made.terminated, made.truncated, clipped)
 
         return jax.lax.scan(step, begun, None, bank.steps - 1 - CURRENT_STEP)[1]

@@ -41,17 +41,19 @@ class IdmPlanner(Memoryless):
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
         """IDM acceleration and pure-pursuit curvature."""
-        scene, frame = situation.scene, situation.surroundings.frame
-        me, motion = frame.box[scene.slot], scene.history[-1]
+        context, frame = situation.context, situation.surroundings.frame
+        me, motion = frame.box[context.slot], context.history[-1]
         speed = motion[MOTION_SPEED]
-        seen = ahead(bank, scene, frame, self.parameters.min_gap_m)
+        seen = ahead(bank, context, frame, self.parameters.min_gap_m)
         ahead_m = jnp.clip(0.8 * speed + 3.0, 4.0, 20.0)
-        left_m = bank.route_points[scene.index, 0] - 1 - scene.route_m
+        left_m = bank.route_points[context.index, 0] - 1 - context.route_m
         ahead_m = jnp.minimum(ahead_m, jnp.maximum(left_m, 0.0))
-        target = route_ahead(bank, scene.index, scene.route_m, ahead_m[None])[0][0, RouteColumn.XY] - me[:2]
+        target = (
+            route_ahead(bank, context.index, context.route_m, ahead_m[None])[0][0, RouteColumn.XY] - me[:2]
+        )
         acceleration = seen.acceleration(speed, self.parameters)
         action = self.actions.action(motion, acceleration, pursuit(me, target), me[4])
-        return self.actions.actuated(motion, action, scene.action), carry
+        return self.actions.actuated(motion, action, context.action), carry
 
 
 def pursuit(me: Float[Array, " pose"], target: Float[Array, " 2"]) -> Float[Array, ""]:

@@ -15,7 +15,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.ahead import project
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 
 #: Times at which others are predicted: how many, and how far apart, s; lanes are followed in longer steps.
 HORIZON, STEP_S = 20, 0.25
@@ -59,11 +59,11 @@ class Trend:
     stood_s: Float[Array, " S"]
 
     @classmethod
-    def logged(cls, bank: ScenarioBank, scene: Scene) -> Trend:
+    def logged(cls, bank: ScenarioBank, context: AgentContext) -> Trend:
         """From the log's rows of the present step and of half a second ago; parked agents keep still."""
-        now = bank.agents[scene.index, scene.step]
-        before = bank.agents[scene.index, jnp.maximum(scene.step - _PAST, 0)]
-        known = (now[:, AgentColumn.VALID] > 0) & (before[:, AgentColumn.VALID] > 0) & (scene.step >= _PAST)
+        now = bank.agents[context.index, context.step]
+        before = bank.agents[context.index, jnp.maximum(context.step - _PAST, 0)]
+        known = (now[:, AgentColumn.VALID] > 0) & (before[:, AgentColumn.VALID] > 0) & (context.step >= _PAST)
         turn = _turn(before[:, AgentColumn.HEADING], now[:, AgentColumn.HEADING])
         faster = _length(now[:, AgentColumn.VELOCITY]) - _length(before[:, AgentColumn.VELOCITY])
         parked = bank.agent_box.shape[1] - len(now)
@@ -128,21 +128,26 @@ class Others:
 
     @classmethod
     def near(
-        cls, bank: ScenarioBank, scene: Scene, frame: Frame, trend: Trend, route: tuple[Array, Array, Array]
+        cls,
+        bank: ScenarioBank,
+        context: AgentContext,
+        frame: Frame,
+        trend: Trend,
+        route: tuple[Array, Array, Array],
     ) -> Others:
         """Those of ego's level.
 
         Args:
             bank: The scenarios.
-            scene: Who is ego, and where.
+            context: Who is ego, and where.
             frame: Everybody.
             trend: How they have moved.
             route: Ego's route: points ahead, whether they exist, their offsets in m.
         """
-        me = frame.box[scene.slot]
+        me = frame.box[context.slot]
         apart = frame.box[:, :2] - me[:2]
-        valid = frame.valid & (jnp.arange(frame.valid.shape[0]) != scene.slot)
-        valid &= jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
+        valid = frame.valid & (jnp.arange(frame.valid.shape[0]) != context.slot)
+        valid &= jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
         # What comes nearer counts as nearer.
         closing = jnp.sum(apart * frame.velocity, axis=-1) / jnp.maximum(_length(apart), 1.0)
         rank = jnp.where(valid, _length(apart) + 2.0 * jnp.minimum(closing, 0.0), 1e6)
@@ -159,7 +164,7 @@ class Others:
         faster = jnp.where(people, 0.0, jnp.clip(trend.acceleration[rows], -8.0, 3.0))
         free, speed = rolled_out(box, velocity, turning, faster)
         vehicle = kind == AgentKind.VEHICLE
-        lane, on_lane = _along_lanes(bank, scene, box, speed, turning)
+        lane, on_lane = _along_lanes(bank, context, box, speed, turning)
         on_lane &= vehicle & drives
         entering, may, sure = _entering(box, velocity, speed, route, me, people)
         may &= ~vehicle | (_length(velocity) < _CROSSES_MPS) | follows
@@ -205,7 +210,7 @@ def rolled_out(
 
 
 def _along_lanes(
-    bank: ScenarioBank, scene: Scene, box: Float[Array, "K 6"], speed: Float[Array, "H K"],
+    bank: ScenarioBank, context: AgentContext, box: Float[Array, "K 6"], speed: Float[Array, "H K"],
     turning: Float[Array, " K"],
 ) -> tuple[Float[Array, "H K 6"], Bool[Array, " K"]]:  # fmt: skip
     """Boxes of those who follow the lane that they are on, and whether they are on one."""
@@ -217,7 +222,7 @@ def _along_lanes(
             way, turn = ahead
             cos, sin = jnp.cos(turn), jnp.sin(turn)
             bent = jnp.stack([heading[0] * cos - heading[1] * sin, heading[0] * sin + heading[1] * cos])
-            lane, left, there = lane_course(bank, scene.index, xy + bent * way / 2, bent, scene.z)
+            lane, left, there = lane_course(bank, context.index, xy + bent * way / 2, bent, context.z)
             back = jnp.clip(-left / jnp.maximum(3.0 * way, 4.0), -0.4, 0.4)
             wanted = lane + back * jnp.stack([-lane[1], lane[0]])
             heading = jnp.where(there, wanted / _length(wanted), bent)

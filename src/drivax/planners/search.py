@@ -79,7 +79,7 @@ class SearchPlanner:
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Trend:
         """What everybody did in the half second before the start."""
-        return Trend.logged(bank, state.scene)
+        return Trend.logged(bank, state.context)
 
     def act(
         self,
@@ -91,14 +91,14 @@ class SearchPlanner:
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
         """The first step of the cheapest manoeuvre."""
-        scene, frame = situation.scene, situation.surroundings.frame
-        me, speed = frame.box[scene.slot], scene.history[-1, 3]
+        context, frame = situation.context, situation.surroundings.frame
+        me, speed = frame.box[context.slot], context.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
-        path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
+        path, there = route_ahead(bank, context.index, context.route_m, offsets)
         wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
-        stop = stop_line_m(bank, scene, frame)
+        stop = stop_line_m(bank, context, frame)
         trend = carry.updated(frame)
-        others = Others.near(bank, scene, frame, trend, (path, there, offsets))
+        others = Others.near(bank, context, frame, trend, (path, there, offsets))
         lateral = jnp.clip(situation.surroundings.route.lateral_m, -5.0, 5.0)
         stuck = _stuck(path, there, offsets, others, me, stop)
 
@@ -117,9 +117,9 @@ class SearchPlanner:
 
         costs, firsts, _ = jax.vmap(line_costs)(jnp.asarray(_SHIFTS))
         best = firsts.reshape(-1, 2)[jnp.argmin(costs)]
-        motion = scene.history[-1]
+        motion = context.history[-1]
         action = self.actions.action(motion, best[0], best[1], me[LENGTH])
-        return self.actions.actuated(motion, action, scene.action), trend
+        return self.actions.actuated(motion, action, context.action), trend
 
     def _driven(
         self, line: Array, there: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
@@ -260,16 +260,16 @@ def _bad_ground(
     bank: ScenarioBank, situation: Situation, pose: Float[Array, "H 4"], line: tuple[Array, Array], me: Array
 ) -> tuple[Array, Array]:
     """Whether the car would leave the road within 3 s, and whether a line leads out of the lanes that go its way."""
-    scene = situation.scene
-    ground = scene.z - bank.height_m(scene.index, scene.slot) / 2
+    context = situation.context
+    ground = context.z - bank.height_m(context.index, context.slot) / 2
 
     def beyond(at: Array) -> Array:
         box = jnp.concatenate([at, me[LENGTH:]])
-        left, known = left_of_edges(bank, scene.index, box[:2], corners(box), ground)
+        left, known = left_of_edges(bank, context.index, box[:2], corners(box), ground)
         return (known & (left < -OFFROAD_TOLERANCE_M / 2)).any()
 
     def astray(row: Array) -> Array:
-        return around_lanes(bank, scene.index, row[:2], row[3:5], row[None, :2], scene.z).straddling
+        return around_lanes(bank, context.index, row[:2], row[3:5], row[None, :2], context.z).straddling
 
     few = slice(4, 17, 4)
     return jnp.mean(jax.vmap(beyond)(pose[1:12:2])), (jax.vmap(astray)(line[0][few]) & line[1][few]).any()

@@ -12,28 +12,28 @@ from drivax.planners.planner import Memoryless
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
-from drivax.simulator.types import Scene, SimState, Situation
+from drivax.simulator.types import AgentContext, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical
 
 
-def logged_motion(bank: ScenarioBank, scene: Scene, ahead: int) -> Float[Array, "4"]:
+def logged_motion(bank: ScenarioBank, context: AgentContext, ahead: int) -> Float[Array, "4"]:
     """Logged motion of the driven slot ``ahead`` steps from now; its present motion where the log has none.
 
     Beyond the end of the log its last motion goes on at its last velocity.
     """
-    at = scene.step + ahead
-    row = bank.agents[scene.index, jnp.minimum(at, bank.steps - 1), scene.slot]
+    at = context.step + ahead
+    row = bank.agents[context.index, jnp.minimum(at, bank.steps - 1), context.slot]
     speed = jnp.maximum(jnp.sum(row[AgentColumn.VELOCITY] * row[AgentColumn.HEADING]), 0.0)
     beyond = jnp.maximum(at - (bank.steps - 1), 0) * 0.1
     xy = row[AgentColumn.XY] + beyond * row[AgentColumn.VELOCITY]
     motion = jnp.stack([xy[0], xy[1], jnp.arctan2(row[AgentColumn.SIN], row[AgentColumn.COS]), speed])
-    return jnp.where(row[AgentColumn.VALID] > 0, motion, scene.history[-1])
+    return jnp.where(row[AgentColumn.VALID] > 0, motion, context.history[-1])
 
 
-def expert_action(bank: ScenarioBank, scene: Scene, actions: ActionSpace) -> Float[Array, " D"]:
+def expert_action(bank: ScenarioBank, context: AgentContext, actions: ActionSpace) -> Float[Array, " D"]:
     """The action that follows the log from here; not clipped, so that ``actions.clipped`` can say what would be."""
-    ahead, beyond = logged_motion(bank, scene, 1), logged_motion(bank, scene, 2)
-    return actions.expert(scene.history[-1], ahead, beyond, bank.length_m(scene.index, scene.slot))
+    ahead, beyond = logged_motion(bank, context, 1), logged_motion(bank, context, 2)
+    return actions.expert(context.history[-1], ahead, beyond, bank.length_m(context.index, context.slot))
 
 
 @record
@@ -58,8 +58,8 @@ class Expert(Memoryless):
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
         """Follows the log."""
-        action, scene = expert_action(bank, state.scene, self.actions), state.scene
-        return self.actions.actuated(scene.history[-1], action, scene.action), carry
+        action, context = expert_action(bank, state.context, self.actions), state.context
+        return self.actions.actuated(context.history[-1], action, context.action), carry
 
 
 @record
@@ -80,9 +80,9 @@ class ConstantVelocity(Memoryless):
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
         """No acceleration, no curvature."""
-        scene, zero = state.scene, jnp.zeros(())
-        length_m = bank.length_m(scene.index, scene.slot)
-        return self.actions.action(scene.history[-1], zero, zero, length_m), carry
+        context, zero = state.context, jnp.zeros(())
+        length_m = bank.length_m(context.index, context.slot)
+        return self.actions.action(context.history[-1], zero, zero, length_m), carry
 
 
 @record
@@ -102,4 +102,4 @@ class RandomActions(Memoryless):
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
         """Independent numbers in [-1, 1)."""
-        return jax.random.uniform(key, state.scene.action.shape, minval=-1.0, maxval=1.0), carry
+        return jax.random.uniform(key, state.context.action.shape, minval=-1.0, maxval=1.0), carry

@@ -17,7 +17,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.traffic.log import LogTraffic, logged_history
-from drivax.simulator.types import Scene, Traffic
+from drivax.simulator.types import AgentContext, Traffic
 
 #: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.
 Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"]]
@@ -71,19 +71,19 @@ class OverrideTraffic:
             )
         return self.base.start(bank, index, step)
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Any) -> Any:
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Any) -> Any:
         """State of ``base`` one step later."""
-        return self.base.advance(bank, scene, frame)
+        return self.base.advance(bank, context, frame)
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of ``base``, with those of the overridden agents as given."""
-        rows, given = self.base.agents(bank, scene, back), bank.given
-        step = jnp.clip(scene.step - back, 0, bank.steps - 1)
-        motion, valid = given.motion[scene.index, step], given.valid[scene.index, step]
+        rows, given = self.base.agents(bank, context, back), bank.given
+        step = jnp.clip(context.step - back, 0, bank.steps - 1)
+        motion, valid = given.motion[context.index, step], given.valid[context.index, step]
         cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
-        parts = [motion[:, 0], motion[:, 1], given.z[scene.index, step], cos, sin]
+        parts = [motion[:, 0], motion[:, 1], given.z[context.index, step], cos, sin]
         parts += [motion[:, 3] * cos, motion[:, 3] * sin, valid.astype(cos.dtype)]
-        slot = given.slot[scene.index]
+        slot = given.slot[context.index]
         slot = jnp.where(slot >= 0, slot, rows.shape[0])
         return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
 
