@@ -11,9 +11,8 @@ from shapely import affinity
 import drivax
 from drivax.cli import main
 from drivax.evaluation.traffic_trajectories import packed, unpacked
-from drivax.report.episode_selection import ranked
+from drivax.report.episodes import EvaluatedSet, ranked, rollouts_of
 from drivax.report.pictures.drawing import with_traffic_of
-from drivax.report.rollouts import EvaluatedSet, rollouts_of
 from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate

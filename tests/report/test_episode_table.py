@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from browser import acted, browse, needs_browser
-from drivax.report.episode_selection import FAILURES, outcome, ranked, worst_first
+from drivax.report.episodes import FAILURES, outcome, ranked, worst_first
 from drivax.report.pages.report import write_report
 from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet, ScenarioWriter

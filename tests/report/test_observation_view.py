@@ -50,9 +50,9 @@ def observed(config=CONFIG):
 
 
 def test_columns_are_taken_apart_with_their_units():
-    from drivax.report.pictures.observation import Seen
+    from drivax.report.pictures.observation import ObservationGroups
 
-    seen = Seen.of(CONFIG, observed())
+    seen = ObservationGroups.of(CONFIG, observed())
     np.testing.assert_allclose(seen["agents", "position"][0], [[14, 0], [10, 0]], atol=1e-5)
     np.testing.assert_allclose(seen["agents", "velocity"][0, 1], [-5, 0], atol=1e-5)
     np.testing.assert_allclose(seen["agents", "length"][0, 1], [4.8], atol=1e-5)

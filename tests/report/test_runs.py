@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.report.episode_selection import EpisodeGroup
-from drivax.report.rollouts import rollouts_of
+from drivax.report.episodes import EpisodeGroup, rollouts_of
 from drivax.report.runs import read_runs
 
 

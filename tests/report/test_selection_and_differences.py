@@ -8,7 +8,7 @@ import pytest
 from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
 from drivax.metrics.catalogue import METRICS
-from drivax.report.episode_selection import choose, outcome
+from drivax.report.episodes import choose, outcome
 from drivax.report.runs import read_runs
 from drivax.stats.intervals import NOTHING, Interval, bootstrap_mean, rate
 

@@ -9,9 +9,9 @@ import pytest
 
 from drivax.cli import main
 from drivax.errors import UsageError
+from drivax.report.episodes import logged_motion
 from drivax.report.pictures.drawing import Rollout
 from drivax.report.pictures.palette import LEGEND, THEMES
-from drivax.report.rollouts import logged_motion
 
 from .conftest import make_scenario, offset_path
 
@@ -130,7 +130,7 @@ def test_panes_in_rows():
 
 
 def test_names_of_files(tmp_path):
-    from drivax.report.episode_selection import EpisodeGroup
+    from drivax.report.episodes import EpisodeGroup
     from drivax.report.pictures.video import _files
 
     chosen = [EpisodeGroup("d", f"a/b {i}", (i,), "success") for i in range(12)]

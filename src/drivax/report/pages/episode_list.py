@@ -10,10 +10,10 @@ import numpy as np
 from drivax.evaluation.episode_table import RATES, ScenarioKey
 from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import CODES, UNKNOWN, metric_label, metric_names, ordered
-from drivax.report.breakdowns import Tags
-from drivax.report.episode_selection import outcome, worst_first
+from drivax.report.episodes import outcome, worst_first
 from drivax.report.pages.page import data_element
 from drivax.report.runs import Evaluation
+from drivax.report.table_files import Tags
 
 #: Tags with more values than this (ids, places) are not offered as a choice.
 MOST_VALUES = 24
