@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Float32, Int16, Int64
 
 from drivax.errors import DataError
-from drivax.metrics.catalogue import EVENTS, METRICS, Column, names_of
+from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable, open_driven_set
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.traffic_trajectories import unpacked
 from drivax.report.charts.motion import COMMANDED
 from drivax.report.pictures.drawing import Rollout
@@ -107,7 +108,7 @@ def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
 def _in_turn(kinds: list[list[EpisodeGroup]]) -> list[EpisodeGroup]:
     """Return the first of each kind, then the second of each, and so on."""
     longest = max(map(len, kinds), default=0)
-    return [groups[place] for place in range(longest) for groups in kinds if place < len(groups)]
+    return [groups[row] for place in range(longest) for groups in kinds if place < len(groups)]
 
 
 def _completed(runs: Sequence[Evaluation], group: EpisodeGroup) -> int:
@@ -152,7 +153,7 @@ class EvaluatedSet:
     """
 
     def __init__(self, run: Evaluation, data: Path | None = None) -> None:
-        self.scenarios: ScenarioSet = open_driven_set(run, data)
+        self.scenarios: ScenarioSet = run.open_set(data)
         self._rows = {
             (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
         }
@@ -186,21 +187,21 @@ def rollouts_of(runs: Sequence[Evaluation], group: EpisodeGroup, scenario: Scena
 
 def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
     stored = run.trajectories
-    place = stored.rows[run.occurrences[row]]
-    steps, start = int(scenario.steps), int(stored.start[place])
+    steps, start = int(scenario.steps), int(stored.start[row])
     ego = np.full((steps, 4), np.nan)
     ego[:start] = logged_motion(scenario)[:start]
-    motion = stored.ego[place, : steps - start]
+    motion = stored.ego[row, : steps - start]
     ego[start : start + len(motion)] = motion
-    events = {name: int(at[place]) for name, at in stored.events.items()}
-    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
+    events = {name: int(at[row]) for name, at in stored.events.items()}
+    crash = run.crash_by_scenario.get(run.scenarios[row])
+    events["crashed"] = -1 if crash is None else crash.step
     action = np.full((steps, COMMANDED), np.nan)
-    commands = stored.action[place, : steps - start, :COMMANDED]
+    commands = stored.action[row, : steps - start, :COMMANDED]
     action[start : start + len(commands), : commands.shape[1]] = commands
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(motion)] = unpacked(stored.others[place, : steps - start])
+        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
     return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 

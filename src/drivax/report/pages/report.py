@@ -202,7 +202,7 @@ def _collisions(runs: Sequence[Evaluation]) -> str:
         for name, meaning in COLLISION_KINDS.values()
     )
     total = ", ".join(
-        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {run.episodes}"
+        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
         for run in runs
         if "collision_type" in run.metrics
     )
