@@ -108,7 +108,7 @@ def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
 def _in_turn(kinds: list[list[EpisodeGroup]]) -> list[EpisodeGroup]:
     """Return the first of each kind, then the second of each, and so on."""
     longest = max(map(len, kinds), default=0)
-    return [groups[row] for place in range(longest) for groups in kinds if place < len(groups)]
+    return [groups[place] for place in range(longest) for groups in kinds if place < len(groups)]
 
 
 def _completed(runs: Sequence[Evaluation], group: EpisodeGroup) -> int:
