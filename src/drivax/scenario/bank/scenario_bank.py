@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
@@ -172,9 +172,6 @@ class ScenarioBank:
         flags: ``scenario.schema.Flag`` bits.
         identity: What chance in a scenario follows from, whatever row it has (``scenario.bank.scenario_bank``).
         extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
-        paths: Paths of agents that react (``simulator.traffic.agent_paths.with_paths``), None where nobody does.
-        driver: Planner that drives others than ego (``planners.planner_traffic.with_driver``), None where nobody does.
-        given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
         long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
         trimmed: Whether padding that no scenario uses was cut (static).
@@ -210,9 +207,6 @@ class ScenarioBank:
     lane_run: int = static()
     long_ego: bool = static()
     trimmed: bool = static()
-    paths: Any = None
-    given: Any = None
-    driver: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -236,8 +230,8 @@ class ScenarioBank:
         return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
-        """Some of the scenarios as a bank; the driver is everyone's."""
-        return replace(jax.tree.map(lambda leaf: leaf[rows], replace(self, driver=None)), driver=self.driver)
+        """Return some of the scenarios as a bank."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)
 
     @classmethod
     def from_scenarios(
