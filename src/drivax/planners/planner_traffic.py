@@ -20,7 +20,7 @@ from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
-from drivax.simulator.traffic.prepared import PreparedBank, TrafficData, data_of, prepare_bank, with_data
+from drivax.simulator.traffic.prepared import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traffic
 from drivax.tasks.task import Task
 
@@ -56,7 +56,7 @@ class Driven:
 
 @dataclass(frozen=True)
 class PlannerTraffic:
-    """The vehicles nearest to ego are driven by the planner of :func:`with_driver`, everyone else behaves as in ``base``.
+    """The vehicles nearest to ego are driven by the planner of :func:`with_driver`, all others move by ``base``.
 
     Driven are vehicles that the log has when the episode begins and that travel more than 2 m in the rest of it. They
     see ego, each other and everyone else, drive by the task's dynamics to the end of the episode, and have no route, as
@@ -112,7 +112,9 @@ class PlannerTraffic:
             key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[one.index])
             key = jax.random.fold_in(key, one.step)
             seen = self.task.observe(bank, found.context, frames, frame)
-            asked, _ = data_of(bank, TrafficPolicy).planner.act((), bank, state, found, seen, jax.random.fold_in(key, one.slot))
+            asked, _ = data_of(bank, TrafficPolicy).planner.act(
+                (), bank, state, found, seen, jax.random.fold_in(key, one.slot)
+            )
             motion, length = one.history[-1], bank.length_m(one.index, one.slot)
             action = self.task.actuated(motion, asked, one.action)
             motion = self.task.motion(motion, action, length)

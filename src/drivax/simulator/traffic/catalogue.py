@@ -29,4 +29,3 @@ def make_traffic(name: str) -> Traffic:
     if not isinstance(made, Traffic):
         raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
     return made
-
