@@ -12,14 +12,13 @@ import pytest
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.planners.prediction import rolled_out
-from drivax.planners.search import SearchPlanner, advanced
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, RED, SMALL, bank_of, car, moved, straight_road
+from search_planner import SearchPlanner, advanced, rolled_out
 
 TASK = Task(observation=GLIMPSE, metrics="none")
 SIMULATOR = Simulator(TASK)
