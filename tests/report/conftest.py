@@ -116,7 +116,7 @@ def make_scenario(number: int) -> Scenario:
     return Scenario(record, SMALL, source, tags=tags)
 
 
-def drive_off(scenario: Scenario, sideways_m: float) -> np.ndarray:
+def offset_path(scenario: Scenario, sideways_m: float) -> np.ndarray:
     """The log's drive, leaving it to the left by ``sideways_m`` at the end: [91, 4]."""
     xy, heading = scenario.agent_xy[:, 0], scenario.agent_heading[:, 0]
     speed = np.linalg.norm(scenario.agent_velocity[:, 0], axis=-1)
@@ -173,7 +173,7 @@ def write_evaluation(folder: Path, planner: str, scenarios: ScenarioSet, data: P
     np.savez(
         folder / "trajectories.npz",
         scenario_id=np.array([row["scenario_id"] for row in rows]),
-        ego=np.stack([drive_off(scenario, sideways)[10:] for scenario in scenarios]),  # from `start` on
+        ego=np.stack([offset_path(scenario, sideways)[10:] for scenario in scenarios]),  # from `start` on
         action=np.tile(commands(planner), (len(rows), 1, 1)),
         start=np.full(len(rows), 10),
         **{f"{name}_step": steps for name, steps in events.items()},

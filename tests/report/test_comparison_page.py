@@ -156,9 +156,9 @@ def test_seeds_in_one_folder(runs, plan, tmp_path, capsys):
         (["A", "TRAINING"], 1, "not evaluation"),
         (["A", "A"], 2, "the same run"),
         (["A", "B", "--primary", "succes"], 2, "did you mean 'success'?"),
-        (["A", "B", "--config", "MISSING.yaml"], 2, "does not exist"),
-        (["A", "B", "--html", "FOLDER"], 2, "name a file in it"),
-        (["--save", "FOLDER"], 2, "name a file in it"),
+        (["A", "B", "--config", "MISSING.yaml"], 2, "file not found"),
+        (["A", "B", "--html", "FOLDER"], 2, "name a file to write"),
+        (["--save", "FOLDER"], 2, "name a file to write"),
     ],
 )
 def test_wrong_calls_get_one_line(arguments, status, words, runs, tmp_path, capsys):

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivax.report.charts.curves import chart, compact, curve_sections, ticks
-from drivax.report.loaded_runs import read_runs
 from drivax.report.pictures.palette import Stroke
+from drivax.report.runs import read_runs
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from browser import acted, browse, needs_browser
-from drivax.report.episode_selection import FAILURES, outcome, ranked, worst_first
-from drivax.report.loaded_runs import read_runs
+from drivax.report.episodes import FAILURES, outcome, ranked, worst_first
 from drivax.report.pages.report import write_report
+from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 from .conftest import SMALL, make_scenario, write_evaluation
@@ -71,11 +71,13 @@ def test_worst_first(runs):
 
 def test_a_page_without_drives_says_so(runs, tmp_path):
     text = write_report(runs, tmp_path / "report.html", episodes=0).read_text()
-    assert "Drives and tags were left out" in text and listed(text)["tags"] == [] and 'id="plots"' not in text
+    assert (
+        "Rollouts and tags were left out" in text and listed(text)["tags"] == [] and 'id="plots"' not in text
+    )
 
 
 ACT = """
-  const $ = (selector) => document.querySelector(selector), form = $("#sieve").elements;
+  const $ = (selector) => document.querySelector(selector), form = $("#filters").elements;
   const ids = () => [...document.querySelectorAll("#rows tr")].map(
     (row) => row.querySelector("th").firstChild.textContent.replace("▶ ", "").slice(-2));
   const set = (name, word) => {
@@ -94,14 +96,14 @@ ACT = """
   form.all.click();
   const button = [...document.querySelectorAll("#heads button")].find((one) => one.textContent.startsWith("progress"));
   button.click(); out.sorted = ids();
-  const cell = [...document.querySelectorAll("td[data-behind]")].find((node) => {
-    const behind = JSON.parse(node.dataset.behind);
+  const cell = [...document.querySelectorAll("td[data-link]")].find((node) => {
+    const behind = JSON.parse(node.dataset.link);
     return behind.run === "constant" && behind.metric === "offroad" && !behind.tags;
   });
   cell.querySelector("button").click();
-  out.behind = ids(); out.said = $("#found").textContent; out.playing = $("[data-control=title]").textContent;
-  const kind = [...document.querySelectorAll("td[data-behind]")].find(
-    (node) => JSON.parse(node.dataset.behind).kind === 5 && JSON.parse(node.dataset.behind).run === "policy");
+  out.behind = ids(); out.said = $("#count").textContent; out.playing = $("[data-control=title]").textContent;
+  const kind = [...document.querySelectorAll("td[data-link]")].find(
+    (node) => JSON.parse(node.dataset.link).kind === 5 && JSON.parse(node.dataset.link).run === "policy");
   kind.querySelector("button").click(); out.vulnerable = ids();
   $("#rows button").click(); out.played = $("[data-control=title]").textContent;
   document.title = JSON.stringify(out);
@@ -141,10 +143,10 @@ def half_tagged(tmp_path):
 BEHIND = """
   const text = (selector) => document.querySelector(selector).textContent;
   const told = (test) => {
-    const cells = [...document.querySelectorAll("td[data-behind]")];
-    cells.find((cell) => test(JSON.parse(cell.dataset.behind), cell)).querySelector("button").click();
+    const cells = [...document.querySelectorAll("td[data-link]")];
+    cells.find((cell) => test(JSON.parse(cell.dataset.link), cell)).querySelector("button").click();
     const ids = [...document.querySelectorAll("#rows th")].map((head) => head.firstChild.textContent.slice(-2));
-    return [ids, text("#found"), text("[data-control=title]")];
+    return [ids, text("#count"), text("[data-control=title]")];
   };
   const against = (cell) => cell.closest("table").className === "differences";
   document.title = JSON.stringify({

@@ -6,10 +6,11 @@ from scipy.signal import savgol_filter
 
 from drivax.metrics.comfort import check_trip_comfort
 from drivax.report.charts.motion import COMMANDS, SIGNALS, signals
-from drivax.report.pictures.episode import Drive, pack_episode
+from drivax.report.pictures.drawing import Rollout
+from drivax.report.pictures.player_data import pack_episode
 
-from .conftest import drive_off, make_scenario
-from .test_episode import shorts
+from .conftest import make_scenario, offset_path
+from .test_player_data import shorts
 
 
 def wavy(steps=91):
@@ -71,11 +72,13 @@ def test_gaps_and_short_paths_say_nothing_that_is_not_there():
 
 def test_the_page_gets_them_in_their_own_steps():
     scenario = make_scenario(0)
-    ego = drive_off(scenario, 3.0)
+    ego = offset_path(scenario, 3.0)
     ego[85:] = np.nan
     asked = np.column_stack((np.linspace(-1, 1, 91), np.full(91, np.nan)))
     asked[:10] = np.nan
-    packed = pack_episode(scenario, [Drive("x", ego, 10, {}, "success", asked)], "t")["drives"][0]["signals"]
+    packed = pack_episode(scenario, [Rollout("x", ego, 10, {}, "success", asked)], "t")["rollouts"][0][
+        "signals"
+    ]
     found = signals(ego) | dict(zip((one.name for one in COMMANDS), asked.T, strict=True))
     for one, text in zip((*SIGNALS, *COMMANDS), packed, strict=True):
         values = shorts(text, 91).astype(float)

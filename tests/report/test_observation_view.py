@@ -12,11 +12,11 @@ from rich.console import Console
 
 from drivax.errors import UsageError
 from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
-from drivax.report.observation_tables import observation_overview, observation_table
+from drivax.report.inspection_tables import observation_overview, observation_table
 from drivax.tasks.features import Features
 from drivax.tasks.observations import ObservationConfig
 
-from .test_scene import pixels, share
+from .test_still import pixels, share
 
 pytest.importorskip("matplotlib")
 
@@ -50,9 +50,9 @@ def observed(config=CONFIG):
 
 
 def test_columns_are_taken_apart_with_their_units():
-    from drivax.report.pictures.observation import Seen
+    from drivax.report.pictures.observation import ObservationGroups
 
-    seen = Seen.of(CONFIG, observed())
+    seen = ObservationGroups.of(CONFIG, observed())
     np.testing.assert_allclose(seen["agents", "position"][0], [[14, 0], [10, 0]], atol=1e-5)
     np.testing.assert_allclose(seen["agents", "velocity"][0, 1], [-5, 0], atol=1e-5)
     np.testing.assert_allclose(seen["agents", "length"][0, 1], [4.8], atol=1e-5)
@@ -121,7 +121,7 @@ def statistics(**more):
 
 def printed(table):
     out = io.StringIO()
-    Console(file=out, width=100).print(table)
+    Console(file=out, width=100).print(table.rich())
     return [line.split() for line in out.getvalue().splitlines()]
 
 
@@ -135,6 +135,4 @@ def test_the_table():
     assert rows[3:] == [["mine"], ["0", "0", "7"]]
     assert printed(observation_table(statistics(permuted=0)))[1] == ["ego"]
     text = observation_overview(statistics())
-    assert (
-        text == "320 states of 40 episodes driven by shy, 3 with a collision; 7 entries are NaN or infinite"
-    )
+    assert text == "320 states of 40 episodes of shy, 3 with a collision; 7 entries are NaN or infinite"

@@ -14,16 +14,16 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.tables import metric_label
 from drivax.metrics.catalogue import METRICS
-from drivax.report.glossary import note
-from drivax.report.loaded_runs import read_runs
 from drivax.report.pages.report import write_report
-from drivax.report.pictures.episode import ABSENT
 from drivax.report.pictures.palette import LIGHT
+from drivax.report.pictures.player_data import ABSENT
+from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
-from .conftest import SMALL, drive_off, make_scenario
+from .conftest import SMALL, make_scenario, offset_path
 
 VOID = {"meta", "input", "br", "wbr", "link", "img"}
 
@@ -95,7 +95,7 @@ def test_tables_are_what_the_csv_files_say(page, runs):
     """Means, intervals and n of every rate, recomputed with nothing but the csv module and Wilson's formula."""
     _, parsed = page
     header, *rows = parsed.tables[0]
-    labels = {note(name).label: name for name in METRICS}
+    labels = {metric_label(name).text: name for name in METRICS}
     columns = [labels[re.sub(r" [↑↓]$", "", cell.strip())] for cell in header[1:]]
     assert columns[0] == "success" and "red_light" in columns and len(rows) == 3
     for folder, row in zip(runs, rows, strict=False):
@@ -106,7 +106,7 @@ def test_tables_are_what_the_csv_files_say(page, runs):
             values = [float(e[name]) for e in episodes if e[name] != ""]
             mean, interval, n = cell.split("|")
             assert n == f"n {len(values)}"
-            if note(name).unit == "rate":
+            if metric_label(name).unit == "rate":
                 assert mean == f"{100 * sum(values) / len(values):.1f} %"
                 if sum(values) in (0, len(values)):  # nothing varies: clusters count once
                     clusters = len({e["segment"] for e in episodes if e[name] != ""})
@@ -126,12 +126,12 @@ def test_undefined_everywhere_is_an_empty_cell_with_its_n(page):
 def test_differences_are_what_the_csv_files_say(page, runs):
     _, parsed = page
     header, *rows = parsed.tables[2]
-    assert header[1:] == ["against expert", "against constant"]
+    assert header[1:] == ["expert", "constant"]
     table = {}
     for folder in runs[:3]:
         with (folder / "episodes.csv").open() as file:
             table[folder.name] = {e["scenario_id"]: e for e in csv.DictReader(file)}
-    labels = {note(name).label: name for name in METRICS}
+    labels = {metric_label(name).text: name for name in METRICS}
     for row in rows:
         name = labels[re.sub(r" [↑↓]$", "", row[0].strip())]
         for other, cell in zip(("expert", "constant"), row[1:], strict=True):
@@ -141,7 +141,7 @@ def test_differences_are_what_the_csv_files_say(page, runs):
                 if mine[name] != "" and table[other][key][name] != ""
             ]
             mean = cell.split("|")[0].replace("−", "-").removesuffix(" points")
-            scale = 100 if note(name).unit == "rate" else 1
+            scale = 100 if metric_label(name).unit == "rate" else 1
             assert math.isclose(
                 float(mean), scale * sum(pairs) / len(pairs), abs_tol=0.051 if scale > 1 else 0.00051
             )
@@ -151,11 +151,11 @@ def test_differences_are_what_the_csv_files_say(page, runs):
 def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
     html, parsed = page
     data = [json.loads(text) for attrs, text in parsed.scripts if attrs.get("type") == "application/json"]
-    themes, signals, *episodes, listed = data
-    assert set(signals) == {"signals", "strokes"} and len(listed["runs"]) == 3
-    assert set(themes) == {"light", "dark"} and len(episodes) == 8
-    assert [d["planner"] for d in episodes[0]["drives"]] == ["expert", "constant", "policy"]
-    assert episodes[0]["title"].endswith(": collision") and episodes[0]["drives"][2]["events"] == {
+    style, *episodes, listed = data
+    assert {"signals", "strokes", "widths"} <= set(style) and len(listed["runs"]) == 3
+    assert set(style["themes"]) == {"light", "dark"} and len(episodes) == 8
+    assert [d["planner"] for d in episodes[0]["rollouts"]] == ["expert", "constant", "policy"]
+    assert episodes[0]["title"].endswith(": collision") and episodes[0]["rollouts"][2]["events"] == {
         "collision": 40
     }
     assert "<b>not markup</b>" not in html and "&lt;b&gt;not markup" in html
@@ -167,12 +167,12 @@ def test_steps_before_the_planner_took_over_are_the_logs(page, scenarios):
     """The stored path begins where the planner took over; the page shows the logged drive before."""
     _, parsed = page
     episode = next(json.loads(t) for a, t in parsed.scripts if a.get("class") == "episode")
-    from .test_episode import shorts
+    from .test_player_data import shorts
 
     assert episode["id"] == "hand-01"
-    pose = shorts(episode["drives"][2]["pose"], 91, 3)[:, :2] * episode["unit"] + episode["centre"]
+    pose = shorts(episode["rollouts"][2]["pose"], 91, 3)[:, :2] * episode["unit"] + episode["centre"]
     np.testing.assert_allclose(pose[:10], scenarios[1].agent_xy[:10, 0], atol=episode["unit"])
-    np.testing.assert_allclose(pose[10:], drive_off(scenarios[1], 3.0)[10:, :2], atol=episode["unit"])
+    np.testing.assert_allclose(pose[10:], offset_path(scenarios[1], 3.0)[10:, :2], atol=episode["unit"])
 
 
 def test_a_moved_set_is_named_and_can_be_given(runs, tmp_path, hand_set):
@@ -207,7 +207,7 @@ def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch
     before = out.read_bytes()
     with pytest.raises(UsageError, match="--overwrite"):
         write_report(runs, out)
-    with pytest.raises(UsageError, match="name a file in it"):
+    with pytest.raises(UsageError, match="name a file to write"):
         write_report(runs, out.parent, overwrite=True)
     with pytest.raises(UsageError, match="-1 episodes"):
         write_report(runs, tmp_path / "new.html", episodes=-1)
@@ -215,7 +215,7 @@ def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch
     def fails(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("drivax.report.pages.page.os.fsync", fails)
+    monkeypatch.setattr("drivax.files.os.fsync", fails)
     with pytest.raises(OSError, match="disk full"):
         write_report(runs, out, overwrite=True)
     assert out.read_bytes() == before and [path.name for path in out.parent.iterdir()] == ["report.html"]
@@ -252,9 +252,9 @@ def test_crashes_are_told_with_step_and_error(runs, tmp_path):
     *_, episode, listed = [one for one in data if one.get("id", "hand-02") == "hand-02"]
     assert listed["runs"][2]["errors"] == {"0": [55, "ValueError: too <fast>"]}, "it is the gravest failure"
     assert (
-        episode["drives"][2]["events"] == {"crashed": 55} and episode["title"] == "hand-02: planner crashed"
+        episode["rollouts"][2]["events"] == {"crashed": 55} and episode["title"] == "hand-02: planner crashed"
     )
-    assert episode["drives"][0]["events"] == {}
+    assert episode["rollouts"][0]["events"] == {}
 
 
 @needs_browser
@@ -320,7 +320,7 @@ def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
         "constant and policy have 2 of 2 and 8 scenarios in common." in page.text
     )
     assert all("no pairs" in row[1] and "no pairs" not in row[2] for row in page.tables[2][1:])
-    drives = [json.loads(t)["drives"] for a, t in page.scripts if a.get("class") == "episode"]
+    drives = [json.loads(t)["rollouts"] for a, t in page.scripts if a.get("class") == "episode"]
     assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.report.episode_selection import Choice
-from drivax.report.episodes import drives_of
-from drivax.report.loaded_runs import read_runs
+from drivax.report.episodes import EpisodeGroup, rollouts_of
+from drivax.report.runs import read_runs
 
 
 def test_what_was_written_is_read(runs, scenarios):
@@ -52,14 +51,14 @@ def test_repeated_scenarios_keep_their_own_trajectory(runs):
 def test_actions_are_read_where_a_run_tells_them(runs, scenarios):
     run = read_runs([runs[2]])[0][0]
     assert run.trajectories.action.shape == (8, 80, 2)
-    choice = Choice("hand", "hand-03", (3,), "offroad")
-    (drive,) = drives_of([run], choice, scenarios[3])
+    choice = EpisodeGroup("hand", "hand-03", (3,), "offroad")
+    (drive,) = rollouts_of([run], choice, scenarios[3])
     assert np.isnan(drive.action[:10]).all() and np.isnan(drive.action[90]).all()
     np.testing.assert_allclose(drive.action[10:90, 0], np.sin(np.arange(80) / 7.0), atol=1e-3)
     with np.load(runs[2] / "trajectories.npz") as stored:
         arrays = {name: array for name, array in stored.items() if name != "action"}
     np.savez(runs[2] / "trajectories.npz", **arrays)
-    (drive,) = drives_of(read_runs([runs[2]])[0], choice, scenarios[3])
+    (drive,) = rollouts_of(read_runs([runs[2]])[0], choice, scenarios[3])
     assert np.isnan(drive.action).all(), "a run of before there were any"
 
 

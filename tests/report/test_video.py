@@ -9,11 +9,11 @@ import pytest
 
 from drivax.cli import main
 from drivax.errors import UsageError
-from drivax.report.episodes import logged_drive
-from drivax.report.pictures.episode import Drive
+from drivax.report.episodes import logged_motion
+from drivax.report.pictures.drawing import Rollout
 from drivax.report.pictures.palette import LEGEND, THEMES
 
-from .conftest import drive_off, make_scenario
+from .conftest import make_scenario, offset_path
 
 av = pytest.importorskip("av")
 pytest.importorskip("matplotlib")
@@ -26,7 +26,7 @@ def close(image, name, theme="light", near=2):
 
 
 def drive(scenario, sideways=3.0, **events):
-    return Drive("policy", drive_off(scenario, sideways).astype(np.float64), 10, events, "collision")
+    return Rollout("policy", offset_path(scenario, sideways).astype(np.float64), 10, events, "collision")
 
 
 def scene(theme="light"):
@@ -75,7 +75,7 @@ def test_failures_are_marked_from_their_step_on():
     ended.ego[41:] = np.nan
     gone = draw_frame(scenery, ended, 80, 0.1)
     assert close(gone[340:410, 340:380], "mark").sum() > 50, "the camera stays where it was last"
-    never = Drive("policy", np.full((91, 4), np.nan), 10, {}, "unjudged")
+    never = Rollout("policy", np.full((91, 4), np.nan), 10, {}, "unjudged")
     assert draw_frame(scenery, never, 20, 0.1).shape == (720, 720, 4)
 
 
@@ -123,17 +123,17 @@ def test_panes_in_rows():
     from drivax.report.pictures.video import frames
 
     scenario = make_scenario(0)
-    drives = [Drive(f"planner {i}", logged_drive(scenario), 10, {}, "success") for i in range(5)]
+    drives = [Rollout(f"planner {i}", logged_motion(scenario), 10, {}, "success") for i in range(5)]
     sizes = [next(frames(scenario, drives[:count])).shape for count in (1, 2, 4, 5)]
     assert [size[1] for size in sizes] == [720, 960, 960, 1440], "at most three side by side"
     assert 480 < sizes[1][0] < 600 and 960 < sizes[2][0] < 1100 and all(size[0] % 2 == 0 for size in sizes)
 
 
 def test_names_of_files(tmp_path):
-    from drivax.report.episode_selection import Choice
+    from drivax.report.episodes import EpisodeGroup
     from drivax.report.pictures.video import _files
 
-    chosen = [Choice("d", f"a/b {i}", (i,), "success") for i in range(12)]
+    chosen = [EpisodeGroup("d", f"a/b {i}", (i,), "success") for i in range(12)]
     assert [file.name for file in _files(tmp_path, chosen, ranked=True)][::11] == [
         "01-a_b_0.mp4",
         "12-a_b_11.mp4",
@@ -176,7 +176,7 @@ def test_an_episode_is_drawn_faster_than_it_lasts(tmp_path):
     from drivax.report.pictures.video import encode, frames
 
     scenario = make_scenario(0)
-    drives = [Drive("log", logged_drive(scenario), 10, {}, "success"), drive(scenario)]
+    drives = [Rollout("log", logged_motion(scenario), 10, {}, "success"), drive(scenario)]
     encode(tmp_path / "warm.mp4", frames(scenario, drives[:1]), 0.1)
     for planners in (drives[:1], drives):
         begin = time.perf_counter()
