@@ -10,8 +10,8 @@ import pytest
 from drivax.geometry.boxes import overlap
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.agent_paths import PATH_X, PATH_Y, PROFILE_SPEED, PROFILE_Z, AgentPaths
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.traffic.prepared import data_of
 from drivax.simulator.traffic.reactive import DRIVES, IdmTraffic
 from drivax.tasks.task import Task
 

@@ -56,7 +56,7 @@ def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
 
 def measured(data: Path) -> dict[str, Any]:
     """Outcome, score and progress of every planner, scenario by scenario."""
-    sys.path.append(str(ROOT / "experiments" / "planners"))
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
     sources, scenarios = zip(*scenarios_of(data), strict=True)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     rows = [{"source": source, "scenario_id": one.id} for source, one in zip(sources, scenarios, strict=True)]

@@ -234,7 +234,7 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "all": (folder / name, all_count, args.seed, world),
         "rare": (folder / f"{name}-rare-{rare_count}", rare_count, args.seed + 1, rare_world),
     }
-    sys.path.append(str(ROOT / "experiments" / "planners"))
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
     planners = tuple(DRIVERS)
     made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
     rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}

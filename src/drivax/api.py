@@ -87,7 +87,7 @@ def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> 
         task: Action space, observation, reward and ends.
         traffic: How the others move: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
             ``zoo:NAME``), or a traffic. All but ``log`` may need their bank prepare_bank:
-            ``bank = simulator.traffic.prepared.prepare_bank(simulator.traffic, bank)``.
+            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
     """
     return Simulator(task or Task(), _traffic(traffic))
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from search_planner import SearchPlanner, advanced, rolled_out
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
@@ -18,7 +19,6 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, RED, SMALL, bank_of, car, moved, straight_road
-from search_planner import SearchPlanner, advanced, rolled_out
 
 TASK = Task(observation=GLIMPSE, metrics="none")
 SIMULATOR = Simulator(TASK)

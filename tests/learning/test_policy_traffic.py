@@ -15,7 +15,7 @@ from drivax.learning.policy_traffic import policy_traffic
 from drivax.planners.planner_traffic import TrafficPolicy
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
-from drivax.simulator.traffic.prepared import data_of, prepare_bank
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.synthetic.generate import Generation, generate
 

@@ -20,8 +20,8 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.policies import PACKED, load_policy, pack_policy
 from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_traffic
 from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
-from drivax.simulator.traffic.prepared import data_of, prepare_bank
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.zoo import is_policy, policy_folder, zoo

@@ -14,8 +14,8 @@ from drivax.planners.planner_traffic import PlannerTraffic, TrafficPolicy, with_
 from drivax.planners.simple import Expert
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.traffic.prepared import data_of
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
 from scenes import bank_of, car, straight_road

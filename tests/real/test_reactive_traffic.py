@@ -12,7 +12,7 @@ from drivax.datasets.reader import BadRecord
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.traffic.agent_paths import AgentPaths
-from drivax.simulator.traffic.prepared import data_of
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import DRIVES, REPLAYS
 from traffic_oracle import TRAFFIC, compare, meetings, runs_of
 from traffic_oracle import Path as Line

@@ -12,9 +12,9 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator import situation
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.override import OverrideTraffic, with_override
-from drivax.simulator.traffic.prepared import prepare_bank
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig

@@ -9,8 +9,8 @@ import pytest
 
 from drivax.evaluation.rollout import judging
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.traffic.prepared import prepare_bank
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import DELTA_LOCAL, DIRECT_STATE, PHYSICAL, PUBLISHED, Physical
 from drivax.tasks.task import Task

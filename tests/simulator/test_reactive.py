@@ -22,8 +22,8 @@ from drivax.simulator.traffic.agent_paths import (
     PROFILE_SPEED,
     AgentPaths,
 )
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.traffic.prepared import data_of
 from drivax.simulator.traffic.reactive import DRIVES, LEFT, REPLAYS, WAITS, IdmTraffic
 from drivax.tasks.task import Task
 from scenes import GREEN, RED, SMALL, bank_of, car, straight_road

@@ -12,7 +12,7 @@ from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator.traffic.agent_paths import AgentPaths
-from drivax.simulator.traffic.prepared import data_of
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import DRIVES, WAITS
 from drivax.synthetic.world import generate_recording
 from traffic_oracle import SIMULATOR, TRAFFIC, Path, compare, meetings, rolled, runs_of

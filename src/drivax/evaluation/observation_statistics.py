@@ -24,8 +24,8 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
-from drivax.simulator.traffic.prepared import prepare_bank
 from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
 from drivax.tasks.task import Task

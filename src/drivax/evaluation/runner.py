@@ -32,8 +32,8 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
-from drivax.simulator.traffic.prepared import prepare_bank
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 

@@ -24,7 +24,7 @@ from drivax.learning.training_log import Journal, Preempted, StopSignal
 from drivax.learning.validation import Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.prepared import prepare_bank
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, refuse_existing
 

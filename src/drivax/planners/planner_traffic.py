@@ -19,8 +19,8 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
+from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
-from drivax.simulator.traffic.prepared import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traffic
 from drivax.tasks.task import Task
 

@@ -32,8 +32,8 @@ from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.traffic.prepared import prepare_bank
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions

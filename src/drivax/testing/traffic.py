@@ -14,9 +14,9 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import alone, logged_history
-from drivax.simulator.traffic.prepared import prepare_bank
 from drivax.simulator.types import AgentContext, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task

@@ -22,7 +22,7 @@ from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
 from drivax.simulator.traffic.agent_lights import light_arcs
-from drivax.simulator.traffic.prepared import TrafficData, find_data, with_data
+from drivax.simulator.traffic.bank_data import TrafficData, find_data, with_data
 
 #: Points of a path, equally far apart along it.
 PATH_POINTS = 96

@@ -15,8 +15,8 @@ from drivax.scenario.bank.queries import around_lanes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.traffic.log import LogTraffic, logged_history
-from drivax.simulator.traffic.prepared import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.types import AgentContext, Traffic
 
 #: Next motion for a motion, an action and a length in metres, such as ``Task.motion``.

@@ -23,8 +23,8 @@ from drivax.simulator.traffic.agent_paths import (
     AgentPaths,
     with_paths,
 )
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
-from drivax.simulator.traffic.prepared import data_of
 from drivax.simulator.types import AgentContext, Frame
 
 #: Steps of recent motion that are kept, which is what observations look back; older frames repeat the oldest.
