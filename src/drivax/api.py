@@ -87,7 +87,7 @@ def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> 
         task: Action space, observation, reward and termination; the default task if None.
         traffic: Traffic model: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
             ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
-            ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
+            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
     """
     return Simulator(task or Task(), _traffic(traffic))
 

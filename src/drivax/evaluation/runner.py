@@ -32,7 +32,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, Start
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
@@ -129,7 +129,7 @@ def evaluate(
 
 def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
     """How many scenarios fit in memory at a time."""
-    single = prepared(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
+    single = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
     return scenarios_at_a_time(single.nbytes, lanes(), free_memory(jax.devices()[0]))
 
 
@@ -180,7 +180,7 @@ class _Evaluation:
 
     def episodes(self, bank: ScenarioBank) -> Iterator[Episodes]:
         """Run all scenarios of a bank in its order, a batch at a time."""
-        bank, width = prepared(self.simulator.traffic, bank), lanes()
+        bank, width = prepare_bank(self.simulator.traffic, bank), lanes()
         index = jnp.arange(width, dtype=jnp.int32)
         for first in range(0, len(bank), width):
             count = min(width, len(bank) - first)
