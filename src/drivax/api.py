@@ -111,7 +111,7 @@ def evaluate(
         start: How episodes start: as logged by default, or ``simulator.starts.NoisyStart()``.
         sample: Whether a policy given by name samples its actions instead of taking the mode.
         metrics: User-defined metrics as ``module:name``, in addition to all built-in ones.
-        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :func:`drivax.evaluation.runner.evaluate`.
+        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :class:`drivax.evaluation.runner.Options`.
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):

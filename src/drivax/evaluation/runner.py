@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,25 @@ def lanes() -> int:
     return LANES if jax.default_backend() == "cpu" else LANES_ELSEWHERE
 
 
+class Options(TypedDict, total=False):
+    """Keyword options of :func:`evaluate`.
+
+    Attributes:
+        start_step: Step of the log at which episodes start, by default the current step.
+        seed: Seed of all random numbers, by default 0.
+        batch: Stored scenarios loaded at a time, by default as many as memory allows; no result depends on it.
+        sizes: Sizes of the banks, by default what the scenarios use. Subsets of a set that are given the sizes of the
+            whole share its compiled program.
+        progress: Called with (done, total) after every batch.
+    """
+
+    start_step: int
+    seed: int
+    batch: int | None
+    sizes: Sizes | None
+    progress: Progress | None
+
+
 def evaluate(
     planner: Planner,
     scenarios: ScenarioBank | Sequence[Scenario],
@@ -59,60 +78,38 @@ def evaluate(
     task: Task | None = None,
     traffic: Traffic | None = None,
     start: Start | None = None,
-    start_step: int = CURRENT_STEP,
-    seed: int = 0,
-    batch: int | None = None,
-    sizes: Sizes | None = None,
-    progress: Progress | None = None,
+    **options: Unpack[Options],
 ) -> EpisodeTable:
     """Run a planner on every scenario to the end of its log, and measure each episode.
 
     Args:
         planner: The planner.
-        scenarios: A bank, or stored scenarios of one capacity, of which as many are loaded at a time as memory allows.
+        scenarios: A bank, or stored scenarios of one capacity.
         names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank; stored scenarios know theirs.
         task: Action space and observation of the planner; the default task if None. All metrics are measured, and no
             episode ends early.
         traffic: Traffic model, log replay if None; what it needs is precomputed here.
         start: How episodes start, as logged if None. Random starts are the same for every planner.
-        start_step: Step of the log at which episodes start.
-        seed: Seed of all random numbers.
-        batch: Stored scenarios loaded at a time; no result depends on it.
-        sizes: Sizes of the banks, by default what ``scenarios`` use. Subsets of a set that are given the sizes of the
-            whole share its compiled program.
-        progress: Called with (done, total) after every batch.
+        options: See :class:`Options`.
 
     Raises:
         UsageError: Planner, task, start and scenarios do not fit together.
         DataError: A scenario has no logged future.
         DrivaxError: Memory does not suffice, or ego's motion is not finite.
     """
+    batch, sizes, progress = options.get("batch"), options.get("sizes"), options.get("progress")
+    start_step, seed = options.get("start_step", CURRENT_STEP), options.get("seed", 0)
     if batch is not None and batch < 1:
         raise UsageError(f"batch of {batch} scenarios", cure="use 1 or more")
-    in_memory = isinstance(scenarios, ScenarioBank)
+    steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else STEPS
     simulator = Simulator(task or Task(), traffic or LogTraffic(), start or LogStart())
-    steps = scenarios.steps if in_memory else STEPS
     evaluation = _Evaluation.of(simulator, planner, start_step, seed, steps)
-    if in_memory:
-        names = names or ()
-        if len(names) != len(scenarios):
-            raise UsageError(
-                f"{len(names)} scenario names for a bank of {len(scenarios)}",
-                cure="name every scenario of the bank",
-            )
-        no_future = np.asarray(scenarios.flags) & Flag.NO_FUTURE != 0
-        present = np.asarray(scenarios.agents[:, start_step, 0, AgentColumn.VALID]) > 0
-        identity = np.asarray(scenarios.identity)
-    else:
-        names = scenario_names(scenarios)
-        no_future = [Flag.NO_FUTURE in scenario.has for scenario in scenarios]
-        present = [scenario.agent_valid[start_step, 0] for scenario in scenarios]
-        identity = identities([(row["dataset"], row["scenario_id"]) for row in names])
-    _check_future(names, no_future)
-    _check_present(names, present, start_step)
-    if in_memory:
+    if isinstance(scenarios, ScenarioBank):
+        names, identity = _bank_names(scenarios, names or (), start_step), np.asarray(scenarios.identity)
         size, banks = len(scenarios), iter([scenarios])
     else:
+        names = _stored_names(scenarios, start_step)
+        identity = identities([(row["dataset"], row["scenario_id"]) for row in names])
         sizes = sizes or Sizes.used(scenarios)
         size = min(batch or _fitting(simulator.traffic, scenarios, sizes), len(scenarios))
         banks = _banks(scenarios, identity, size, sizes)
@@ -125,6 +122,25 @@ def evaluate(
                 if progress is not None:
                     progress(done, len(names))
     return evaluation.table(_joined(episodes), names, identity, errors)
+
+
+def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
+    """Check the names of a bank, and that episodes can start there."""
+    if len(names) != len(bank):
+        raise UsageError(
+            f"{len(names)} scenario names for a bank of {len(bank)}", cure="name every scenario of the bank"
+        )
+    _check_future(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
+    _check_present(names, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0, start_step)
+    return names
+
+
+def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
+    """Return the names of stored scenarios, and check that episodes can start there."""
+    names = scenario_names(scenarios)
+    _check_future(names, [Flag.NO_FUTURE in scenario.has for scenario in scenarios])
+    _check_present(names, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step)
+    return names
 
 
 def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
