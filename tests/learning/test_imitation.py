@@ -56,7 +56,7 @@ def test_losses_against_numpy(mask):
     density = stats.norm.logpdf(np.arctanh(action.astype(float)), loc, scale) - np.log1p(-(action**2.0))
     for loss, expected in (("mse", (error**2).mean(axis=-1)), ("likelihood", -density.sum(axis=-1))):
         cloning = Cloning(loss=loss, mask_clipped=mask)
-        found, logs = cloning.of_batch(gaussian, parameters, Told(), data, jax.random.key(0))
+        found, logs = cloning.batch_loss(gaussian, parameters, Told(), data, jax.random.key(0))
         assert float(found) == pytest.approx(expected[counts].mean(), rel=1e-4)
         assert float(logs["imitation_error"]) == pytest.approx(np.abs(error)[counts].mean(), rel=1e-4)
         assert float(logs["left_out"]) == pytest.approx(2 / 6 if mask else 0.0, abs=1e-6)
@@ -69,7 +69,7 @@ def test_clipped_moments_teach_nothing():
     for loss in ("mse", "likelihood"):
 
         def of(parameters, loss=loss):
-            return Cloning(loss=loss).of_batch(gaussian, parameters, Told(), data, jax.random.key(0))[0]
+            return Cloning(loss=loss).batch_loss(gaussian, parameters, Told(), data, jax.random.key(0))[0]
 
         slope = jax.grad(of)(parameters)["loc"][:, 0]
         assert slope[0] == 0.0 and slope[1] < 0.0

@@ -11,7 +11,7 @@ from drivax import settings
 from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policy_traffic import policy_traffic
+from drivax.learning.policies import policy_traffic
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.catalogue import prepared
 from drivax.simulator.traffic.reactive import IdmTraffic

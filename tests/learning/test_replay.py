@@ -10,9 +10,8 @@ from scipy import stats
 
 from drivax.errors import UsageError
 from drivax.learning import replay
-from drivax.learning.collector import collect
 from drivax.learning.driving import Driving
-from drivax.learning.environment import Environments, Outcome
+from drivax.learning.environment import Environments, Outcome, collect
 from drivax.learning.replay import ReplayConfig
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
@@ -44,10 +43,10 @@ class Counting:
 
     observe = observe_all
 
-    def look(self, data, state):
+    def cache(self, data, state):
         return ()
 
-    def step(self, data, now, looked, action, key):
+    def step(self, data, now, cache, action, key):
         who, episode, step = jnp.moveaxis(now.state, -1, 0)
         moved = jnp.stack([who, episode, step + 1], axis=-1)
         begun = jnp.stack([who, episode + 1, jnp.zeros_like(step)], axis=-1)
@@ -67,7 +66,7 @@ def fill(config, steps, unroll):
     """A replay after so many steps, and the steps that it should hold, told by plain loops."""
     environment = Counting()
     environments = environment.start((), jax.random.key(0), COUNT)
-    kept = replay.init(config, environment, environments)
+    kept = ReplayBuffer(config, environment).init(environments)
     run = jax.jit(lambda e, key: collect(environment, (), e, act, key, unroll, config.store)[:2])
     for _ in range(steps // unroll):
         environments, rollout = run(environments, jax.random.key(0))
@@ -97,7 +96,9 @@ def test_samples_are_the_steps_that_happened(store, capacity, steps):
     """Before the ring is full, exactly full, and after it was written over once and four times."""
     environment, kept, held = fill(ReplayConfig(capacity, store), steps, 4)
     batch = sampled(environment, kept, 4000)
-    before, after = (np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.following))
+    before, after = (
+        np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.next_observation)
+    )
     assert {tuple(row) for row in before.tolist()} == held
     # What a step led to is the next state of the same episode, final states included.
     np.testing.assert_array_equal(after, before + np.array([0, 0, 1]))
@@ -152,10 +153,13 @@ def test_states_and_observations_give_the_same_batch():
     assert bool(exact.terminated.any()) or float(jnp.abs(exact.reward).max()) > 0
     for name in ("action", "reward", "terminated"):
         np.testing.assert_array_equal(getattr(exact, name), getattr(stored, name))
-    for one, other in ((exact.observation, stored.observation), (exact.following, stored.following)):
+    for one, other in (
+        (exact.observation, stored.observation),
+        (exact.next_observation, stored.next_observation),
+    ):
         assert set(one) == set(other)
         for name in one:
             # bfloat16 keeps 8 bits.
             np.testing.assert_allclose(one[name], other[name], rtol=2**-8, atol=1e-6, err_msg=name)
-    moved = np.abs(np.asarray(exact.observation["route"]) - np.asarray(exact.following["route"]))
+    moved = np.abs(np.asarray(exact.observation["route"]) - np.asarray(exact.next_observation["route"]))
     assert moved.max() > 1e-3

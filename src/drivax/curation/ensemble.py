@@ -23,10 +23,9 @@ from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.curation.scoring import Progress, each_batch
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
-from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, updated
+from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.driving import Driving
-from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
-from drivax.learning.sampler import draw, sampler
+from drivax.learning.experience import Experience, ExperienceConfig, draw, expert_actions, recorded, sampler
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
@@ -322,7 +321,7 @@ def fit(
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
         places = draw(experience.critic, key, (cloning.batch,))
-        observation, action, _ = moments(environment, experience, places)
+        observation, action, _ = expert_actions(environment, experience, places)
 
         def one(each: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
             others = fold[places[0]] != each[0]
@@ -331,9 +330,11 @@ def fit(
             seen = jax.tree.map(lambda leaf: leaf[rows], observation)
 
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
-                return cloning.of_moments(learner.distribution(parameters, seen), action[rows], others[rows])
+                return cloning.imitation_loss(
+                    learner.distribution(parameters, seen), action[rows], others[rows]
+                )
 
-            return updated(each[1], learner.optimiser, loss)[0]
+            return imitation_update(each[1], learner.optimiser, loss)[0]
 
         size = config.folds if together else None
         return jax.lax.map(one, (jnp.arange(config.folds), trained), batch_size=size), None
