@@ -132,7 +132,7 @@ def test_steps_that_weights_are_made_for_are_those_that_are_drawn(data):
     usable = usable_steps(config, data)
     np.testing.assert_array_equal(usable, own.expert.usable & ~own.expert.clipped)
     assert usable.any() and not usable[:, :10].any()
-    with pytest.raises(UsageError, match="PpoConfig learns from no recorded steps"):
+    with pytest.raises(UsageError, match="PpoConfig does not learn from logged steps"):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
 
 
@@ -147,5 +147,5 @@ def test_what_cannot_be_learned_from_is_refused(bank):
             ExperienceConfig().of(DRIVING, bank, weights)
     with pytest.raises(DataError, match="no step has any weight"):
         ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
-    with pytest.raises(UsageError, match="Pendulum holds no recorded episodes"):
+    with pytest.raises(UsageError, match="Pendulum has no logged episodes"):
         ExperienceConfig().of(Pendulum(), ())

@@ -94,7 +94,7 @@ def test_checkpoints_are_compared_by_it():
     assert rank("score", row) == (0.5,)
     values = {"checkpoint_rule": "fitted_q", "evaluate_every": 1}
     for algorithm in ({"kind": "bc"}, {"kind": "iql"}):
-        with pytest.raises(UsageError, match="evaluates by no fitted Q"):
+        with pytest.raises(UsageError, match="needs fitted-Q evaluation"):
             settings.load(TrainConfig, values | {"algorithm": algorithm})
     fits = {"kind": "iql", "fitted_q": {"updates": 5}}
     assert settings.load(TrainConfig, values | {"algorithm": fits}).checkpoint_rule == "fitted_q"

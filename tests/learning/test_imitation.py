@@ -97,7 +97,7 @@ def test_a_grid_and_missing_experts_are_refused(shown):
     learner = BcConfig(network=network, loss="likelihood", batch=8, updates=2).build(environment, shown, 1)
     state = jax.jit(learner.init)(shown, jax.random.key(0))
     assert isinstance(learner.distribution(state.parameters, {"pendulum": jnp.zeros(3)}), Grid)
-    with pytest.raises(UsageError, match="gradient through its samples"):
+    with pytest.raises(UsageError, match="reparameterised samples"):
         SacConfig(network=network)
 
 
@@ -108,8 +108,8 @@ def test_imitation_fades():
     with pytest.raises(UsageError, match="use 0 or more"):
         WarmStart(weight=-1.0)
     with pytest.raises(UsageError, match="raise total_steps"):
-        WarmStart(iterations=5).rest(5)
-    assert WarmStart(iterations=5).rest(8) == 3
+        WarmStart(iterations=5).remaining(5)
+    assert WarmStart(iterations=5).remaining(8) == 3
 
 
 @pytest.mark.slow

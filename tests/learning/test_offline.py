@@ -362,10 +362,10 @@ def test_what_cannot_be_learned_is_refused():
     assert IqlConfig(network=grid).loss == "likelihood"
     for config, words in (
         (partial(IqlConfig, expectile=1.0), "an expectile of 1"),
-        (partial(IqlConfig, inverse_temperature=-1.0), "weights of IQL"),
+        (partial(IqlConfig, inverse_temperature=-1.0), "inverse_temperature or largest_weight"),
         (partial(CqlConfig, actions=0), "too small"),
         (partial(CqlConfig, backup_actions=0), "too small"),
-        (partial(CqlConfig, penalty=0.0, gap=1.0), "nothing for a multiplier"),
+        (partial(CqlConfig, penalty=0.0, gap=1.0), "penalty is 0 with a gap"),
         (partial(Td3BcConfig, delay=0), "a delay of 1"),
     ):
         with pytest.raises(UsageError, match=words):

@@ -79,7 +79,7 @@ def test_a_packed_policy_says_where_it_comes_from_and_not_where_it_lay(run, bank
 @pytest.mark.slow
 def test_what_a_packed_policy_is_not(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank)
-    with pytest.raises(UsageError, match="packed and has no steps; leave out @4"):
+    with pytest.raises(UsageError, match="packed and without steps; leave out @4"):
         find_planner(f"{packed.path}@4", bank)
     with pytest.raises(UsageError, match="exists already"):
         export_policy(run.path, packed.path, bank)
@@ -163,7 +163,7 @@ def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
     assert planner.name == name.removeprefix("zoo:") and all(
         np.isfinite(leaf).all() for leaf in weights(planner)
     )
-    with pytest.raises(UsageError, match="has no steps"):
+    with pytest.raises(UsageError, match="without steps"):
         find_planner(f"{name}@5", bank)
     among = find_traffic(name)
     assert among.task == task and prepared(among, bank).driver.name == planner.name

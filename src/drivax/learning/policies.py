@@ -92,8 +92,8 @@ def export_policy(
 ) -> RunFolder:
     """Write the best policy of a run (the newest without a validation) to a folder that loads like the run.
 
-    The folder holds the planner's parameters, the configuration, and the provenance: command, versions, commit and hashes
-    of data sets, but no path of the machine.
+    The folder holds the planner's parameters, the configuration, and the provenance (command, versions, commit and
+    hashes of data sets, but no path of the machine).
 
     Args:
         run: Run folder of ``drivax train``.

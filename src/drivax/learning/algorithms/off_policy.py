@@ -7,7 +7,7 @@ the target networks.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from drivax.planners.network_planner import NetworkPlanner
 from drivax.rl.online import polyak, soft_policy_loss, td_target, temperature_loss
 
 
+@runtime_checkable
 class OffPolicyConfig(Protocol):
     """Settings that off-policy algorithms share."""
 
