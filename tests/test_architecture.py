@@ -138,8 +138,18 @@ def test_no_registry_hosts_and_no_paths_of_one_machine(repository: Path):
 
 
 def test_no_large_files(repository: Path):
-    large = [file for file in tracked_files(repository) if file.stat().st_size > 2_000_000]
+    limits = {".json": 300_000, ".png": 200_000}
+    large = [
+        file for file in tracked_files(repository) if file.stat().st_size > limits.get(file.suffix, 500_000)
+    ]
     assert large == []
+
+
+def test_episodes_and_tables_of_experiments_are_not_tracked(repository: Path):
+    stored = [file for file in tracked_files(repository) if file.suffix in (".npz", ".csv", ".xz", ".jsonl")]
+    assert [file.relative_to(repository).parts[:3] for file in stored] == [("src", "drivax", "zoo")] * len(
+        stored
+    )
 
 
 def test_lock_file_pins_exactly(repository: Path):

@@ -120,7 +120,11 @@ def test_a_step_is_the_simulators(env, data):
     def two_moments(bank, action):
         state = simulator.reset(bank, 1)
         after, transition = simulator.step(bank, state, action)
-        return simulator.observe(bank, state.scene), simulator.observe(bank, after.scene), transition.reward
+        return (
+            simulator.observe(bank, state.context),
+            simulator.observe(bank, after.context),
+            transition.reward,
+        )
 
     before, after, reward = two_moments(data.bank, jnp.asarray(action))
     seen, info = env.reset(options={"scenario": 1})

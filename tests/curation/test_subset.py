@@ -12,7 +12,7 @@ from drivax.curation.methods import Wanted, curate
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import check_top, top_rows, write_top
 from drivax.errors import DataError, UsageError
-from drivax.report.pages.criticality import criticality_html
+from drivax.report.pages.viewer import criticality_html
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.stats.clusters import recordings_of

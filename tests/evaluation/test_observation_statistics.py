@@ -33,10 +33,10 @@ from scenes import bank_of, car, straight_road
 STARE_M = 30.0
 
 
-def faulty(bank, scene, frames):
+def faulty(bank, context, frames):
     """A feature of one number that is not one at steps 20 and 50 of the first scenario."""
-    broken = (scene.index == 0) & ((scene.step == 20) | (scene.step == 50))
-    return jnp.where(broken, jnp.nan, scene.step / 100.0)[None]
+    broken = (context.index == 0) & ((context.step == 20) | (context.step == 50))
+    return jnp.where(broken, jnp.nan, context.step / 100.0)[None]
 
 
 @record
@@ -77,7 +77,7 @@ def column(found, group, name):
 @pytest.mark.slow
 def test_episodes_are_looked_at_until_and_after_the_collision(bank):
     looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
-    assert looks.state.scene.step.tolist() == [[*range(10, 81, 10)]] * 3
+    assert looks.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
     assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
     assert looks.collides.tolist() == [True, False, False]

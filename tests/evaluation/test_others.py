@@ -11,10 +11,9 @@ from shapely import affinity
 import drivax
 from drivax.cli import main
 from drivax.evaluation.traffic_trajectories import packed, unpacked
-from drivax.report.episode_selection import ranked
-from drivax.report.episodes import DrivenSet, drives_of
-from drivax.report.loaded_runs import read_runs
-from drivax.report.pictures.episode import as_driven
+from drivax.report.episodes import EvaluatedSet, ranked, rollouts_of
+from drivax.report.pictures.drawing import with_traffic_of
+from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate
 
@@ -65,11 +64,11 @@ def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
     call = ["evaluate", "--planner", "constant_velocity", "--data", str(tmp_path / "set"), "--traffic", "idm"]
     assert main([*call, "--out", str(tmp_path / "run")]) == 0
     evaluations, _ = read_runs([tmp_path / "run"])
-    driven, gaps, missed = DrivenSet(evaluations[0]), [], []
+    driven, gaps, missed = EvaluatedSet(evaluations[0]), [], []
     for choice in ranked(evaluations):
         scenario = driven.scenario((choice.dataset, choice.scenario_id))
-        (drive,) = drives_of(evaluations, choice, scenario)
-        seen = as_driven(scenario, drive)
+        (drive,) = rollouts_of(evaluations, choice, scenario)
+        seen = with_traffic_of(scenario, drive)
         at = drive.events["collision"]
         np.testing.assert_array_equal(seen.agent_xy[:10], scenario.agent_xy[:10])
         if at >= 0:

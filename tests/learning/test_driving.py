@@ -25,10 +25,10 @@ from drivax.tasks.observations import ObservationConfig, OwnGroup
 from drivax.tasks.task import Task
 
 
-def moment(bank, scene, frames):
+def moment(bank, context, frames):
     """A feature that tells where it was made: scenario, step, last action."""
-    place = jnp.stack([scene.index, scene.step]).astype(jnp.float32)
-    return jnp.concatenate([place, scene.action])[None]
+    place = jnp.stack([context.index, context.step]).astype(jnp.float32)
+    return jnp.concatenate([place, context.action])[None]
 
 
 OBSERVATION = ObservationConfig(agents=1, steps=1, road=0, lights=1, route=2, own=(OwnGroup(moment),))
@@ -113,24 +113,24 @@ def test_the_row_behind_an_end_holds_the_final_state(experience):
     np.testing.assert_array_equal(~alive[1:], ended[:-1])
     np.testing.assert_array_equal(after.over, ended[-1])
     assert not (ended & ~alive).any() and (rollout.reward[~alive] == 0).all()
-    scene = rollout.state
+    context = rollout.state
     # Whatever happens, what a step led to is the same scenario one step later, seen with the same past.
     lived = alive[:-1]
-    np.testing.assert_array_equal(scene.index[1:][lived], scene.index[:-1][lived])
-    np.testing.assert_array_equal(scene.step[1:][lived], scene.step[:-1][lived] + 1)
-    np.testing.assert_array_equal(scene.history[1:][lived][:, :-1], scene.history[:-1][lived][:, 1:])
+    np.testing.assert_array_equal(context.index[1:][lived], context.index[:-1][lived])
+    np.testing.assert_array_equal(context.step[1:][lived], context.step[:-1][lived] + 1)
+    np.testing.assert_array_equal(context.history[1:][lived][:, :-1], context.history[:-1][lived][:, 1:])
     # Nothing of that reaches the episode that begins behind it.
-    begun = scene.step[1:][~lived]
+    begun = context.step[1:][~lived]
     assert (begun >= EARLIEST).all() and (begun <= LATEST).all() and len(np.unique(begun)) > 2
-    assert (scene.action[1:][~lived] == 0).all() and (scene.route_m[1:][~lived] >= 0).all()
+    assert (context.action[1:][~lived] == 0).all() and (context.route_m[1:][~lived] >= 0).all()
 
 
 def test_new_episodes_begin_as_logged(experience, bank):
-    scene, alive = experience[1].state, experience[1].alive
+    context, alive = experience[1].state, experience[1].alive
     rows = np.argwhere(~alive[:-1]) + np.array([1, 0])
     for time, number in rows:
-        step, history = scene.step[time, number], scene.history[time, number]
-        logged = np.asarray(bank.agents)[scene.index[time, number], max(step - 9, 0) : step + 1, 0]
+        step, history = context.step[time, number], context.history[time, number]
+        logged = np.asarray(bank.agents)[context.index[time, number], max(step - 9, 0) : step + 1, 0]
         np.testing.assert_allclose(history[-len(logged) :, :2], logged[:, :2], atol=1e-4)
 
 

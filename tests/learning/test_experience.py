@@ -50,11 +50,12 @@ def drive(bank, index):
     simulator, planner = DRIVING.simulator, Expert(DRIVING.task.actions)
 
     def step(state, _):
-        seen = simulator.observe(bank, state.scene)
+        seen = simulator.observe(bank, state.context)
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
-        after, made = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        following = simulator.observe(bank, after.scene)
+        action = DRIVING.task.actuated(state.context.history[-1], action, state.context.action)
+        after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        following = simulator.observe(bank, after.context)
         return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)
 
     return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]

@@ -166,7 +166,9 @@ def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
     with pytest.raises(UsageError, match="without steps"):
         find_planner(f"{name}@5", bank)
     among = find_traffic(name)
-    assert among.task == task and prepared(among, bank).driver.name == planner.name
+    assert (
+        among.task == task and data_of(prepare_bank(among, bank), TrafficPolicy).planner.name == planner.name
+    )
 
 
 @pytest.mark.slow

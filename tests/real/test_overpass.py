@@ -64,8 +64,8 @@ def test_vehicle_height_follows_its_road(driven):
 
     def one(state, _):
         action = jnp.zeros(2)
-        state, _ = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        return state, state.scene.z
+        state, _ = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        return state, state.context.z
 
     @jax.jit
     @jax.vmap

@@ -83,7 +83,7 @@ def crossings(recording, row):
 def changes(bank):
     def one(row):
         def step(state, _):
-            now = logged_motion(bank, state.scene, 1)
+            now = logged_motion(bank, state.context, 1)
             after, _ = SIMULATOR.replay(bank, state, now, jnp.zeros(2))
             return after, after.facts.lane_changed
 

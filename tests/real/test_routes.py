@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmark_scripts import load_script
 from drivax.datasets.reader import BadRecord
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Recording, windows, with_ego
 from drivax.scenario.schema import AgentKind, Flag
+from experiment_scripts import load_script
 
-routes = load_script("routes")
+routes = load_script("data.routes")
 
 
 @dataclass(frozen=True)

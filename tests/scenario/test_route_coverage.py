@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark_scripts import load_script
 from drivax.scenario.build.assemble import assemble
+from experiment_scripts import load_script
 
 from .recordings import driving, make_recording, make_tracks
 
-routes = load_script("routes")
+routes = load_script("data.routes")
 
 
 def test_coverage_is_the_share_of_steps_within_reach():

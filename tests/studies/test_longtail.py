@@ -1,6 +1,5 @@
 """The long-tail study: verdicts on results that are known, and the whole study on a few scenarios."""
 
-import importlib
 import json
 from dataclasses import asdict, replace
 from typing import get_args
@@ -34,6 +33,7 @@ from drivax.studies.longtail_results import (
     needed,
     rates,
 )
+from experiment_scripts import load_script
 from scenes import SMALL, car, straight_road
 
 SEEDS, SCENARIOS = 5, 400
@@ -285,7 +285,7 @@ def here(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
+def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     out = tmp_path / "study"
     sets = ["--data", str(data.path), "--validation", str(data.path), "--test", str(data.path)]
     arguments = ["study", "longtail", *sets, "--out", str(out), *TINY]
@@ -309,8 +309,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     again = capsys.readouterr().err
     assert "trained" not in again and "driving" not in again
     # And so where only what was kept of it is.
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    script = importlib.import_module("longtail")
+    script = load_script("longtail")
     monkeypatch.setattr(script, "KEPT", tmp_path / "kept")
     script.keep(out)
     script.restore(tmp_path / "restored")

@@ -112,7 +112,7 @@ def judged_all(bank: ScenarioBank, states: SimState) -> dict[str, Value]:
 
 def limited(simulator: Simulator, bank: ScenarioBank, state: SimState) -> dict[str, Array]:
     """The observation within the bounds of its space; groups without rows are left out."""
-    seen = simulator.observe(bank, state.scene)
+    seen = simulator.observe(bank, state.context)
     return {
         name: leaf.astype(jnp.int8) if leaf.dtype == bool else jnp.clip(leaf, -LIMIT, LIMIT)
         for name, leaf in seen.items()

@@ -29,10 +29,10 @@ from drivax.adapters.driving import (
     judged_all,
     opened,
 )
-from drivax.adapters.pictures import path_of, picture
 from drivax.errors import UsageError
+from drivax.report.pictures.still import draw_pixels
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import SimState
+from drivax.simulator.types import AgentContext, SimState
 from drivax.tasks.actions import DISCRETE, DirectState, Discrete
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
@@ -147,7 +147,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
         state, observation = begin(worlds.simulator, worlds.bank, self._row)
         self._state = state
-        self._path = path_of(state.scene)
+        self._path = _path_of(state.context)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -164,7 +164,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         state, observation, ending = advance(worlds.simulator, worlds.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:
-            self._path = path_of(state.scene, self._path)
+            self._path = _path_of(state.context, self._path)
         reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
         info: dict[str, Any] = {"scenario_id": worlds.ids[self._row]}
         if terminated or truncated:
@@ -179,7 +179,7 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
             return None
         if not len(self._path):
             raise gymnasium.error.ResetNeeded("there is nothing to draw yet; call reset() first")
-        return picture(self._worlds.scenarios[self._row], self._path)
+        return draw_pixels(self._worlds.scenarios[self._row], self._path)
 
 
 class VectorDrivingEnv(VectorEnv):
@@ -281,7 +281,7 @@ class VectorDrivingEnv(VectorEnv):
             raise gymnasium.error.ResetNeeded("there is nothing to draw yet; call reset() first")
         scenarios = self._worlds.scenarios
         return tuple(
-            picture(scenarios[int(row)], path) for row, path in zip(self._rows, self._paths, strict=True)
+            draw_pixels(scenarios[int(row)], path) for row, path in zip(self._rows, self._paths, strict=True)
         )
 
     def _drawn(self) -> Any:
@@ -295,11 +295,11 @@ class VectorDrivingEnv(VectorEnv):
         """Keeps the driven paths where they are drawn."""
         if self.render_mode is None or self._state is None:
             return
-        scenes = [jax.tree.map(lambda leaf, n=n: leaf[n], self._state.scene) for n in range(self.num_envs)]
+        scenes = [jax.tree.map(lambda leaf, n=n: leaf[n], self._state.context) for n in range(self.num_envs)]
         old = self._paths or [None] * self.num_envs
         self._paths = [
-            path_of(scene, None if new else path)
-            for scene, path, new in zip(scenes, old, begins, strict=True)
+            _path_of(context, None if new else path)
+            for context, path, new in zip(scenes, old, begins, strict=True)
         ]
 
 
@@ -343,3 +343,17 @@ for _name, _task in TASKS.items():
         vector_entry_point="drivax.adapters.gym:VectorDrivingEnv",
         kwargs={"task": _task},
     )
+
+
+def _path_of(context: AgentContext, before: Any = None) -> Any:
+    """Return ego's motion from the first step of the log to the present one ``[step + 1, 4]``; NaN where unknown.
+
+    Args:
+        context: The present context.
+        before: The path one step ago; None where an episode starts.
+    """
+    history, step = np.asarray(context.history), int(context.step)
+    if before is not None:
+        return np.concatenate([before, history[-1:]])
+    known = history[-min(step + 1, len(history)) :]
+    return np.concatenate([np.full((step + 1 - len(known), 4), np.nan, np.float32), known])

@@ -54,10 +54,9 @@ def run(args: Compare) -> int:
     from drivax.evaluation.comparison import compare
     from drivax.evaluation.plan import ComparisonPlan
     from drivax.evaluation.stored import open_driven_set, read_seeds
-    from drivax.files import write_text
-    from drivax.report.comparison_text import comparison_text
+    from drivax.files import check_output, write_text
+    from drivax.report.comparison import comparison_text
     from drivax.report.pages.comparison import write_comparison
-    from drivax.report.pages.page import refuse_page
 
     if len(args.runs) not in (0, 2):
         raise UsageError(f"{len(args.runs)} runs are named", cure="write drivax compare A B")
@@ -68,7 +67,7 @@ def run(args: Compare) -> int:
     plan = replace(plan, **given)
     for out in (args.save, args.html):
         if out is not None:
-            refuse_page(out, args.overwrite)
+            check_output(out, args.overwrite)
     if args.save is not None:
         args.save.parent.mkdir(parents=True, exist_ok=True)
         write_text(args.save, settings.dump(plan))

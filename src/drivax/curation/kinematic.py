@@ -32,7 +32,7 @@ from drivax.curation.logged import LOG_ROUTE, Logged
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
 from drivax.geometry.vectors import wrap
-from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, filter_operator
+from drivax.metrics.comfort import JERK_MPS3, YAW_ACCELERATION_RPS2, savgol_matrix
 from drivax.scenario.bank.queries import LEVEL_M, lane_distance, offroad_distance, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import DT_S
@@ -195,7 +195,7 @@ def _derivative(
     start = jnp.clip(place - _WINDOW // 2, first, last - (_WINDOW - 1))
     window = signal[jnp.clip(start[:, None] + jnp.arange(_WINDOW), 0, len(signal) - 1)]
     # One row for each place in a window.
-    rows = jnp.asarray(filter_operator(_WINDOW, _WINDOW, order, derivative), jnp.float32)
+    rows = jnp.asarray(savgol_matrix(_WINDOW, _WINDOW, order, derivative), jnp.float32)
     found = jnp.sum(rows[place - start] * window, axis=-1) / DT_S**derivative
     return jnp.where(known & (last - first >= _WINDOW - 1), found, 0.0)
 

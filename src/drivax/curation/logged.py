@@ -17,7 +17,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.contact import overlaps
 from drivax.simulator.traffic.log import alone, frame_of
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: Row of ``bank.routes`` that holds the log's own way.
 LOG_ROUTE = 1
@@ -28,7 +28,7 @@ class Logged:
     """One log. Where ego is not there, its last motion stands for it.
 
     Attributes:
-        scene: What the simulator would know of ego at every step.
+        context: What the simulator would know of ego at every step.
         motion: x, y (m), heading (rad), speed (m/s) of ego.
         velocity: As recorded, m/s.
         valid: Whether ego is there.
@@ -38,7 +38,7 @@ class Logged:
         ground_m: Height of the ground under ego.
     """
 
-    scene: Scene
+    context: AgentContext
     motion: Float[Array, "T 4"]
     velocity: Float[Array, "T 2"]
     valid: Bool[Array, " T"]
@@ -50,7 +50,7 @@ class Logged:
     @property
     def index(self) -> Int[Array, ""]:
         """Row of the bank."""
-        return self.scene.index[0]
+        return self.context.index[0]
 
 
 def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
@@ -58,15 +58,17 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
     rows = bank.agents[index, :, 0]
     valid, steps = rows[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
     known = jnp.maximum(jax.lax.cummax(jnp.where(valid, steps, -1)), jnp.argmax(valid))
-    scenes = jax.vmap(lambda step: _scene(bank, index, step))(known)
-    motion = jax.vmap(lambda scene: logged_motion(bank, scene, 0))(scenes)
-    scenes = jax.vmap(lambda step, now: _scene(bank, index, step, now))(steps, motion)
+    contexts = jax.vmap(lambda step: _scene(bank, index, step))(known)
+    motion = jax.vmap(lambda context: logged_motion(bank, context, 0))(contexts)
+    contexts = jax.vmap(lambda step, now: _scene(bank, index, step, now))(steps, motion)
     frame = jax.vmap(
-        lambda scene: frame_of(bank, index, scene.step, bank.agents[index, scene.step], alone(scene), 0)
-    )(scenes)
+        lambda context: frame_of(
+            bank, index, context.step, bank.agents[index, context.step], alone(context), 0
+        )
+    )(contexts)
     touching = jax.vmap(lambda now: overlaps(now, jnp.int32(0)))(frame)
     return Logged(
-        scene=scenes,
+        context=contexts,
         motion=motion,
         velocity=rows[known, AgentColumn.VELOCITY],
         valid=valid,
@@ -77,10 +79,10 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
     )
 
 
-def _scene(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> Scene:
+def _scene(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> AgentContext:
     history = jnp.zeros((HISTORY, 4)) if motion is None else jnp.broadcast_to(motion, (HISTORY, 4))
     z, zero = bank.agents[index, step, 0, AgentColumn.Z], jnp.zeros(())
-    return Scene(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, ())
+    return AgentContext(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, ())
 
 
 def _left_out(touching: Bool[Array, "T S"], there: Bool[Array, "T S"]) -> Bool[Array, "T S"]:

@@ -40,7 +40,7 @@ class ExpertActions:
 
         The second of them tells the curvature; without it the action that follows the log is a guess.
         """
-        action = jax.vmap(lambda scene: expert_action(bank, scene, _SPACE))(log.scene)
+        action = jax.vmap(lambda context: expert_action(bank, context, _SPACE))(log.context)
         later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
         known = log.valid & later[1:-1] & later[2:]
         return {"action": jnp.clip(action, -1.0, 1.0), "known": known}

@@ -19,7 +19,7 @@ from drivax.planners.simple import expert_action, logged_motion
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP, Flag, Scenario
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import Facts, Frame, Scene, SimState, Situation, Surroundings
+from drivax.simulator.types import AgentContext, Facts, Frame, SimState, Situation, Surroundings
 from drivax.tasks.actions import PHYSICAL, PUBLISHED
 
 Finding = dict[str, float | int | bool | str | None]
@@ -92,7 +92,9 @@ class _Watch:
         """None."""
         return PHYSICAL.first(history, length)
 
-    def observe(self, bank: ScenarioBank, scene: Scene, agents: Any, frame: Frame) -> Mapping[str, Any]:
+    def observe(
+        self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
+    ) -> Mapping[str, Any]:
         """Nothing."""
         return {}
 
@@ -100,14 +102,14 @@ class _Watch:
         """Nothing."""
         return {}
 
-    def ended(self, bank: ScenarioBank, scene: Scene, facts: Facts) -> tuple[Array, Array]:
+    def ended(self, bank: ScenarioBank, context: AgentContext, facts: Facts) -> tuple[Array, Array]:
         """Never."""
         return jnp.zeros((), bool), jnp.zeros((), bool)
 
     def episode_start(self) -> None:
         """Nothing."""
 
-    def episode_add(self, episode: Any, found: Situation, start: Array, final: Array) -> None:
+    def episode_add(self, episode: Any, situation: Situation, start: Array, final: Array) -> None:
         """Nothing."""
 
 
@@ -127,14 +129,14 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) ->
     simulator = Simulator(_Watch())
 
     def one(state: SimState, _: None) -> tuple[SimState, dict[str, Array]]:
-        action = jnp.clip(expert_action(bank, state.scene, PHYSICAL), -1.0, 1.0)
+        action = jnp.clip(expert_action(bank, state.context, PHYSICAL), -1.0, 1.0)
         if driven:
             after, _transition = simulator.step(bank, state, action)
         else:
-            logged = logged_motion(bank, state.scene, 1)
+            logged = logged_motion(bank, state.context, 1)
             after, _transition = simulator.replay(bank, state, logged, action)
         clipped = {
-            name: space.clipped(expert_action(bank, state.scene, space)) for name, space in _SPACES.items()
+            name: space.clipped(expert_action(bank, state.context, space)) for name, space in _SPACES.items()
         }
         return after, _read(after.facts) | clipped
 

@@ -12,46 +12,32 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import DataError
-from drivax.metrics.catalogue import EVENTS, METRICS, Metric
+from drivax.metrics.catalogue import EVENTS, METRICS, Column, Metric, names_of
 from drivax.stats.clusters import recordings
 from drivax.stats.intervals import Interval, bootstrap_mean, rate
 
 #: Columns of ``episodes.csv`` before the metrics.
 KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
-#: Metrics that are shares of episodes: their interval is Wilson's.
-RATES = (
-    "accuracy", "accuracy_at_fault", "success", "success_moving", "collision", "at_fault_collision", "offroad",
-    "left_map", "off_route", "red_light", "ttc_ok", "comfortable", "making_progress", "reached_goal", "crashed",
-)  # fmt: skip
-#: What lies between 0 and 1: these, and the scores.
-SHARES = (*RATES, "vmax_score", "nuplan_score", "vmax_score_partial", "nuplan_score_partial")
-#: Codes and counts that no mean makes sense of.
-NOT_SUMMARISED = ("collision_type", "steps")
-#: What an episode is, by these metrics, whose planner crashed: failed.
-FAILED = (
-    "accuracy", "accuracy_at_fault", "success", "success_moving", "vmax_score", "nuplan_score", "vmax_score_partial",
-    "nuplan_score_partial",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class About:
-    """What tables say of a column outside the catalogue: unit, direction (``high``, ``low``, ``-``), a line of text."""
-
-    unit: str
-    better: str
-    text: str
-
-
 #: The columns that evaluation adds to the metrics.
 ADDED = {
-    "crashed": About(
-        "-", "low", "the planner raised an error, or its action was no number: a failed episode"
+    "crashed": Column(
+        "-", "low", "the planner raised an error, or its action was not finite: a failed episode", kind="rate"
     ),
-    "action_jerk": About(
-        "-", "low", "standard deviation of the change of the action from step to step; 0.82 is pure chance"
+    "action_jerk": Column(
+        "-",
+        "low",
+        "standard deviation of the change of the action from step to step; 0.82 for random actions",
     ),
 }
+_COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
+#: Columns of zeros and ones: their interval is Wilson's.
+RATES = names_of(_COLUMNS, "rate")
+#: Columns that lie between 0 and 1.
+SHARES = names_of(_COLUMNS, "rate", "score")
+#: Columns without a mean.
+NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.summarised)
+#: Columns that are 0 in an episode in which the planner crashed.
+FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
 
 
 @dataclass(frozen=True)
@@ -136,7 +122,7 @@ class Results:
 
     def notes(self) -> dict[str, Any]:
         """What ``run.json`` says of the user's own metrics, so that a report can head their columns."""
-        about = {n: {"unit": m.unit, "better": m.better, "text": m.text} for n, m in self.own.items()}
+        about = {n: {"unit": m.unit, "better": m.better, "text": m.definition} for n, m in self.own.items()}
         return {"own_metrics": about} if about else {}
 
     def crash_rows(self) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from typing import Any
 from drivax.evaluation.results import Results
 from drivax.evaluation.runner import evaluate_scenarios
 from drivax.files import replace_folder
-from drivax.metrics.selection import selected
+from drivax.metrics.selection import select_metrics
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import Sizes
 from drivax.scenario.schema import CURRENT_STEP
@@ -136,7 +136,9 @@ def format_metrics(summary: Mapping[str, Any], wanted: tuple[str, ...]) -> str:
         summary: Of an evaluation.
         wanted: Sets, metrics, and those of the user's own (``metrics.selection``).
     """
-    found = {name: summary["metrics"][name] for name in selected(wanted).names if name in summary["metrics"]}
+    found = {
+        name: summary["metrics"][name] for name in select_metrics(wanted).names if name in summary["metrics"]
+    }
     width = max(map(len, ("metric", *found)))
     lines = [f"{'metric':<{width}}  {'mean':>9}  {'95 % interval':>20}  {'n':>7}"]
     for name, cells in found.items():

@@ -24,7 +24,7 @@ from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_o
 from drivax.evaluation.results import ADDED, KEYS, Crash, Results, with_crashes
 from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
 from drivax.metrics.catalogue import METRICS, Metric
-from drivax.metrics.selection import catalogue
+from drivax.metrics.selection import metric_specs
 from drivax.planners.functions import raised
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.columns import AgentColumn
@@ -32,7 +32,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
@@ -150,7 +150,7 @@ def evaluate_scenarios(
     trial.refuse_absent(names, np.array([scenario.agent_valid[start_step, 0] for scenario in scenarios]))
     numbers = identities([(row["dataset"], row["scenario_id"]) for row in names])
     total, sizes = len(scenarios), sizes or Sizes.used(scenarios)
-    one = prepared(simulator.traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes)).nbytes
+    one = prepare_bank(simulator.traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes)).nbytes
     size = min(batch or scenarios_at_a_time(one, lanes(), free_memory(jax.devices()[0])), total)
     parts: list[Episodes] = []
     with raised() as errors, telling_out_of_memory(size):
@@ -198,7 +198,7 @@ class _Trial:
                 cure="use expert_actions",
             )
         judged = judging(task)
-        metrics = catalogue(judged.metrics)
+        metrics = metric_specs(judged.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
         return cls(replace(simulator, task=judged), planner, start_step, seed, metrics)
@@ -218,7 +218,7 @@ class _Trial:
 
     def drive_all(self, bank: ScenarioBank, progress: Progress | None = None) -> Episodes:
         """The episodes of all scenarios of a bank, in its order."""
-        bank, width = prepared(self.simulator.traffic, bank), lanes()
+        bank, width = prepare_bank(self.simulator.traffic, bank), lanes()
         parts: list[Episodes] = []
         for first in range(0, len(bank), width):
             kept = min(width, len(bank) - first)

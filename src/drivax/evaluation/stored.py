@@ -10,15 +10,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from drivax import settings
 from drivax.errors import DataError
-from drivax.evaluation.results import ADDED, KEYS, About, Results
-from drivax.metrics.catalogue import METRICS, Metric
+from drivax.evaluation.results import ADDED, KEYS, Results
+from drivax.metrics.catalogue import METRICS, Column, Direction
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.clusters import recordings
 from drivax.tracking.run_folder import CONFIG_FILE
@@ -71,10 +71,13 @@ class EpisodeTable:
         return str(self.about.get("traffic", "log"))
 
     @property
-    def own_metrics(self) -> Mapping[str, About]:
+    def own_metrics(self) -> Mapping[str, Column]:
         """What the run says about metrics of the user's own."""
         told = self.about.get("own_metrics") or {}
-        return {name: About(str(m["unit"]), str(m["better"]), str(m["text"])) for name, m in told.items()}
+        return {
+            name: Column(str(m["unit"]), cast(Direction, str(m["better"])), str(m["text"]))
+            for name, m in told.items()
+        }
 
     @property
     def data(self) -> Mapping[str, Any]:
@@ -99,7 +102,7 @@ class EpisodeTable:
         """Cluster of every episode: its segment, or its scenario where no segment is known."""
         return recordings(*(self.keys[name] for name in ("dataset", "segment", "scenario_id")))
 
-    def metric(self, name: str) -> Metric | About | None:
+    def metric(self, name: str) -> Column | None:
         """Unit and direction of a metric; None where nobody told."""
         return METRICS.get(name) or ADDED.get(name) or self.own_metrics.get(name)
 

@@ -22,7 +22,7 @@ from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
 from drivax.simulator.starts import LogStart
-from drivax.simulator.types import Beginning, Frame, Scene, SimState
+from drivax.simulator.types import AgentContext, Beginning, Frame, SimState
 from drivax.tasks.actions import Discrete
 from drivax.tasks.task import Task
 
@@ -90,7 +90,7 @@ class Driving:
         """Reset environments to random steps of the log, so that their episodes end at different times."""
         index, step, keys = _draw(data, key, count, self.earliest_start, data.steps - 3)
         state = jax.vmap(self.simulator.reset, (None, 0, 0, None, 0))(data, index, step, 0, keys)
-        observation = self.observe_all(data, state.scene)
+        observation = self.observe_all(data, state.context)
         return Environments(state, jnp.zeros(count, bool), observation)
 
     def stored(self, state: SimState) -> Scene:
@@ -126,7 +126,7 @@ class Driving:
             cache=self.cache(data, state),
             totals=_totals(data, state, made.reward_terms, over, now.over),
         )
-        return Environments(state, over, self.observe_all(data, state.scene)), outcome
+        return Environments(state, over, self.observe_all(data, state.context)), outcome
 
     def _beginning(self, data: ScenarioBank, index: Array, step: Array, key: Array) -> Beginning:
         return self.simulator.beginning(data, index, step, 0, key)
@@ -185,8 +185,8 @@ class Driving:
     def _expert_action(self, bank: ScenarioBank, scene: Scene) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
         """The expert's action as executed, and whether it was clipped."""
         space = self.task.actions
-        action = expert_action(bank, scene, space)
-        return space.actuated(scene.history[-1], action, scene.action), space.clipped(action)
+        action = expert_action(bank, context, space)
+        return space.actuated(context.history[-1], action, context.action), space.clipped(action)
 
     def _rollout(self, bank: ScenarioBank, index: Int[Array, ""]) -> tuple[Array, ...]:
         """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""

@@ -24,7 +24,7 @@ from drivax.learning.program import Program, Seeds
 from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, refuse_existing, seed_folders
 

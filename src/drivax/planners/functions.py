@@ -60,8 +60,8 @@ class FunctionPlanner(Memoryless):
         if not self.in_python:
             return jnp.asarray(self.function(situation, observation), jnp.float32), carry
         # How traffic keeps its books is no concern of a driver.
-        seen = replace(situation, scene=replace(situation.scene, traffic=()))
-        who, size = bank.identity[state.scene.index], state.scene.action.shape
+        seen = replace(situation, context=replace(situation.context, traffic=()))
+        who, size = bank.identity[state.context.index], state.context.action.shape
 
         def answer(who: Any, *seen: Any) -> Any:
             return _answers(self.function, np.asarray(who), jax.tree.map(np.asarray, seen), size)
@@ -106,7 +106,7 @@ def raised() -> Iterator[dict[tuple[int, int], str]]:
 
 def _answers(function: Drive, who: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
     """The function's action for each scenario of a batch of any shape."""
-    actions, steps = np.full((*who.shape, *size), np.nan, np.float32), seen[0].scene.step
+    actions, steps = np.full((*who.shape, *size), np.nan, np.float32), seen[0].context.step
     for at in np.ndindex(who.shape):
         try:
             action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)

@@ -99,7 +99,7 @@ def relative(frame: Frame, slot: Int[Array, ""]) -> tuple[Array, Array, Array, A
     return dx * me[COS] + dy * me[SIN], dy * me[COS] - dx * me[SIN], cos, sin
 
 
-def judge_contacts(
+def classify_contacts(
     frame: Frame, slot: Int[Array, ""], fresh: Bool[Array, " S"], speed: Float[Array, ""],
     others_speed: Float[Array, " S"], unlawful: Bool[Array, ""],
 ) -> tuple[Bool[Array, " S"], Int[Array, ""]]:  # fmt: skip

@@ -22,7 +22,7 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
 )
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 
 #: Width of the transition where two faces of a box, or two signs of an angle, take over from each other (m, 1).
 _BLEND_M, _BLEND_TURN = 0.03, 0.01
@@ -101,19 +101,19 @@ def offroad_potential(
 
 
 def fault_potential(
-    bank: ScenarioBank, scene: Scene, frame: Frame, margin_m: float = 0.5
+    bank: ScenarioBank, context: AgentContext, frame: Frame, margin_m: float = 0.5
 ) -> Float[Array, ""]:
-    """Both potentials of a scene's driven agent, added up: positive wherever it collides or is off the road.
+    """Both potentials of a context's driven agent, added up: positive wherever it collides or is off the road.
 
     Args:
         bank: The scenarios.
-        scene: The scene.
+        context: The context.
         frame: Everyone in it (``Simulator.frame``).
         margin_m: As above.
     """
-    ground = frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
-    away = offroad_potential(bank, scene.index, frame.box[scene.slot], ground, margin_m)
-    return away + collision_potential(frame, scene.slot, margin_m).sum()
+    ground = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
+    away = offroad_potential(bank, context.index, frame.box[context.slot], ground, margin_m)
+    return away + collision_potential(frame, context.slot, margin_m).sum()
 
 
 def _rise(distance: Float[Array, " K"], margin_m: float) -> Float[Array, " K"]:

@@ -31,4 +31,4 @@ def slots_of(
 
 def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:
     """Which states of a stack belong to an agent; the others fill it up."""
-    return states.scene.slot < bank.agents.shape[2]
+    return states.context.slot < bank.agents.shape[2]

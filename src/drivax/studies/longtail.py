@@ -26,10 +26,10 @@ from drivax.evaluation.stored import read_evaluation
 from drivax.files import write_text
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
-from drivax.learning.loop import hashes, train, usable_steps
-from drivax.learning.training_log import rank
-from drivax.report.pages.criticality import criticality_html
-from drivax.report.pages.viewer import write_player
+from drivax.learning.folders import hashes
+from drivax.learning.loop import train, usable_steps
+from drivax.learning.validation import rank
+from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.longtail_drives import (
     MEAN_Q,
@@ -243,7 +243,7 @@ def _show(results: Mapping[str, Any], data: ScenarioSet, tables: Mapping[str, Sc
         out / CRITICAL,
         overwrite=True,
         title="most critical drives",
-        beside=[criticality_html(table, row) for row, table in tops.items()],
+        details=[criticality_html(table, row) for row, table in tops.items()],
     )
 
 

@@ -12,7 +12,7 @@ from drivax.plugins import find_named
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 from drivax.tasks.observations import Feature, OwnGroup
 from drivax.tasks.task import Task
 from drivax.testing import worlds
@@ -34,8 +34,8 @@ _NOW = 45
 def check_feature(feature: Feature | str) -> None:
     """Whether an observation feature keeps to the rules.
 
-    It is a pure function of bank, scene and frames; finite float32 of at most 100 with features last, or a pair of that
-    and a mask over its rows; the same compiled or not, batched or alone, every time; it sees nothing of the log's
+    It is a pure function of bank, context and frames; finite float32 of at most 100 with features last, or a pair of
+    that and a mask over its rows; the same compiled or not, batched or alone, every time; it sees nothing of the log's
     future; and it is unchanged by turning and shifting the world, by the order of the agents, by padding, and by what
     rows hold where nobody is.
 
@@ -50,16 +50,16 @@ def check_feature(feature: Feature | str) -> None:
     what = f"observation feature {group.name!r}"
     simulator = Simulator(Task())
 
-    def seen(bank: ScenarioBank, scene: Scene) -> Any:
+    def seen(bank: ScenarioBank, context: AgentContext) -> Any:
         def frames(back: int) -> Frame:
-            return simulator.frame(bank, scene, alone(scene), back)
+            return simulator.frame(bank, context, alone(context), back)
 
-        _check_form(what, found(bank, scene, frames))
-        return group.observe(bank, scene, frames)
+        _check_form(what, found(bank, context, frames))
+        return group.observe(bank, context, frames)
 
     program = Program(what, seen, (None, 0))
-    bank, scenes = worlds.worlds(), worlds.moments().found.scene
-    results = program.check_pure(bank, scenes)
+    bank, contexts = worlds.worlds(), worlds.moments().found.context
+    results = program.check_pure(bank, contexts)
     check_numbers(what, results)
     largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(results))
     expect(
@@ -67,7 +67,7 @@ def check_feature(feature: Feature | str) -> None:
         f"{what} reaches {largest:g}",
         "scale it to about [-1, 1] (tasks.observations has the units of the others)",
     )
-    check_numbers(what, program(worlds.deserted(bank), scenes))
+    check_numbers(what, program(worlds.deserted(bank), contexts))
     variants = (
         (worlds.littered, "rows hold something else where nobody is", "mask with frame.valid first"),
         (worlds.padded, "there are more empty slots", "mask with frame.valid, and let no size follow theirs"),
@@ -78,15 +78,15 @@ def check_feature(feature: Feature | str) -> None:
         ),
     )
     for change, cause, cure in variants:
-        check_same(what, results, program(change(bank), scenes), cause, cure)
-    present = np.asarray(scenes.step) == _NOW
+        check_same(what, results, program(change(bank), contexts), cause, cure)
+    present = np.asarray(contexts.step) == _NOW
     now, later = (
         jax.tree.map(lambda leaf: leaf[present], told)
-        for told in (results, program(worlds.forgotten(bank, _NOW), scenes))
+        for told in (results, program(worlds.forgotten(bank, _NOW), contexts))
     )
-    cure = "read the scene and its frames; of the bank only map, route 0, goal and the present step"
+    cure = "read the context and its frames; of the bank only map, route 0, goal and the present step"
     check_same(what, now, later, "the log's future changes", cure)
-    turned = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).found.scene)
+    turned = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).found.context)
     check_turned(what, results, turned)
 
 
@@ -95,7 +95,7 @@ def _check_form(what: str, found: Any) -> None:
     value, mask = found if isinstance(found, tuple) else (found, None)
     expect(
         value.dtype == jnp.float32 and value.ndim >= 1,
-        f"{what} gives {value.dtype}{list(value.shape)} for a scene",
+        f"{what} gives {value.dtype}{list(value.shape)} for a context",
         "give float32 with the features on the last axis",
     )
     if mask is not None:

@@ -83,7 +83,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
         expect(
             same(program(bank, index, at), program(worlds.forgotten(bank, _FORGETS + 1), index, at), CLOSE),
             f"{what} changes when the log goes on in another way",
-            "look at nothing later than scene.step, or say privileged=True",
+            "look at nothing later than context.step, or say privileged=True",
         )
 
 
@@ -105,7 +105,7 @@ def _driven(simulator: Simulator, planner: Planner) -> Callable[..., Array]:
 def _act(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any
 ) -> tuple[Array, Any]:
-    situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.scene)
+    situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.context)
     return planner.act(carry, bank, state, situation, seen, jax.random.key(5))
 
 
@@ -116,7 +116,12 @@ def _check_forms(what: str, simulator: Simulator, planner: Planner, bank: Scenar
         state = simulator.reset(bank, 0)
         carry = planner.init(bank, state, jax.random.key(3))
         action, after = _act(simulator, planner, bank, state, carry)
-        return state.scene.action, action, jax.tree.map(jnp.asarray, carry), jax.tree.map(jnp.asarray, after)
+        return (
+            state.context.action,
+            action,
+            jax.tree.map(jnp.asarray, carry),
+            jax.tree.map(jnp.asarray, after),
+        )
 
     wanted, action, before, after = forms(what, once, bank)
     expect(

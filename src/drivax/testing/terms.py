@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.metrics.catalogue import Metric
-from drivax.metrics.outcomes import Ending
+from drivax.metrics.catalogue import EpisodeEnd, Metric
 from drivax.metrics.scores import Value
 from drivax.metrics.steps import Moment
 from drivax.plugins import find_named
@@ -68,16 +67,16 @@ def check_metric(metric: Metric | str) -> None:
     Raises:
         BrokenContract: It does not; the message says which rule and what to do.
     """
-    what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.text!r}"
+    what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
     found: Any = find_named(metric) if isinstance(metric, str) else metric
-    expect(isinstance(found, Metric), f"{what} is no Metric", "see metrics.catalogue.Metric")
+    expect(isinstance(found, Metric), f"{what} is not a Metric", "see metrics.catalogue.Metric")
     expect(
-        found.unit and found.text,
-        f"{what} has no unit or text",
+        found.unit and found.definition,
+        f"{what} has no unit or definition",
         "tables and reports print them; '-' is the unit of shares",
     )
-    if found.of is not None:
-        step = found.of
+    if found.step_value is not None:
+        step = found.step_value
 
         def value(moment: Moments) -> tuple[Any, Any]:
             now = Moment(moment.found, moment.start, jnp.ones((), bool))
@@ -86,7 +85,7 @@ def check_metric(metric: Metric | str) -> None:
             defined = jnp.broadcast_to(jnp.asarray(defined, bool), number.shape)
             return jnp.where(defined, number.astype(jnp.float32), 0.0), defined
 
-        _check_moments(what, value, check_scalar if not step.late else _check_rows)
+        _check_moments(what, value, check_scalar if not step.delayed else _check_rows)
         _check_reads(what, value, step.reads)
     if found.compute is not None:
         _check_computed(what, found)
@@ -143,7 +142,7 @@ def _check_computed(what: str, metric: Metric) -> None:
     grid = jnp.linspace(0.0, 1.0, 12)
 
     def value(row: Any, number: Any, defined: Any) -> Any:
-        ending = Ending(bank, row, jnp.asarray(10), jnp.asarray(80))
+        ending = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80))
         given = Value(number, defined)
         return compute(ending, given, dict.fromkeys(metric.inputs, given))
 

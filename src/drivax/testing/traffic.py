@@ -14,9 +14,10 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import alone, logged_history
-from drivax.simulator.types import Scene, Traffic
+from drivax.simulator.types import AgentContext, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task
 from drivax.testing import worlds
@@ -63,7 +64,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     """
     traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
     what = f"traffic {traffic.name!r}"
-    bank = prepared(traffic, worlds.worlds())
+    bank = prepare_bank(traffic, worlds.worlds())
     _check_state(what, traffic, bank)
     index, program = jnp.arange(len(bank)), Program(what, _driven(traffic), (None, 0))
     seen: _Seen = program.check_pure(bank, index)
@@ -71,7 +72,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     there = seen.rows[..., AgentColumn.VALID] > 0
 
     def told(change: Callable[[ScenarioBank], ScenarioBank]) -> Any:
-        return program(prepared(traffic, change(worlds.worlds())), index).rows
+        return program(prepare_bank(traffic, change(worlds.worlds())), index).rows
 
     check_numbers(what, told(worlds.deserted))
     known = np.where(there[..., None], seen.rows, 0.0)
@@ -101,7 +102,7 @@ def check_traffic(traffic: Traffic | str) -> None:
         "the agents stand in another order",
         "let no agent's motion follow from its slot",
     )
-    turned = program(prepared(traffic, worlds.worlds(ANGLE)), index)
+    turned = program(prepare_bank(traffic, worlds.worlds(ANGLE)), index)
     check_turned(what, _from_ego(seen), _from_ego(turned))
 
 
@@ -110,18 +111,18 @@ def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
     simulator = Simulator(Task(), traffic)
 
     def drive(bank: ScenarioBank, index: Any) -> _Seen:
-        def step(scene: Scene, _: None) -> tuple[Scene, _Seen]:
-            frame = simulator.frame(bank, scene, alone(scene), 0)
+        def step(context: AgentContext, _: None) -> tuple[AgentContext, _Seen]:
+            frame = simulator.frame(bank, context, alone(context), 0)
             moved = replace(
-                scene,
-                step=scene.step + 1,
-                history=logged_history(bank, index, scene.step + 1, 0),
-                traffic=traffic.advance(bank, scene, frame),
+                context,
+                step=context.step + 1,
+                history=logged_history(bank, index, context.step + 1, 0),
+                traffic=traffic.advance(bank, context, frame),
             )
-            rows, remembered = traffic.agents(bank, scene, 0), traffic.agents(bank, moved, 1)
-            return moved, _Seen(rows, remembered, View.of(scene))
+            rows, remembered = traffic.agents(bank, context, 0), traffic.agents(bank, moved, 1)
+            return moved, _Seen(rows, remembered, View.of(context))
 
-        return jax.lax.scan(step, simulator.scene(bank, index, _BEGIN), None, _STEPS)[1]
+        return jax.lax.scan(step, simulator.context(bank, index, _BEGIN), None, _STEPS)[1]
 
     return drive
 
@@ -130,7 +131,7 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     simulator = Simulator(Task(), traffic)
 
     def told(bank: ScenarioBank) -> Any:
-        return traffic.agents(bank, simulator.scene(bank, 0, _BEGIN), 0)
+        return traffic.agents(bank, simulator.context(bank, 0, _BEGIN), 0)
 
     rows, shape = jax.eval_shape(told, bank), bank.agents.shape[2:]
     expect(
@@ -140,9 +141,9 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     )
 
     def following(bank: ScenarioBank) -> tuple[Any, Any]:
-        scene = simulator.scene(bank, 0, _BEGIN)
-        frame = simulator.frame(bank, scene, alone(scene), 0)
-        return scene.traffic, traffic.advance(bank, scene, frame)
+        context = simulator.context(bank, 0, _BEGIN)
+        frame = simulator.frame(bank, context, alone(context), 0)
+        return context.traffic, traffic.advance(bank, context, frame)
 
     first, second = jax.eval_shape(following, bank)
     forms = [
@@ -177,7 +178,7 @@ def _check_rows(what: str, seen: _Seen) -> None:
         (remembered[..., AgentColumn.VALID] == valid).all()
         and np.allclose(remembered[there], rows[there], rtol=CLOSE, atol=1e-2),
         f"{what} says another thing of the past than it said then",
-        "let agents(bank, scene, back) tell where everyone was 'back' steps ago",
+        "let agents(bank, context, back) tell where everyone was 'back' steps ago",
     )
     both = there[:, 1:] & there[:, :-1]
     leap = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1)[both]

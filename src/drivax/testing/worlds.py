@@ -108,15 +108,15 @@ def _moments(bank: ScenarioBank) -> Moments:
 def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Situation:
     """What is measured when ego has driven like its log, but aside, askew and at another speed."""
     simulator = Simulator(Task())
-    scene = simulator.scene(bank, index, step)
-    x, y, heading, speed = jnp.moveaxis(scene.history, -1, 0)
+    context = simulator.context(bank, index, step)
+    x, y, heading, speed = jnp.moveaxis(context.history, -1, 0)
     aside, askew, pace = place
     shifted = jnp.stack([x - aside * jnp.sin(heading), y + aside * jnp.cos(heading)], axis=-1)
     moved = jnp.stack([wrap(heading + askew), speed * pace], axis=-1)
-    scene = replace(scene, history=jnp.concatenate([shifted, moved], axis=-1))
-    now, previous = (simulator.frame(bank, scene, alone(scene), back) for back in (0, 1))
+    context = replace(context, history=jnp.concatenate([shifted, moved], axis=-1))
+    now, previous = (simulator.frame(bank, context, alone(context), back) for back in (0, 1))
     apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
-    return measure(bank, scene, now, previous, apart, remember_lights(bank, scene), FACTS | ON_REQUEST)[0]
+    return measure(bank, context, now, previous, apart, remember_lights(bank, context), FACTS | ON_REQUEST)[0]
 
 
 def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:
@@ -161,7 +161,7 @@ def with_frame(moments: Moments, frame: Frame) -> Moments:
     """The same moments with everyone's frame replaced."""
     around = moments.found.surroundings
     around = Surroundings(frame, around.lanes, around.route)
-    return replace(moments, found=Situation(moments.found.scene, moments.found.facts, around))
+    return replace(moments, found=Situation(moments.found.context, moments.found.facts, around))
 
 
 def extremes(moments: Moments) -> Moments:
@@ -183,7 +183,7 @@ def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
             lambda path, fact: fact if path[0].name in reads else None, facts
         )
 
-    found = Situation(moments.found.scene, kept(moments.found.facts), moments.found.surroundings)
+    found = Situation(moments.found.context, kept(moments.found.facts), moments.found.surroundings)
     return Moments(kept(moments.before), found, moments.start)
 
 

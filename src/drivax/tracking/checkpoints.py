@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import zipfile
 import zlib
@@ -25,6 +26,8 @@ from drivax.errors import DataError
 from drivax.files import write_text
 
 ABOUT = "about.json"
+#: Fields of training states that checkpoints of version 0.1.0 store under another name.
+_RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
 _CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)
@@ -73,7 +76,10 @@ class Checkpoints:
                 f"there is no checkpoint of step {step}", file=self.folder, cure=f"there are: {have}"
             )
         try:
-            return json.loads(file.read_bytes())
+            about = json.loads(file.read_bytes())
+            for leaf in about.get("leaves", ()):
+                leaf["name"] = _present_name(leaf["name"])
+            return about
         except ValueError as error:
             raise DataError(f"is damaged ({error})", file=file, cure="use another checkpoint") from error
 
@@ -174,6 +180,11 @@ class Checkpoints:
 def is_part(leaf: str, parts: Iterable[str]) -> bool:
     """Whether the name of a leaf lies within one of these parts of a state (``.critic`` holds no ``.critics``)."""
     return any(leaf.startswith(part) and (leaf + ".")[len(part)] in ".[" for part in parts)
+
+
+def _present_name(leaf: str) -> str:
+    """Return the name of a leaf with each renamed field under its present name."""
+    return re.sub(r"\.(\w+)", lambda field: f".{_RENAMED_FIELDS.get(field[1], field[1])}", leaf)
 
 
 def pack(file: Path, tree: Any) -> None:

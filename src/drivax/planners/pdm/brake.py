@@ -116,8 +116,8 @@ class EmergencyBrake:
     ) -> tuple[Float[Array, " D"], Any]:
         """The planner's action, or the brake straight ahead."""
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
-        scene, around = situation.scene, situation.surroundings
-        motion, me = scene.history[-1], around.frame.box[scene.slot]
+        context, around = situation.context, situation.surroundings
+        motion, me = context.history[-1], around.frame.box[context.slot]
 
         def on(motion: Array, _: None) -> tuple[Array, Array]:
             return self.actions.move(motion, action, me[LENGTH]), motion
@@ -125,14 +125,14 @@ class EmergencyBrake:
         steps = round(self.config.within_s / DT_S)
         last, drive = jax.lax.scan(on, motion, None, steps)
         drive = jnp.concatenate([drive, last[None]])
-        touched = overlaps(around.frame, scene.slot)
-        others = Forecast.of(around.frame, scene.slot, touched, drive[::5, :2], _OTHERS, _RADIUS_M)
+        touched = overlaps(around.frame, context.slot)
+        others = Forecast.of(around.frame, context.slot, touched, drive[::5, :2], _OTHERS, _RADIUS_M)
         size = me[LENGTH : WIDTH + 1]
         unlawful = jnp.broadcast_to(around.lanes.leaving_lane, drive.shape[:1])
         soon = until_overlap(drive, size, others, DT_S)
         fault_s = jnp.min(fault_times(drive, size, others, soon, unlawful))
         speed = motion[MOTION_SPEED]
-        wanted = braking(speed, (speed - scene.history[-2, MOTION_SPEED]) / DT_S, self.config)
+        wanted = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
         brake = self.actions.action(motion, wanted, jnp.zeros(()), me[LENGTH])
         chosen = jnp.where(is_emergency(fault_s, speed, self.config), brake, action)
-        return self.actions.actuated(motion, chosen, scene.action), carry
+        return chosen, carry

@@ -11,7 +11,7 @@ from drivax.geometry.vectors import norm
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
-from drivax.simulator.contact import judge_contacts
+from drivax.simulator.contact import classify_contacts
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, MOTION_X, MOTION_Y, Frame
 
 #: Looks into the next five seconds at who comes near.
@@ -100,7 +100,7 @@ def fault_times(
 ) -> Float[Array, " K"]:  # fmt: skip
     """When each of the others is hit by ego's fault, s; infinite for those who are not.
 
-    Fault is decided at the first overlap, by the rule that judges episodes (``simulator.contact.judge_contacts``).
+    Fault is decided at the first overlap, by the rule that judges episodes (``simulator.contact.classify_contacts``).
 
     Args:
         motion: The drive.
@@ -123,7 +123,7 @@ def fault_times(
             both, jnp.zeros((2, 2)), two, two == 0.0, jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
         )
         fresh = jnp.arange(2) == 1
-        return judge_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
+        return classify_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
 
     pairs = jnp.stack([me, moved], axis=1)
     fault = jax.vmap(at_fault)(pairs, others.kind, motion[step, MOTION_SPEED], speeds, unlawful[step])

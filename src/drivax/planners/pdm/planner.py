@@ -131,12 +131,12 @@ class PdmPlanner:
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Memory:
         """Nobody touched yet; acceleration and steering as the motion of the last half second has them."""
-        scene = state.scene
-        before, now = scene.history[-1 - _PAST], scene.history[-1]
+        context = state.context
+        before, now = context.history[-1 - _PAST], context.history[-1]
         moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _PAST * DT_S
         turned = wrap(now[MOTION_HEADING] - before[MOTION_HEADING])
         curvature = jnp.where(moved_m > _STILL_M, turned / jnp.maximum(moved_m, _STILL_M), 0.0)
-        steering = jnp.arctan(curvature * self._wheelbase(bank.length_m(scene.index, scene.slot)))
+        steering = jnp.arctan(curvature * self._wheelbase(bank.length_m(context.index, context.slot)))
         most = self.config.tracking.most_steering
         return Memory(
             touched=jnp.zeros(bank.agent_box.shape[1], bool),
@@ -154,8 +154,8 @@ class PdmPlanner:
         key: Array,
     ) -> tuple[Float[Array, " D"], Memory]:
         """The first step of the best proposal, or the brake."""
-        scene = situation.scene
-        motion, length = scene.history[-1], situation.surroundings.frame.box[scene.slot, LENGTH]
+        context = situation.context
+        motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
         carry = self._touching(carry, situation)
         weighed = self.weigh(carry, bank, situation)
         best = jnp.argmax(weighed.score)
@@ -166,23 +166,22 @@ class PdmPlanner:
         steering = jnp.where(brakes, 0.0, weighed.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
-        action = self.actions.actuated(motion, action, scene.action)
         return action, Memory(carry.touched, acceleration, steering)
 
     def weigh(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> Weighed:
         """All proposals, driven and judged."""
-        config, scene, around = self.config, situation.scene, situation.surroundings
-        frame, motion = around.frame, scene.history[-1]
-        me = frame.box[scene.slot]
+        config, context, around = self.config, situation.context, situation.surroundings
+        frame, motion = around.frame, context.history[-1]
+        me = frame.box[context.slot]
         size, speed = me[LENGTH : WIDTH + 1], motion[MOTION_SPEED]
-        lines = Lines.beside_route(bank, scene.index, around.route.along_m, config.offsets_m, me)
+        lines = Lines.beside_route(bank, context.index, around.route.along_m, config.offsets_m, me)
         way = lines.points[0, ::_SPARSE, :2]
-        others = Forecast.of(frame, scene.slot, carry.touched, way, config.agents, config.radius_m)
+        others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
         # Each stage is written out: XLA would compute it anew in every operation that uses it.
         lines, others = jax.lax.optimization_barrier((lines, others))
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
         wanted = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
-        stop_m = stop_line_m(bank, scene, frame)
+        stop_m = stop_line_m(bank, context, frame)
         driver = (config.driver, config.steps, config.leader_every)
         proposals = unrolled(lines, others, size, speed, wanted, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
@@ -191,10 +190,10 @@ class PdmPlanner:
         cars = jax.vmap(lambda one: tracked(car, one, wheelbase, config.tracking))(reference)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
-        ground_z = frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
+        ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
-        ground = grounds(bank, scene.index, cars.motion, size, z, on_route, every)
+        ground = grounds(bank, context.index, cars.motion, size, z, on_route, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
@@ -205,7 +204,7 @@ class PdmPlanner:
         return Weighed(cars, judgement, scores(judgement, config.scoring))
 
     def _touching(self, carry: Memory, situation: Situation) -> Memory:
-        frame, slot = situation.surroundings.frame, situation.scene.slot
+        frame, slot = situation.surroundings.frame, situation.context.slot
         return Memory(carry.touched | overlaps(frame, slot), carry.acceleration, carry.steering)
 
     def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:

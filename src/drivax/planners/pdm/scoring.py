@@ -20,7 +20,7 @@ from drivax.metrics.comfort import (
     LONGITUDINAL_MPS2,
     YAW_ACCELERATION_RPS2,
     YAW_RATE_RPS,
-    filter_operator,
+    savgol_matrix,
 )
 from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
@@ -253,7 +253,7 @@ def is_comfortable(
     magnitude = jnp.sqrt(acceleration**2 + lateral**2 + 1e-12)
 
     def within(signal: Array, window: int, order: int, derivative: int, least: float, most: float) -> Array:
-        operator = jnp.asarray(filter_operator(steps, window, order, derivative), jnp.float32)
+        operator = jnp.asarray(savgol_matrix(steps, window, order, derivative), jnp.float32)
         smooth = operator @ signal / DT_S**derivative
         return ((smooth >= least) & (smooth <= most)).all()
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class LogTraffic:
         """Nothing: the bank and the step say it all."""
         return ()
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> tuple[()]:
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> tuple[()]:
         """Nothing."""
         return ()
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """The logged rows ``back`` steps ago; steps before the recording repeat its first one."""
-        return bank.agents[scene.index, jnp.clip(scene.step - back, 0, bank.steps - 1)]
+        return bank.agents[context.index, jnp.clip(context.step - back, 0, bank.steps - 1)]
 
 
 def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "16 4"]:
@@ -61,7 +61,7 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
 
 
 def frame_of(
-    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: Scene, back: int
+    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: AgentContext, back: int
 ) -> Frame:
     """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
 
@@ -102,6 +102,6 @@ def frame_of(
     )
 
 
-def alone(scene: Scene) -> Scene:
+def alone(context: AgentContext) -> AgentContext:
     """The cast of a scenario with one driven agent."""
-    return jax.tree.map(lambda leaf: leaf[None], scene)
+    return jax.tree.map(lambda leaf: leaf[None], context)
