@@ -27,7 +27,7 @@ import numpy as np
 from drivax import settings
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policies import pack_policy
+from drivax.learning.policies import export_policy
 from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet

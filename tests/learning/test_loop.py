@@ -16,7 +16,7 @@ from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
 from drivax.learning.training_log import patience_exceeded, rank
-from drivax.report.loaded_runs import read_runs
+from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.generate import Generation, generate

@@ -99,5 +99,5 @@ def test_every_loss_reaches_its_own_parameters_only(sac):
 def test_what_cannot_be_learned_from_is_refused():
     with pytest.raises(UsageError, match="no step with a successor"):
         SacConfig(network=NETWORK, environments=4, unroll=1, warm_up=4)
-    with pytest.raises(UsageError, match="raise replay.capacity"):
+    with pytest.raises(UsageError, match=r"raise replay\.capacity"):
         SacConfig(network=NETWORK, environments=4, unroll=100, replay=ReplayConfig(100))

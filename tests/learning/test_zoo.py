@@ -25,7 +25,6 @@ from drivax.learning.policies import (
     load_policy,
     policy_traffic,
 )
-from drivax.simulator.traffic.catalogue import prepared
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tracking.run_folder import RunFolder

@@ -82,7 +82,7 @@ class Driving:
         # Starts change no shape; the logged start is the fastest to trace.
         simulator = replace(self.simulator, start=LogStart())
         observation = jax.eval_shape(
-            lambda bank: simulator.observe(bank, simulator.scene(bank, 0, CURRENT_STEP)), data
+            lambda bank: simulator.observe(bank, simulator.context(bank, 0, CURRENT_STEP)), data
         )
         return {name: tuple(value.shape) for name, value in observation.items()}
 
@@ -93,21 +93,21 @@ class Driving:
         observation = self.observe_all(data, state.context)
         return Environments(state, jnp.zeros(count, bool), observation)
 
-    def stored(self, state: SimState) -> Scene:
-        """Return the scene: index, step, history, and reactive traffic."""
-        return state.scene
+    def stored(self, state: SimState) -> AgentContext:
+        """Return the context: index, step, history, and reactive traffic."""
+        return state.context
 
-    def observe(self, data: ScenarioBank, stored: Scene) -> dict[str, Array]:
-        """Observe a scene."""
+    def observe(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
+        """Observe a context."""
         return dict(self.simulator.observe(data, stored))
 
-    def observe_all(self, data: ScenarioBank, stored: Scene) -> dict[str, Array]:
-        """Observe a batch of scenes."""
+    def observe_all(self, data: ScenarioBank, stored: AgentContext) -> dict[str, Array]:
+        """Observe a batch of contexts."""
         return jax.vmap(self.observe, (None, 0))(data, stored)
 
     def cache(self, data: ScenarioBank, state: SimState) -> Frame:
         """Return the frame of all agents, which the current observation and the next step both need."""
-        return jax.vmap(self.simulator.now, (None, 0))(data, state.scene)
+        return jax.vmap(self.simulator.now, (None, 0))(data, state.context)
 
     def step(
         self, data: ScenarioBank, now: Environments, cache: Frame, action: Float[Array, "B D"], key: Array
@@ -143,8 +143,8 @@ class Driving:
         index, step, _ = _draw(data, key, count, CURRENT_STEP, data.steps - 3)
 
         def demonstrate(index: Array, step: Array) -> tuple[dict[str, Array], Array, Array]:
-            scene = self._logged_scene(data, index, step)
-            return (dict(self._logged.observe(data, scene)), *self._expert_action(data, scene))
+            context = self._logged_context(data, index, step)
+            return (dict(self._logged.observe(data, context)), *self._expert_action(data, context))
 
         return jax.vmap(demonstrate)(index, step)
 
@@ -152,7 +152,7 @@ class Driving:
         """Observe logged steps as in :meth:`demonstrations`."""
 
         def observe(scenario: Array, step: Array) -> dict[str, Array]:
-            return dict(self._logged.observe(data, self._logged_scene(data, scenario, step)))
+            return dict(self._logged.observe(data, self._logged_context(data, scenario, step)))
 
         return jax.vmap(observe)(*index)
 
@@ -177,12 +177,16 @@ class Driving:
         """The simulator with all agents as logged and without metrics."""
         return Simulator(replace(self.task, metrics="none"))
 
-    def _logged_scene(self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]) -> Scene:
-        """Scene of a logged step as if the expert had driven there."""
-        scene, before = (self._logged.scene(bank, index, t) for t in (step, jnp.maximum(step - 1, 0)))
-        return replace(scene, action=self._expert_action(bank, before)[0])
+    def _logged_context(
+        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""]
+    ) -> AgentContext:
+        """AgentContext of a logged step as if the expert had driven there."""
+        context, before = (self._logged.context(bank, index, t) for t in (step, jnp.maximum(step - 1, 0)))
+        return replace(context, action=self._expert_action(bank, before)[0])
 
-    def _expert_action(self, bank: ScenarioBank, scene: Scene) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
+    def _expert_action(
+        self, bank: ScenarioBank, context: AgentContext
+    ) -> tuple[Float[Array, " D"], Bool[Array, ""]]:
         """The expert's action as executed, and whether it was clipped."""
         space = self.task.actions
         action = expert_action(bank, context, space)
@@ -192,11 +196,11 @@ class Driving:
         """Action, reward, terminated, truncated and clipped of the expert in one scenario from the current step on."""
         simulator = self._logged
         first = simulator.reset(bank, index)
-        first = replace(first, scene=self._logged_scene(bank, index, first.start))
+        first = replace(first, context=self._logged_context(bank, index, first.start))
 
         def step(state: SimState, _: None) -> tuple[SimState, tuple[Array, ...]]:
-            action, clipped = self._expert_action(bank, state.scene)
-            after, made = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
+            action, clipped = self._expert_action(bank, state.context)
+            after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
             return after, (action, made.reward, made.terminated, made.truncated, clipped)
 
         return jax.lax.scan(step, first, None, bank.steps - 1 - CURRENT_STEP)[1]

@@ -34,7 +34,7 @@ def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
 
     Args:
         config: Task, algorithm, traffic and starts.
-        bank: Scenarios to train on, prepared for reactive traffic (``simulator.traffic.catalogue.prepared``); only
+        bank: Scenarios to train on, prepared for reactive traffic (``simulator.traffic.bank_data.prepare_bank``); only
             shapes are read.
 
     Raises:
@@ -158,7 +158,7 @@ def _learner(config: TrainConfig, environment: Driving, bank: ScenarioBank) -> L
 def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, ScenarioBank]:
     """Environment of a training, and its bank."""
     environment = config.environment(find_traffic(config.traffic))
-    return environment, prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    return environment, prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
 
 
 def _create_folders(
