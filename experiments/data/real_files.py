@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,6 +39,8 @@ BEGIN, END = "<!-- real_files.py: begin -->", "<!-- real_files.py: end -->"
 PLANNERS = (
     "expert", "expert_actions", "pdm", "idm", "search", "zoo:aggressive", "constant_velocity", "random",
 )  # fmt: skip
+#: Planners outside of the package.
+MODULES = {"search": "search_planner:SearchPlanner"}
 TRAFFIC = ("log", "idm")
 
 
@@ -53,12 +56,13 @@ def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
 
 def measured(data: Path) -> dict[str, Any]:
     """Outcome, score and progress of every planner, scenario by scenario."""
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
     sources, scenarios = zip(*scenarios_of(data), strict=True)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     rows = [{"source": source, "scenario_id": one.id} for source, one in zip(sources, scenarios, strict=True)]
     found: dict[str, Any] = {kind: {} for kind in TRAFFIC}
     for planner in PLANNERS:
-        driver, task = find_planner(planner, bank, False)
+        driver, task = find_planner(MODULES.get(planner, planner), bank, False)
         for kind in TRAFFIC:
             results = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
             table = EpisodeTable.of(results)

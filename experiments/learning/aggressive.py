@@ -96,7 +96,7 @@ def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path)
     table: Table = {}
     for name in ("clone", "aggressive"):
         planner, task = load_policy(runs / name, bank)
-        slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).scenes.slot)
+        slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
         row, place = np.nonzero(slots < bank.agents.shape[2])
         values = _driven(
             Simulator(judging(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]

@@ -86,8 +86,8 @@ def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> 
     Args:
         task: Action space, observation, reward and ends.
         traffic: How the others move: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
-            ``zoo:NAME``), or a traffic. All but ``log`` may need their bank prepared:
-            ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
+            ``zoo:NAME``), or a traffic. All but ``log`` may need their bank prepare_bank:
+            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
     """
     return Simulator(task or Task(), _traffic(traffic))
 
@@ -107,7 +107,7 @@ def evaluate(
         planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
         data: Folder of a scenario set, or what :func:`load` returned (a part of a set, scenarios of your own).
         task: Action space and observation of a planner of your own.
-        traffic: As of :func:`make_simulator`; it is prepared here.
+        traffic: As of :func:`make_simulator`; it is prepare_bank here.
         start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
         sample: Whether a policy, named by its folder, samples its actions rather than acting by the mode.
         metrics: Metrics of your own as ``module:name``, beside all of ours.

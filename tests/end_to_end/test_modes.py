@@ -77,7 +77,9 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("planner", ["idm", "pdm", "search", "random", "zoo:aggressive"])
+@pytest.mark.parametrize(
+    "planner", ["idm", "pdm", "search_planner:SearchPlanner", "random", "zoo:aggressive"]
+)
 def test_thread_count_does_not_change_results(data, planner, tmp_path):
     """XLA's pool has a thread per core unless NPROC says otherwise, which it reads once per process."""
     found = []
@@ -86,7 +88,7 @@ def test_thread_count_does_not_change_results(data, planner, tmp_path):
         call = ["evaluate", "--planner", planner, "--data", str(data), "--out", str(out), "--traffic", "idm"]
         subprocess.run(
             [sys.executable, "-m", "drivax", *call],
-            env=os.environ | {"NPROC": threads},
+            env=os.environ | {"NPROC": threads, "PYTHONPATH": os.pathsep.join(sys.path)},
             check=True,
             timeout=900,
         )

@@ -86,7 +86,8 @@ def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whol
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "planner", ["expert", "constant_velocity", "idm", "random", "pdm", "search", "zoo:aggressive"]
+    "planner",
+    ["expert", "constant_velocity", "idm", "random", "pdm", "search_planner:SearchPlanner", "zoo:aggressive"],
 )
 def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
     with ScenarioWriter(tmp_path / "set", scenarios[0].capacity) as writer:

@@ -10,7 +10,7 @@ from drivax.report.episodes import EpisodeGroup, rollouts_of
 from drivax.report.runs import read_runs
 
 
-def test_what_was_written_is_read(runs, scenarios):
+def test_evaluations_and_trainings_are_read(runs, scenarios):
     evaluations, trainings = read_runs(runs)
     assert [run.name for run in evaluations] == ["expert", "constant", "policy"]
     policy = evaluations[-1]
@@ -27,7 +27,7 @@ def test_what_was_written_is_read(runs, scenarios):
     assert len(curves["loss/policy"]) == 20, "half a last row is left out"
 
 
-def test_repeated_names_stay_apart(runs):
+def test_repeated_names_get_the_folder_as_suffix(runs):
     folder = runs[1]
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"planner": "expert"}))
@@ -35,7 +35,7 @@ def test_repeated_names_stay_apart(runs):
     assert [run.name for run in evaluations] == ["expert", "expert (constant)", "policy"]
 
 
-def test_repeated_scenarios_keep_their_own_trajectory(runs):
+def test_repeated_scenarios_keep_their_trajectories(runs):
     folder = runs[0]
     lines = (folder / "episodes.csv").read_text().splitlines()
     (folder / "episodes.csv").write_text("\n".join([*lines, lines[1].replace(",0,log", ",1,log", 1)]) + "\n")
@@ -48,7 +48,7 @@ def test_repeated_scenarios_keep_their_own_trajectory(runs):
     assert run.trajectories.rows["hand-00", 1] == 8
 
 
-def test_actions_are_read_where_a_run_tells_them(runs, scenarios):
+def test_actions_are_nan_in_runs_without_them(runs, scenarios):
     run = read_runs([runs[2]])[0][0]
     assert run.trajectories.action.shape == (8, 80, 2)
     choice = EpisodeGroup("hand", "hand-03", (3,), "offroad")
@@ -112,7 +112,7 @@ def _lacks(folder):
         (_lacks, "lacks an array"),
     ],
 )
-def test_damage_is_named_with_its_cure(runs, damage, words):
+def test_damaged_files_are_errors_with_a_cure(runs, damage, words):
     damage(runs[0])
     with pytest.raises(DataError) as caught:
         read_runs(runs)
@@ -120,14 +120,14 @@ def test_damage_is_named_with_its_cure(runs, damage, words):
     assert "\n" not in str(caught.value)
 
 
-def test_an_evaluation_without_episodes_is_refused(runs):
+def test_evaluation_without_episodes_is_refused(runs):
     path = runs[0] / "episodes.csv"
     path.write_text(path.read_text().splitlines()[0] + "\n")
     with pytest.raises(DataError, match="no episodes"):
         read_runs(runs)
 
 
-def test_training_damage(runs):
+def test_damaged_training_log_is_an_error(runs):
     log = runs[-1] / "metrics.jsonl"
     log.write_text(log.read_text().replace('"step": 300', '"stop": 300'))
     with pytest.raises(DataError, match="record 4: is no row of metrics"):
@@ -137,7 +137,7 @@ def test_training_damage(runs):
         read_runs(runs)
 
 
-def test_runs_must_exist_once(runs, tmp_path):
+def test_runs_must_exist_and_be_given_once(runs, tmp_path):
     with pytest.raises(UsageError, match="once"):
         read_runs([runs[0], tmp_path / "x" / ".." / runs[0].name])
     with pytest.raises(UsageError):

@@ -140,6 +140,7 @@ def advanced(
     observation = simulator.observe(bank, state.context)
     action, carry = planner.act(carry, bank, state, situation, observation, key)
     if planner.replays:
+        action = simulator.task.actuated(state.context.history[-1], action, state.context.action)
         logged = logged_motion(bank, state.context, 1)
         return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
     context, sound = state.context, jnp.isfinite(action).all()

@@ -32,7 +32,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
@@ -150,7 +150,7 @@ def evaluate_scenarios(
     trial.refuse_absent(names, np.array([scenario.agent_valid[start_step, 0] for scenario in scenarios]))
     numbers = identities([(row["dataset"], row["scenario_id"]) for row in names])
     total, sizes = len(scenarios), sizes or Sizes.used(scenarios)
-    one = prepared(simulator.traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes)).nbytes
+    one = prepare_bank(simulator.traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes)).nbytes
     size = min(batch or scenarios_at_a_time(one, lanes(), free_memory(jax.devices()[0])), total)
     parts: list[Episodes] = []
     with raised() as errors, telling_out_of_memory(size):
@@ -218,7 +218,7 @@ class _Trial:
 
     def drive_all(self, bank: ScenarioBank, progress: Progress | None = None) -> Episodes:
         """The episodes of all scenarios of a bank, in its order."""
-        bank, width = prepared(self.simulator.traffic, bank), lanes()
+        bank, width = prepare_bank(self.simulator.traffic, bank), lanes()
         parts: list[Episodes] = []
         for first in range(0, len(bank), width):
             kept = min(width, len(bank) - first)

@@ -24,7 +24,7 @@ from drivax.learning.training_log import Journal, Preempted, StopSignal
 from drivax.learning.validation import Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, refuse_existing
 
@@ -73,7 +73,7 @@ def train(
     _refuse(config, validation, seeds)
     numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
     environment = config.environment()
-    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    bank = prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     held_out = None if validation is None else Validation.of(validation)
     recorded = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
     learner = config.algorithm.build(environment, bank, config.iterations)
@@ -100,7 +100,7 @@ def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
         UsageError: The algorithm learns from no recorded steps.
     """
     environment = config.environment()
-    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    bank = prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     return np.asarray(experience.usable)
 
