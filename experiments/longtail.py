@@ -25,7 +25,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from drivax.evaluation.stored import read_evaluation
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.studies import longtail_page
 from drivax.studies.longtail_drives import has_driven, names
 from drivax.studies.longtail_plan import DRIVES, REFERENCES, RUNS, SCORES, drive_of, run_of
@@ -74,7 +74,7 @@ def finish(study: Path) -> None:
     results = json.loads((study / "results.json").read_text())
     collisions = {
         name: [
-            int(read_evaluation(folder).metrics["collision"].sum()) for folder in _evaluations(study, name)
+            int(EpisodeTable.read(folder).metrics["collision"].sum()) for folder in _evaluations(study, name)
         ]
         for name in results["rates"]
     }

@@ -29,7 +29,6 @@ import numpy as np
 
 from drivax.api import evaluate, load
 from drivax.files import write_text
-from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.domains import DOMAINS
@@ -52,7 +51,9 @@ from experiments.world.measures import (
 from experiments.world.tables import into_guide, lines
 
 #: Planners whose success says how difficult the world is.
-DRIVERS = ("constant_velocity", "random", "idm", "search")
+DRIVERS = {name: name for name in ("constant_velocity", "random", "idm")} | {
+    "search": "search_planner:SearchPlanner"
+}
 EXPERT_METRICS = ("accuracy", "collision", "offroad", "red_light", "comfortable", "success")
 #: Scenarios that are on the device at once.
 CHUNK = 512
@@ -120,7 +121,7 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
         for scenario, name in zip(scenarios, loaded.names, strict=True)
     ]
     for planner in ("expert", *planners):
-        metrics = evaluate(planner, loaded).metrics
+        metrics = evaluate(DRIVERS.get(planner, planner), loaded).metrics
         wanted = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
         for i, row in enumerate(rows):
             row |= {f"{planner}.{name}": float(metrics[name][i]) for name in wanted}
@@ -233,7 +234,8 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "all": (folder / name, all_count, args.seed, world),
         "rare": (folder / f"{name}-rare-{rare_count}", rare_count, args.seed + 1, rare_world),
     }
-    planners = tuple(planner for planner in DRIVERS if planner in PLANNERS)
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
+    planners = tuple(DRIVERS)
     made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
     rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
     return {

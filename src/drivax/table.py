@@ -162,10 +162,12 @@ class Table:
         lines.writerow([*(key.replace(" ", "_") for key in (*keys, *across)), *_NUMBERS])
         for row in self.rows:
             for column, cell in zip(self.columns, row, strict=True):
-                if (found := cell.interval) is not None:
-                    numbers = ("" if x is None else repr(x) for x in (found.mean, found.low, found.high))
+                if (interval := cell.interval) is not None:
+                    numbers = (
+                        "" if x is None else repr(x) for x in (interval.mean, interval.low, interval.high)
+                    )
                     place = [*(row[at].text for at in labels), *([column.key] if across else [])]
-                    lines.writerow([*place, cell.metric, *numbers, found.n])
+                    lines.writerow([*place, cell.metric, *numbers, interval.n])
         return stream.getvalue()
 
     def html(self) -> str:

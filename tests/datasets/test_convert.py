@@ -532,7 +532,7 @@ def test_other_data_or_options_are_not_continued(thirty, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4), stop)
-    with pytest.raises(UsageError, match=r"other options \(stride\).*--overwrite to start anew"):
+    with pytest.raises(UsageError, match=r"other options \(stride\).*--overwrite to start again"):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4, stride=20))
     (thirty / "2.tfrecord").unlink()
     with pytest.raises(UsageError, match=r"other options \(files\)"):

@@ -53,6 +53,7 @@ def drive(bank, index):
         seen = simulator.observe(bank, state.context)
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
+        action = DRIVING.task.actuated(state.context.history[-1], action, state.context.action)
         after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
         following = simulator.observe(bank, after.context)
         return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)

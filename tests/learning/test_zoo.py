@@ -19,7 +19,8 @@ from drivax.errors import DataError, UsageError
 from drivax.learning.config import TrainConfig
 from drivax.learning.policies import PACKED, load_policy, pack_policy
 from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_traffic
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tracking.run_folder import RunFolder
@@ -113,7 +114,7 @@ def test_traffic_is_found_by_name(run, tmp_path):
     ):
         with pytest.raises(UsageError, match=words):
             find_traffic(name)
-    with pytest.raises(DataError, match="is no run folder"):
+    with pytest.raises(DataError, match="not a run folder"):
         find_traffic(str(tmp_path))
 
 
@@ -160,7 +161,9 @@ def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
     with pytest.raises(UsageError, match="has no steps"):
         find_planner(f"{name}@5", bank)
     among = find_traffic(name)
-    assert among.task == task and prepared(among, bank).driver.name == planner.name
+    assert (
+        among.task == task and data_of(prepare_bank(among, bank), TrafficPolicy).planner.name == planner.name
+    )
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def test_forms_are_checked_before_anything_runs():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["constant_velocity", "idm", "pdm", "search"])
+@pytest.mark.parametrize("name", ["constant_velocity", "idm", "pdm", "search_planner:SearchPlanner"])
 def test_built_in_planners_pass(name):
     check_planner(name)
 

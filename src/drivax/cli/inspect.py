@@ -138,7 +138,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.learning.config import TrainConfig
     from drivax.learning.policy_traffic import find_traffic
     from drivax.planners.simple import Expert
-    from drivax.report.pictures.observation import draw_moment
+    from drivax.report.pictures.observation import draw_log_observation
     from drivax.scenario.bank.scenario_bank import ScenarioBank
 
     scenarios = list(inspection.sample(_OBSERVED))
@@ -157,7 +157,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
         _print_observations(found)
     if args.draw is not None:
         title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
-        draw_moment(task, bank, title).savefig(args.draw)
+        draw_log_observation(task, bank, title).savefig(args.draw)
         print(args.draw, file=sys.stderr if args.json else sys.stdout)
 
 

@@ -24,7 +24,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
@@ -142,7 +142,7 @@ def observation_statistics(
             f"planner {planner.name} acts in another action space than the task", cure="use the task's"
         )
     traffic = traffic or LogTraffic()
-    simulator, bank = Simulator(judging(task), traffic), prepared(traffic, bank)
+    simulator, bank = Simulator(judging(task), traffic), prepare_bank(traffic, bank)
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)

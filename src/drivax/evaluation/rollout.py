@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int16
 
-from drivax.evaluation.results import FAILED
+from drivax.evaluation.episode_table import FAILED
 from drivax.evaluation.traffic_trajectories import packed
 from drivax.metrics.episode import episode_metrics, event_steps
 from drivax.metrics.scores import Value
@@ -140,6 +140,7 @@ def advanced(
     observation = simulator.observe(bank, state.context)
     action, carry = planner.act(carry, bank, state, situation, observation, key)
     if planner.replays:
+        action = simulator.task.actuated(state.context.history[-1], action, state.context.action)
         logged = logged_motion(bank, state.context, 1)
         return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
     context, sound = state.context, jnp.isfinite(action).all()

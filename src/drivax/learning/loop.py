@@ -24,9 +24,9 @@ from drivax.learning.training_log import Journal, Preempted, StopSignal
 from drivax.learning.validation import Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, refuse_existing
+from drivax.tracking.run_folder import RunFolder
 
 
 def train(
@@ -68,12 +68,12 @@ def train(
     if resume:
         config, folders = resumed_folders(data, validation, weights, out, seeds)
     else:
-        refuse_existing(out, overwrite, "training")
+        RunFolder.check(out, overwrite, "training")
         config = with_step(config)
     _refuse(config, validation, seeds)
     numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
     environment = config.environment()
-    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    bank = prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     held_out = None if validation is None else Validation.of(validation)
     recorded = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
     learner = config.algorithm.build(environment, bank, config.iterations)
@@ -100,7 +100,7 @@ def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
         UsageError: The algorithm learns from no recorded steps.
     """
     environment = config.environment()
-    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    bank = prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     return np.asarray(experience.usable)
 

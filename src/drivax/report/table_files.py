@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.results import ADDED
-from drivax.evaluation.stored import comparable
+from drivax.evaluation.episode_table import ADDED, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import (
+    STRATA,
     collisions_table,
     differences_table,
     headline,
     metric_names,
     ordered,
     results_table,
+    set_key,
+    strata_table,
+    summarise,
+    transfer_table,
 )
 from drivax.files import check_output, write_text
 from drivax.metrics.catalogue import METRICS, SETS
-from drivax.report.breakdowns import strata_tables, transfer_tables
-from drivax.report.rollouts import EvaluatedSet
+from drivax.report.episodes import EvaluatedSet
 from drivax.report.runs import Evaluation, read_evaluations
 from drivax.table import Table
+
+#: Columns of a breakdown: what tells planners apart, few enough for a page.
+KEY_METRICS = (
+    "success", "accuracy", "collision", "at_fault_collision", "offroad", "red_light", "progress_ratio", "vmax_score",
+)  # fmt: skip
+#: Metrics of a transfer matrix.
+TRANSFERRED = ("success", "vmax_score")
+Tags = Mapping[ScenarioKey, Mapping[str, str]]
 
 
 def write_tables(
@@ -87,3 +99,20 @@ def _tables(runs: Sequence[Evaluation], data: Path | None, more: Sequence[str]) 
     added = [name for name in metrics if name not in usual]
     tables += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
     return tables + transfer_tables(runs)
+
+
+def strata_tables(runs: Sequence[Evaluation], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
+    """Return a table for each tag of the scenarios, over the runs on these scenarios; with ``more`` metrics."""
+    evaluated = [run for run in runs if any(key in tags for key in run.scenarios)]
+    known = {name for values in tags.values() for name in values}
+    names = dict.fromkeys((*KEY_METRICS, *more))
+    metrics = [name for name in names if any(name in run.metrics for run in evaluated)]
+    return [strata_table(evaluated, tags, tag, metrics) for tag in STRATA if tag in known]
+
+
+def transfer_tables(runs: Sequence[Evaluation]) -> list[Table]:
+    """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
+    if len({set_key(run.data) for run in runs}) < 2:
+        return []
+    known = [name for name in TRANSFERRED if any(summarise(run, name).n for run in runs)]
+    return [transfer_table(runs, name) for name in known]

@@ -1,4 +1,4 @@
-"""What readers and the built-in world produce: a log as its source tells it, before it is assembled."""
+"""Recordings: logs in the frame of their source, as readers and the built-in world produce them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = np.ndarray[Any, Any]
 #: The median step may differ from 0.1 s by this much.
 STEP_TOLERANCE_S = 0.005
 TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
-#: Nothing lies further from the ego, and nobody drives faster: the file is damaged, or its unit is not the metre.
+#: Largest distance from the ego and largest speed; beyond them the file is damaged or its unit is not the metre.
 EXTENT_M, SPEED_MPS = 100_000.0, 500.0
 #: Steps between the starts of two windows.
 STRIDE = 40
@@ -26,10 +26,7 @@ Finding = tuple[str, str] | None
 
 @dataclass(frozen=True)
 class Tracks:
-    """Everything that moves (or could), one row per track, in the source's map frame.
-
-    Invalid entries hold zeros. ``size`` is per step where the source measures it per step.
-    """
+    """Tracks of all road users in the map frame of the source; invalid entries hold zeros."""
 
     xy: Float64[np.ndarray, "track time 2"]
     z: Float64[np.ndarray, "track time"]
@@ -43,7 +40,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class MapFeature:
-    """One element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
+    """An element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
 
     ``points`` are (x, y, z) in metres; polygons are implicitly closed; a stop sign has one point. Road edges have
     the drivable side on their left. Links name other features by ``feature_id`` and may dangle.
@@ -65,7 +62,7 @@ class MapFeature:
 
 @dataclass(frozen=True)
 class Light:
-    """A traffic light as it concerns one lane."""
+    """A traffic light for one lane."""
 
     lane_id: int
     stop_point: Float64[np.ndarray, " 3"]
@@ -74,7 +71,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Event:
-    """A labelled rare event of the built-in world. ``actors`` are track ids, steps are inclusive."""
+    """A labelled rare event of the built-in world; ``actors`` are track ids, steps are inclusive."""
 
     kind: int
     start: int
@@ -84,22 +81,21 @@ class Event:
 
 @dataclass(frozen=True)
 class Recording:
-    """A log as its source tells it: ragged arrays, float64, the source's frame; what readers produce.
+    """A log in the frame of its source: ragged arrays, float64.
 
     Attributes:
         ego: Row of ``tracks`` that is the ego vehicle.
-        timestamps_s: Seconds, one per step, starting anywhere.
-        current_step: Step at which the future begins (10 in WOMD).
+        timestamps_s: Seconds, one per step.
+        current_step: Last step of the past (10 in WOMD).
         to_predict, of_interest: Rows of ``tracks``.
-        route_lanes: Feature ids of the lanes of the intended route in order, where the source knows it.
-        route_corridor: Feature ids of all lanes that the intended route may use, where the source knows only that
-            (nuPlan's roadblocks).
-        seen: Which valid steps of which tracks ego's sensors would have seen, where the source holds the truth and
-            knows the difference; None: everything that was recorded was seen.
-        tags: What the source says in words: ``place`` (city), ``source_format``, the world's ``family``, ...
-        lost: What the reader left out, by name and number.
-        flags: Facts that only the reader knows (defaulted sizes, truncated map, ...).
-        split_gap_m: Polylines are cut where neighbouring points are further apart (clipping jumps); None: never.
+        route_lanes: Feature ids of the lanes of the intended route in order, if known.
+        route_corridor: Feature ids of all lanes that the intended route may use, if only these are known (nuPlan's
+            roadblocks).
+        seen: Mask of the valid steps that the sensors of the ego would see; None if all recorded steps were seen.
+        tags: Words of the source: ``place`` (city), ``source_format``, ``family`` of the built-in world, ...
+        lost: Numbers of items that the reader left out, by name.
+        flags: Facts that only the reader knows (default sizes, truncated map, ...).
+        split_gap_m: Polylines are split where neighbouring points are further apart (clipped maps).
     """
 
     scenario_id: str
@@ -124,20 +120,15 @@ class Recording:
 
 
 def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
-    """Cuts a long recording into windows of 91 steps that share its segment.
+    """Cut a recording into windows of 91 steps that share its segment.
 
-    A recording of at most 91 steps is its own window. Of a longer one, window ``k`` holds the steps from ``k * stride``
-    on, so with the default stride 51 of 91 steps are in the next window too; steps at the end that fill no window are
-    left out (110 steps are one window, 199 are three). Windows in which the ego is not there at the current step are
-    left out and counted in the others' ``lost`` as ``windows_without_ego``.
-
-    Args:
-        recording: Any recording.
-        stride: Steps between the starts of two windows.
+    Window ``k`` begins at step ``k * stride``; steps at the end that fill no window are left out (110 steps make one
+    window, 199 make three). Windows without a valid ego at the current step are left out and counted in ``lost`` of the
+    others as ``windows_without_ego``. A recording of at most 91 steps is its own window.
 
     Raises:
         UsageError: The stride is not positive.
-        DataError: The ego is not there at the current step of any window.
+        DataError: No window has a valid ego at its current step.
     """
     if stride < 1:
         raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
@@ -161,7 +152,7 @@ def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
 
 
 def _window(recording: Recording, start: int) -> Recording:
-    """The 91 steps from ``start`` on, with the current step at its usual place."""
+    """The 91 steps from ``start`` on."""
     part = slice(start, start + STEPS)
     tracks = recording.tracks
     time_fields = ("xy", "z", "heading", "velocity", "size", "valid")
@@ -183,9 +174,7 @@ def _window(recording: Recording, start: int) -> Recording:
 
 
 def with_ego(recording: Recording, row: int) -> Recording:
-    """The same recording with another logged vehicle as the ego.
-
-    What was known of the former ego's route, and of what its sensors saw, is dropped.
+    """Return the recording with another logged vehicle as the ego, without the route and ``seen`` of the former ego.
 
     Raises:
         UsageError: The row is no vehicle that is valid at the current step.
@@ -196,7 +185,7 @@ def with_ego(recording: Recording, row: int) -> Recording:
         raise UsageError(
             f"track row {row} is no vehicle that is valid at step {recording.current_step}",
             record=recording.scenario_id,
-            cure="choose the row of a vehicle that is there at the current step",
+            cure="choose a vehicle that is valid at the current step",
         )
     if row == recording.ego:
         return recording
@@ -211,10 +200,10 @@ def with_ego(recording: Recording, row: int) -> Recording:
 
 
 def check(recording: Recording, capacity: Capacity) -> None:
-    """Refuses recordings that make no sense.
+    """Refuse an invalid recording.
 
     Raises:
-        DataError: Names the recording, what is wrong with it and the cure.
+        DataError: The recording is invalid.
     """
     for test in (
         _check_names,
@@ -232,7 +221,7 @@ def check(recording: Recording, capacity: Capacity) -> None:
 
 
 def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
-    """Median step, and the largest deviation of a step from it, seconds; 0.1 and 0 for a single step."""
+    """Median step and largest deviation from it, seconds; 0.1 and 0 for a single step."""
     steps = np.diff(timestamps_s)
     if len(steps) == 0:
         return DT_S, 0.0
@@ -266,19 +255,12 @@ def _check_time(recording: Recording, capacity: Capacity) -> Finding:
 def _check_shapes(recording: Recording, capacity: Capacity) -> Finding:
     tracks, steps = recording.tracks, len(recording.timestamps_s)
     count = len(tracks.track_id)
-    wanted = {
-        "xy": (count, steps, 2),
-        "z": (count, steps),
-        "heading": (count, steps),
-        "velocity": (count, steps, 2),
-        "size": (count, steps, 3),
-        "valid": (count, steps),
-        "kind": (count,),
-    }
-    for name, shape in wanted.items():
-        found = np.shape(getattr(tracks, name))
-        if found != shape:
-            return f"tracks.{name} has shape {found}, not {shape}", "give every track every step"
+    widths = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
+    expected = {name: (count, steps, *width) for name, width in widths.items()} | {"kind": (count,)}
+    for name, shape in expected.items():
+        given = np.shape(getattr(tracks, name))
+        if given != shape:
+            return f"tracks.{name} has shape {given}, not {shape}", "give every track every step"
     if recording.seen is not None and np.shape(recording.seen) != (count, steps):
         return (
             f"seen has shape {np.shape(recording.seen)}, not {(count, steps)}",
@@ -315,13 +297,13 @@ def _check_ego(recording: Recording, capacity: Capacity) -> Finding:
 
 
 def _here(recording: Recording) -> Float[Array, "3"]:
-    """Where the ego is at the current step."""
+    """Position of the ego at the current step."""
     now = recording.ego, recording.current_step
     return np.append(recording.tracks.xy[now], recording.tracks.z[now])
 
 
 def _check_extent(recording: Recording, capacity: Capacity) -> Finding:
-    """Valid numbers of any size would need memory of any size, and would not fit into float32."""
+    """Positions and speeds of any size would not fit into memory or float32."""
     tracks, here = recording.tracks, _here(recording)
     places = np.concatenate((tracks.xy[tracks.valid], tracks.z[tracks.valid][:, None]), axis=1)
     if np.abs(places - here).max() > EXTENT_M:

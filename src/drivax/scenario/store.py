@@ -5,12 +5,11 @@ A set is a folder::
     manifest.json        schema version, capacity, field table, shards, one entry per scenario
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
-    splits/              lists for training, validation and test, if asked for (``scenario.select.splits``)
-    scores.npz           criticality of its scenarios, if they were chosen by it (``curation.subset``)
+    splits/              lists for training, validation and test (``scenario.select.splits``)
+    scores.npz           criticality scores by which the scenarios were selected (``curation.subset``)
 
 Any tool reads a shard with ``numpy.load(path, mmap_mode="r")``; record ``i`` lies at a fixed offset, so one
-scenario is one range read. Sets appear under their name only when they are complete. Numpy only, so that
-worker processes never import JAX.
+scenario is one range read. A set appears under its name only when it is complete. This module needs no JAX.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from typing import IO, Any, Self
 import numpy as np
 
 from drivax.errors import DataError, UsageError
-from drivax.files import PartialFolder, sync_and_close, write_json
+from drivax.files import PartialFolder, check_output, sync_and_close, write_json
 from drivax.scenario.schema import (
     SCHEMA_VERSION,
     Capacity,
@@ -48,18 +47,18 @@ _HEADER_LIMIT = 100_000
 
 
 class ScenarioWriter:
-    """Writes a scenario set; it appears under ``path`` when the ``with`` block ends without an exception.
+    """Write a scenario set; it appears as ``path`` when the ``with`` block ends without an exception.
 
     Args:
         path: Folder to create.
-        capacity: Padded sizes that all scenarios of the set share.
-        source: Where the scenarios come from, as plain JSON values; may be completed until the block ends.
+        capacity: Padded sizes of all scenarios.
+        source: Origin of the scenarios, as JSON values; may be completed until the block ends.
         shard_size: Records per shard.
         overwrite: Replace an existing scenario set; other folders are never replaced.
-        shares: Percentages of train, validation and test for the files of ``splits/``; None: no such files.
-        identity: What is written, for a set that can be continued: closed shards outlive an exception or a kill, and
-            the next writer with the same identity begins after them (:attr:`notes`).
-        further: Called with the folder of the whole set before it gets its name, to write what else it shall hold.
+        shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
+        identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
+            next writer with the same identity continues after them (:attr:`notes`).
+        further: Called with the complete folder before it is published, to write additional files.
 
     Raises:
         UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
@@ -84,7 +83,7 @@ class ScenarioWriter:
         self.overwrite = overwrite
         self._refuse_existing()
         self.source: dict[str, Any] = plain(dict(source or {}))
-        #: What :meth:`add` was told with the last scenario of every shard that an earlier writer closed.
+        #: Notes given to :meth:`add` with the last scenario of every shard that an earlier writer closed.
         self.notes: list[Any] = []
         self._shard_size = shard_size
         self._shares = shares
@@ -98,45 +97,38 @@ class ScenarioWriter:
         self._partial = PartialFolder(self.path, identity)
 
     def __enter__(self) -> Self:
-        for part in self._partial.open(anew=self.overwrite):
-            if (
-                part["shard"]["count"] < self._shard_size
-            ):  # closed by the end of the data: that end comes again
+        for part in self._partial.open(restart=self.overwrite):
+            if part["shard"]["count"] < self._shard_size:  # The last shard of the data is written again.
                 break
             self._shards.append(part["shard"])
             self._entries += part["scenarios"]
             self.notes.append(part["note"])
         self._known = {_key(entry) for entry in self._entries}
         names = {name for shard in self._shards for name in (shard["file"], crc_name(shard["file"]))}
-        for left in self._partial.content.iterdir():  # of a shard that was never closed
-            if left.name not in names:
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
+        for entry in self._partial.content.iterdir():  # Remove a shard that was never closed.
+            if entry.name not in names:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return self
 
     @property
     def folder(self) -> Path:
-        """Where the set is being made; for files that are needed until it is complete."""
+        """The hidden folder that holds the set and temporary files until it is complete."""
         return self._partial.root
 
     @property
     def room(self) -> int:
-        """How many more scenarios the current shard holds."""
+        """Number of scenarios that still fit into the current shard."""
         return self._shard_size - len(self._crcs)
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __contains__(self, key: object) -> bool:
-        """Whether a scenario is in the set, by its (dataset, scenario id)."""
+        """Return whether a scenario is in the set, by its (dataset, scenario id)."""
         return key in self._known
 
     def add(self, scenario: Scenario, note: Any = None) -> None:
-        """Append one scenario.
-
-        Args:
-            scenario: What to append.
-            note: What :attr:`notes` shall tell a later writer if this scenario fills its shard, as JSON values.
-        """
+        """Append a scenario; a later writer finds ``note`` in :attr:`notes` if the scenario fills its shard."""
         if scenario.capacity != self.capacity:
             raise UsageError(
                 f"capacity is {scenario.capacity.name!r}, the set's is {self.capacity.name!r}",
@@ -220,7 +212,7 @@ class ScenarioWriter:
         write_json(self._partial.content / MANIFEST, manifest)
         if self._further is not None:
             self._further(self._partial.content)
-        self._refuse_existing()  # someone may have written it in the meantime
+        self._refuse_existing()  # Another process may have written it in the meantime.
         self._partial.publish()
 
     def _refuse_existing(self) -> None:
@@ -231,19 +223,16 @@ class ScenarioWriter:
             return
         if not (path / MANIFEST).is_file():
             raise UsageError("exists and is not a scenario set", file=path, cure="choose another name")
-        if not self.overwrite:
-            raise UsageError("exists already", file=path, cure="choose another name or pass --overwrite")
+        check_output(path, self.overwrite, folder=True)
 
 
 class ScenarioSet(Sequence[Scenario]):
-    """A scenario set opened for reading: memory-mapped, every record's checksum tested when first touched.
+    """A memory-mapped scenario set; the checksum of a record is tested when it is first read.
 
     Attributes:
-        path: The folder.
         capacity: Padded sizes of all records.
-        entries: The manifest's entry of every scenario (see :func:`manifest_entry`).
-        manifest: The whole manifest.
-        verify: Whether checksums are tested.
+        entries: Manifest entry of every scenario (:func:`manifest_entry`).
+        verify: Whether to test checksums.
     """
 
     def __init__(self, path: str | Path, manifest: dict[str, Any], verify: bool = True) -> None:
@@ -258,11 +247,11 @@ class ScenarioSet(Sequence[Scenario]):
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
-        """Open a set and check that it is whole (checksums follow when records are read).
+        """Open a set and check its manifest and the size and layout of its shards.
 
         Raises:
-            DataError: Manifest missing, damaged or of another version; a shard missing, cut short or laid out
-                otherwise.
+            DataError: The manifest is missing, damaged or of another version; a shard is missing, truncated or laid
+                out differently.
         """
         opened = cls(path, read_manifest(Path(path)), verify)
         if len(opened.entries) != int(opened._starts[-1]):
@@ -279,7 +268,7 @@ class ScenarioSet(Sequence[Scenario]):
         return len(self.entries)
 
     def __getitem__(self, index: Any) -> Any:
-        """One scenario (a view of the file), or a list of them for a slice."""
+        """Return a scenario (a view of the file), or a list for a slice."""
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         shard, row = self._locate(int(index))
@@ -298,50 +287,48 @@ class ScenarioSet(Sequence[Scenario]):
         return (self[index] for index in range(len(self)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return ScenarioSet.open, (self.path, self.verify)  # a worker maps the files itself
+        return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
 
     @property
     def hash(self) -> str:
-        """Identity of the data: SHA-256 (hex) over the checksums of the shards."""
-        return hashlib.sha256(
-            "".join(shard["sha256"] for shard in self.manifest["shards"]).encode()
-        ).hexdigest()
+        """SHA-256 (hex) over the checksums of the shards."""
+        digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
+        return hashlib.sha256(digests.encode()).hexdigest()
 
     def records(self, indices: Any, out: np.ndarray[Any, Any] | None = None) -> np.ndarray[Any, Any]:
-        """Copies of many records at once: structured array ``[n]``, in the order of ``indices``.
+        """Copy records into a structured array ``[n]``, in the order of ``indices``.
 
         Args:
-            indices: Which; negative ones count from the end.
-            out: Where to put them: what an earlier call of as many returned. A loader that reads batch after batch
-                reads twice as fast into the same memory.
+            indices: Negative ones count from the end.
+            out: Result of an earlier call with as many indices, to be filled again; twice as fast as new memory.
 
         Raises:
-            IndexError: There is no such scenario.
+            IndexError: An index is out of range.
             DataError: A record is damaged.
         """
-        wanted = np.asarray(indices, np.int64).reshape(-1)
+        index = np.asarray(indices, np.int64).reshape(-1)
         total = len(self)
-        if wanted.size and (wanted.min() < -total or wanted.max() >= total):
+        if index.size and (index.min() < -total or index.max() >= total):
             raise IndexError(f"scenario indices must be in [-{total}, {total})")
-        wanted = np.where(wanted < 0, wanted + total, wanted)
+        index = np.where(index < 0, index + total, index)
         if out is None:
-            out = np.empty(wanted.size, self._dtype)
-        if out.shape != wanted.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
+            out = np.empty(index.size, self._dtype)
+        if out.shape != index.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
             raise UsageError(
-                "out has not the size and type of the records", file=self.path, cure="leave it out"
+                "out does not have the size and type of the records", file=self.path, cure="leave it out"
             )
-        data = out.view(np.uint8).reshape(wanted.size, self._dtype.itemsize)
-        owner = np.searchsorted(self._starts, wanted, side="right") - 1
-        # One contiguous copy each, right after the test that brought it into the cache; take() is slower.
-        for place, (shard, index) in enumerate(zip(owner.tolist(), wanted.tolist(), strict=True)):
-            data[place] = self._shards[shard].record(index - int(self._starts[shard]), self.verify)
+        data = out.view(np.uint8).reshape(index.size, self._dtype.itemsize)
+        shards = np.searchsorted(self._starts, index, side="right") - 1
+        # A contiguous copy right after the test that brought the record into the cache; take() is slower.
+        for row, (shard, number) in enumerate(zip(shards.tolist(), index.tolist(), strict=True)):
+            data[row] = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         return out
 
     def check(self) -> None:
-        """Read everything: every record's CRC and every shard's SHA-256.
+        """Test the CRC of every record and the SHA-256 of every shard.
 
         Raises:
-            DataError: The first damaged record or shard.
+            DataError: A record or shard is damaged.
         """
         for shard in self._shards:
             for row in range(shard.count):
@@ -357,7 +344,7 @@ class ScenarioSet(Sequence[Scenario]):
 
 
 class Shard:
-    """One shard file: its expected layout, its memory map, and which records were found intact."""
+    """A shard file: expected layout, memory map, and a mask of the records that passed their checksum."""
 
     def __init__(self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any]) -> None:
         self.path = folder / entry["file"]
@@ -370,7 +357,7 @@ class Shard:
         self._intact = np.zeros(self.count, bool)
 
     def check_files(self) -> int:
-        """Test presence, layout and size; returns the offset of the first record."""
+        """Test presence, layout and size; return the offset of the first record."""
         for path in (self.path, self.crc_path):
             if not path.is_file():
                 raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
@@ -391,11 +378,7 @@ class Shard:
         return offset
 
     def record(self, row: int, verify: bool) -> np.ndarray[Any, Any]:
-        """The bytes of a record ``[itemsize]``, a view of the file; tested at its first use, if asked for.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
         data = self._map() if self._data is None else self._data
         if verify and not self._intact[row]:
             self._test(data, row)
@@ -410,7 +393,7 @@ class Shard:
     def _map(self) -> np.ndarray[Any, Any]:
         offset = self.check_files()
         shape = (self.count, self._dtype.itemsize)
-        # A plain view of the map: memmap's own indexing costs Python time per access.
+        # A plain view: indexing a memmap costs Python time.
         self._data = np.asarray(np.memmap(self.path, np.uint8, "r", offset, shape))
         with self.crc_path.open("rb") as file:
             shape, dtype = read_header(file, self.crc_path)
@@ -436,7 +419,7 @@ def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def manifest_entry(scenario: Scenario) -> dict[str, Any]:
-    """What the manifest says about one scenario."""
+    """Return the manifest entry of a scenario."""
     return {
         "scenario_id": scenario.id,
         "dataset": scenario.text("dataset"),
@@ -451,7 +434,7 @@ def manifest_entry(scenario: Scenario) -> dict[str, Any]:
 
 
 def field_table(capacity: Capacity) -> list[dict[str, Any]]:
-    """The manifest's description of a record: name, dtype, shape and byte offset of every field."""
+    """Return name, dtype, shape and byte offset of every field of a record."""
     offsets = {name: entry[1] for name, entry in (record_dtype(capacity).fields or {}).items()}
     return [
         {"name": name, "dtype": np.dtype(kind).str, "shape": list(shape), "offset": offsets[name]}
@@ -460,14 +443,14 @@ def field_table(capacity: Capacity) -> list[dict[str, Any]]:
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """The checked manifest of the set at ``path``.
+    """Read and check the manifest of the set at ``path``.
 
     Raises:
         DataError: No such folder, no manifest, damaged JSON, a missing key, another schema version or layout.
     """
     file = path / MANIFEST
     if not path.is_dir():
-        problem = "is not a scenario set (a folder)" if path.exists() else "does not exist"
+        problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"
         raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
     if not file.is_file():
         raise DataError(
@@ -514,12 +497,12 @@ def _need(rows: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
 
 
 def shard_name(number: int) -> str:
-    """File name of a shard."""
+    """Return the file name of a shard."""
     return f"shard-{number:05d}.npy"
 
 
 def crc_name(shard: str) -> str:
-    """File name of the checksums of the shard in file ``shard``."""
+    """Return the file name of the checksums of a shard file."""
     return shard.removesuffix(".npy") + ".crc.npy"
 
 
@@ -531,7 +514,7 @@ def write_header(file: IO[bytes], dtype: np.dtype[Any], count: int) -> None:
 
 
 def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and dtype that a ``.npy`` file names; leaves ``file`` at the first byte of data.
+    """Read shape and dtype of a ``.npy`` file; leaves ``file`` at the first byte of data.
 
     Raises:
         DataError: The header is damaged.
@@ -545,7 +528,7 @@ def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[
 
 
 def plain(value: Any) -> Any:
-    """The value as strict JSON: numpy scalars unpacked, paths as text, NaN and infinities as null."""
+    """Return a value as strict JSON: NumPy scalars unpacked, paths as text, NaN and infinities as null."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -221,9 +221,7 @@ def _speed(frame: Frame) -> Float[Array, " S"]:
     return norm(frame.velocity)
 
 
-def _rates(
-    history: Float[Array, "16 4"],
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _rates(history: Float[Array, "16 4"]) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)

@@ -32,7 +32,7 @@ from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
@@ -203,7 +203,7 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
             cure="give a multiple",
         )
     traffic = find_traffic(config.traffic)
-    return Simulator(config.task, traffic), spread(prepared(traffic, bank))
+    return Simulator(config.task, traffic), spread(prepare_bank(traffic, bank))
 
 
 def spread(bank: ScenarioBank) -> ScenarioBank:

@@ -22,7 +22,7 @@ from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import top_rows
 from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
-from drivax.evaluation.stored import read_evaluation
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import write_text
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
@@ -284,7 +284,7 @@ def findings(
     rare, labels, share = rare_rows(config, test), clusters(test), ordinary_share(sets)
     drives = {name: driven(config, out, name) for name in (*config.agents, BY_MEAN_Q)}
     for name in REFERENCES:
-        drove = read_evaluation(out / DRIVES / name).metrics
+        drove = EpisodeTable.read(out / DRIVES / name).metrics
         drives[name] = {metric: drove[metric][None] for metric in METRICS}
     by_mean_q = drives[BY_MEAN_Q]
     return {

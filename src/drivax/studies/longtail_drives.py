@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from drivax.curation.controls import event_kinds
 from drivax.curation.methods import Request, curate
 from drivax.errors import UsageError
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
-from drivax.evaluation.stored import read_evaluation
 from drivax.learning.policies import load_policy
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -131,7 +131,7 @@ def step_by_mean_q(run: Path) -> int:
 
 def driven(config: LongtailConfig, out: Path, agent: str) -> dict[str, Float[np.ndarray, "seed scenario"]]:
     """What the agents of one name did in the test, by metric, in the order of the test set."""
-    tables = [read_evaluation(drive_of(out, agent, seed)) for seed in range(config.seeds)]
+    tables = [EpisodeTable.read(drive_of(out, agent, seed)) for seed in range(config.seeds)]
     return {name: np.stack([table.metrics[name] for table in tables]) for name in tables[0].metrics}
 
 

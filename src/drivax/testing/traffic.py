@@ -14,7 +14,8 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import alone, logged_history
 from drivax.simulator.types import AgentContext, Traffic
 from drivax.tasks.observations import View
@@ -63,7 +64,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     """
     traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
     what = f"traffic {traffic.name!r}"
-    bank = prepared(traffic, worlds.worlds())
+    bank = prepare_bank(traffic, worlds.worlds())
     _check_state(what, traffic, bank)
     index, program = jnp.arange(len(bank)), Program(what, _driven(traffic), (None, 0))
     seen: _Seen = program.check_pure(bank, index)
@@ -71,7 +72,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     there = seen.rows[..., AgentColumn.VALID] > 0
 
     def told(change: Callable[[ScenarioBank], ScenarioBank]) -> Any:
-        return program(prepared(traffic, change(worlds.worlds())), index).rows
+        return program(prepare_bank(traffic, change(worlds.worlds())), index).rows
 
     check_numbers(what, told(worlds.deserted))
     known = np.where(there[..., None], seen.rows, 0.0)
@@ -101,7 +102,7 @@ def check_traffic(traffic: Traffic | str) -> None:
         "the agents stand in another order",
         "let no agent's motion follow from its slot",
     )
-    turned = program(prepared(traffic, worlds.worlds(ANGLE)), index)
+    turned = program(prepare_bank(traffic, worlds.worlds(ANGLE)), index)
     check_turned(what, _from_ego(seen), _from_ego(turned))
 
 

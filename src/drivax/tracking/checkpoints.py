@@ -27,7 +27,7 @@ from drivax.files import write_text
 
 ABOUT = "about.json"
 #: Fields of training states that checkpoints of version 0.1.0 store under another name.
-_RENAMED_FIELDS = {"scene": "context"}
+_RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
 _CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)

@@ -135,4 +135,4 @@ class EmergencyBrake:
         wanted = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
         brake = self.actions.action(motion, wanted, jnp.zeros(()), me[LENGTH])
         chosen = jnp.where(is_emergency(fault_s, speed, self.config), brake, action)
-        return self.actions.actuated(motion, chosen, context.action), carry
+        return chosen, carry

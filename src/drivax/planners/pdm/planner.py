@@ -166,7 +166,6 @@ class PdmPlanner:
         steering = jnp.where(brakes, 0.0, weighed.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
-        action = self.actions.actuated(motion, action, context.action)
         return action, Memory(carry.touched, acceleration, steering)
 
     def weigh(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> Weighed:

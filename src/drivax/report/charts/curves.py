@@ -1,19 +1,21 @@
-"""Learning curves as inline SVG: small charts, one per quantity, one line per training run."""
+"""Learning curves as inline SVG, and the axes of all charts: scales, round ticks, legends."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from drivax.evaluation.results import SHARES
-from drivax.report.charts.axes import Axes, compact, series_legend, ticks
+from drivax.evaluation.episode_table import SHARES
 from drivax.report.pictures.palette import Stroke, stroke
 from drivax.report.runs import Training
 
+WIDTH, HEIGHT = 380, 210
+_RIGHT, _TOP, _BOTTOM = 12, 10, 34
 Points = Float[np.ndarray[Any, Any], "point 2"]
 #: A longer line is averaged into this many bins.
 _MOST_POINTS = 150
@@ -82,3 +84,73 @@ def _charts(names: Sequence[str], runs: Sequence[Training]) -> str:
         share = name.split("/")[-1] in (*SHARES, "progress_ratio")
         drawn.append(chart(name, lines, share, across="environment steps"))
     return f"<div class=charts>{''.join(drawn)}</div>"
+
+
+class Axes:
+    """Maps data to the drawing; ``left`` is the margin of the vertical axis, pixels."""
+
+    def __init__(self, x0: float, x1: float, y0: float, y1: float, left: int) -> None:
+        self.x0, self.x1, self.y0, self.y1, self.left = x0, x1, y0, y1, left
+
+    def x(self, value: Any) -> Any:
+        """Return the horizontal place of a value, pixels."""
+        return self.left + (value - self.x0) / (self.x1 - self.x0) * (WIDTH - self.left - _RIGHT)
+
+    def y(self, value: Any) -> Any:
+        """Return the vertical place of a value, pixels."""
+        return HEIGHT - _BOTTOM - (value - self.y0) / (self.y1 - self.y0) * (HEIGHT - _BOTTOM - _TOP)
+
+    def path(self, points: Any) -> str:
+        """Return points ``[n, 2]`` as an SVG path."""
+        return " ".join(f"{self.x(x):.1f},{self.y(y):.1f}" for x, y in points)
+
+    def horizontal(self, value: float, text: str) -> str:
+        """Return a grid line with its label."""
+        y = self.y(value)
+        return (
+            f'<line class="grid" x1="{self.left}" x2="{WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text x="{self.left - 6}" y="{y + 4:.1f}" text-anchor="end">{text}</text>'
+        )
+
+    def mark(self, value: float) -> str:
+        """Return a label of the horizontal axis."""
+        y = HEIGHT - _BOTTOM + 15
+        return f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{compact(value)}</text>'
+
+    def figure(self, title: str, shapes: Iterable[str], across: str, facts: str = "") -> str:
+        """Return the chart: a caption (``facts`` is HTML), shapes, and words below the horizontal axis."""
+        middle = (self.left + WIDTH - _RIGHT) / 2
+        return (
+            f"<figure class=chart><figcaption>{escape(title)}{facts}</figcaption>"
+            f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(shapes)}'
+            f'<text x="{middle:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(across)}</text></svg></figure>'
+        )
+
+
+def ticks(low: float, high: float, most: int) -> list[float]:
+    """Return evenly spaced round numbers that enclose ``[low, high]``: steps of 1, 2 or 5 times a power of ten."""
+    if high - low < 1e-12 * max(1.0, abs(low), abs(high)):
+        pad = max(0.5 * abs(low), 0.5)
+        low, high = low - pad, high + pad
+    rough = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * (1 - 1e-9))
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [step * place for place in range(first, last + 1)]
+
+
+def compact(value: float) -> str:
+    """Return a number in few letters: ``1.5M``, ``20k``, ``0.25``."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:.4g}{letter}".replace("-", "−")
+    return "0" if abs(value) < 1e-12 else f"{value:.4g}".replace("-", "−")
+
+
+def series_legend(names: Sequence[str]) -> str:
+    """Return the legend of charts: names in the order of their strokes."""
+    items = "".join(
+        f'<li><i style="background:{stroke(place).key}"></i>{escape(name)}</li>'
+        for place, name in enumerate(names)
+    )
+    return f"<ul class=series>{items}</ul>"

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.evaluation.tables import metric_label
-from drivax.report.charts.axes import Axes, compact, series_legend, ticks
-from drivax.report.charts.curves import chart
+from drivax.report.charts.curves import Axes, chart, compact, series_legend, ticks
 from drivax.report.pictures.palette import Stroke, stroke
 from drivax.report.runs import Evaluation
 

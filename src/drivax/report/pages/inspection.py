@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 
 from drivax.files import check_output, write_text
-from drivax.report.charts.axes import series_legend
+from drivax.report.charts.curves import series_legend
 from drivax.report.charts.distributions import histogram, short
 from drivax.report.inspection import QUANTITIES, Inspection, speeds
 from drivax.report.inspection_tables import Counts, content_table, of_all, true_findings

@@ -1,16 +1,38 @@
-"""The frame of every page: one HTML file that carries its styles, scripts and data."""
+"""The frame of every page: one HTML file that carries its styles, scripts and data; and the player as HTML."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import metadata, resources
 from string import Template
 from typing import Any
 
-from drivax.report.pictures.palette import THEMES
+from drivax.report.charts.motion import COMMANDS, SIGNALS
+from drivax.report.pictures.drawing import EVENT_WORDS, GOAL_M, LIGHTS, STOP_M, WIDTHS
+from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
 from drivax.table import Cell, Column, Table
+
+KEYS = (
+    ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
+    ("+ −", "zoom"), ("f", "follow or whole episode"), ("n p", "next and previous episode"),
+)  # fmt: skip
+_CONTROLS = """<div class=controls>
+<button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
+<button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
+<button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
+<div class=track><div class=ticks data-control=ticks></div>
+<input type=range min=0 max=90 value=0 step=1 data-control=scrub aria-label="time"></div>
+<span class=clock data-control=clock></span>
+<select data-control=speed aria-label="speed" title="speed ([ and ])">
+<option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
+<option value=2>2×</option><option value=4>4×</option></select>
+<button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
+<button type=button data-control=fit aria-pressed=false title="show the whole episode (f)">whole</button>
+<button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
+<button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
+</div>"""
 
 
 def page(
@@ -65,3 +87,46 @@ def _colours() -> str:
     light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
                    for name in ("light", "dark"))  # fmt: skip
     return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
+
+
+def player_html() -> str:
+    """Return stage, controls, legend, keys and plots."""
+    legend = "".join(_legend_item(name, words) for name, words in LEGEND)
+    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
+    return (
+        f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        "<noscript><p>The player needs JavaScript, which this page carries with it.</p></noscript>"
+        "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
+        "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
+        "the executed ones: acceleration (or metres ahead) and steering (or metres to the left), as shares of the "
+        "maximum of the action space.</small></p>"
+    )
+
+
+def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return script elements with styles, signals and packed episodes (``report.pictures.player_data``)."""
+    style = {
+        "themes": {name: dict(theme) for name, theme in THEMES.items()},
+        "widths": dict(WIDTHS),
+        "radii": {"stop": STOP_M, "goal": GOAL_M},
+        "lights": LIGHTS,
+        "events": dict(EVENT_WORDS),
+        "signals": [
+            {"words": signal.title, "unit": signal.unit, "step": signal.step, "limits": signal.limits}
+            for signal in (*SIGNALS, *COMMANDS)
+        ],
+        "strokes": [[stroke.colour, stroke.dash, stroke.key] for stroke in STROKES],
+    }
+    packed = (data_element(episode, **{"class": "episode"}) for episode in episodes)
+    return [data_element(style, id="style"), *packed]
+
+
+def player_scripts() -> list[str]:
+    """Return the programs of plots and player; the plots listen to the player, so they come first."""
+    return [asset("plots.js"), asset("player.js")]
+
+
+def _legend_item(name: str, words: str) -> str:
+    sign = "✕" if name == "mark" else ""
+    fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
+    return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'

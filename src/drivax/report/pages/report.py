@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.stored import ScenarioKey, comparable, mismatch
+from drivax.evaluation.episode_table import ScenarioKey
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import (
+    COLLISION_KINDS,
     CONFIDENCE,
+    collisions_table,
     differences_table,
     headline,
     metric_label,
@@ -24,16 +27,14 @@ from drivax.evaluation.tables import (
     summarise,
 )
 from drivax.files import check_output, write_text
-from drivax.report.breakdowns import Tags, collision_section, strata_section, transfer_section
 from drivax.report.charts.curves import curve_sections
 from drivax.report.charts.distributions import distribution_charts
-from drivax.report.episode_selection import EpisodeGroup, choose
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, rollouts_of
 from drivax.report.pages.episode_list import EPISODE_LIST, episode_data
-from drivax.report.pages.page import asset, facts_html, page
-from drivax.report.pages.player import player_data, player_html, player_scripts
+from drivax.report.pages.page import asset, facts_html, page, player_data, player_html, player_scripts
 from drivax.report.pictures.player_data import pack_episode
-from drivax.report.rollouts import EvaluatedSet, rollouts_of
 from drivax.report.runs import Evaluation, Training, read_runs
+from drivax.report.table_files import Tags, strata_tables, transfer_tables
 from drivax.table import bounds, number, suffix
 
 EPISODES = 12
@@ -88,8 +89,8 @@ def _page(runs: Sequence[Evaluation], trainings: Sequence[Training], packed: Pac
     sections, data, scripts = [], [], []
     if runs:
         sections = [
-            _results(runs), _differences(runs), transfer_section(runs), collision_section(runs),
-            strata_section(runs, tags), _distributions(runs), _episodes(runs, packed),
+            _results(runs), _differences(runs), _transfer(runs), _collisions(runs),
+            _strata(runs, tags), _distributions(runs), _episodes(runs, packed),
         ]  # fmt: skip
         played: dict[ScenarioKey, int] = {group.key: place for place, (group, _) in enumerate(packed)}
         data = player_data([episode for _, episode in packed]) if packed else []
@@ -118,7 +119,7 @@ def _lead(runs: Sequence[Evaluation]) -> str:
                 f"<p class=lead><b>{name}</b> {words} <b>{share}</b> ({bounds(interval, 'rate')}) of {interval.n} "
                 f"{'episode' if interval.n == 1 else 'episodes'} of {where}, {escape(policy.traffic)} traffic.</p>"
             )
-    return f"<p class=lead><b>{name}</b>: {policy.episodes} episodes of {where}.</p>"
+    return f"<p class=lead><b>{name}</b>: {len(policy)} episodes of {where}.</p>"
 
 
 def _results(runs: Sequence[Evaluation]) -> str:
@@ -173,6 +174,56 @@ def _differences(runs: Sequence[Evaluation]) -> str:
         "recordings. “Better” and “worse”: the interval excludes zero; it is not widened for the number of "
         "comparisons. “All equal”: no pair differs from the next, so that a bootstrap has no width."
         "</small></p></section>"
+    )
+
+
+def _transfer(runs: Sequence[Evaluation]) -> str:
+    """Return the results by training and evaluation data; empty where all runs share one set."""
+    tables = "".join(
+        f"<h3>{escape(metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
+        for table in transfer_tables(runs)
+    )
+    return (
+        f"<section><h2>Transfer</h2>{tables}<p><small>Rows: planners and their training data (– where nothing was "
+        "trained, or the run does not say). Columns: evaluation data. Sets differ in difficulty: compare along a "
+        "column.</small></p></section>"
+        if tables
+        else ""
+    )
+
+
+def _collisions(runs: Sequence[Evaluation]) -> str:
+    """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
+    table = collisions_table(runs)
+    if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
+        return ""
+    meanings = "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(meaning[:1].upper() + meaning[1:])}.</dd></div>"
+        for name, meaning in COLLISION_KINDS.values()
+    )
+    total = ", ".join(
+        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
+        for run in runs
+        if "collision_type" in run.metrics
+    )
+    return (
+        f"<section><h2>Kinds of collision</h2><p>Episodes with a collision: {total}.</p>{table.html()}"
+        f"<dl class=metrics>{meanings}</dl><p><small>{escape(table.caption)} (Wilson's).</small></p></section>"
+    )
+
+
+def _strata(runs: Sequence[Evaluation], tags: Tags) -> str:
+    """Return the results by kind of scenario; empty without tags."""
+    tables = "".join(
+        f"<details{'' if place else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
+        f"{table.html()}</details>"
+        for place, table in enumerate(strata_tables(runs, tags))
+    )
+    return (
+        f"<section><h2>By kind of scenario</h2>{tables}<p><small>Tags describe the log. Small strata have wide "
+        "intervals; of many cells, some stand out by chance.</small></p></section>"
+        if tables
+        else ""
     )
 
 
@@ -239,7 +290,7 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
     rows = []
     for run in runs:
         data = run.data if isinstance(run, Evaluation) else {}
-        command, versions = run.about.get("command"), run.about.get("versions")
+        command, versions = run.info.get("command"), run.info.get("versions")
         texts = (
             " ".join(map(str, command)) if isinstance(command, list) else str(command or ""),
             f"{data.get('path', '')} {str(data.get('hash') or '')[:12]}".strip(),
@@ -247,7 +298,7 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
         )
         rows.append((run.name, [text or "–" for text in texts]))
     settings = "".join(
-        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.about), indent=1, ensure_ascii=False))}</pre>"
+        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.info), indent=1, ensure_ascii=False))}</pre>"
         for run in runs
     )
     return (

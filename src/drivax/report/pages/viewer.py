@@ -12,14 +12,12 @@ import numpy as np
 from drivax.curation.scores import ScoreTable
 from drivax.errors import UsageError, did_you_mean
 from drivax.files import check_output, write_text
-from drivax.report.charts.axes import series_legend
-from drivax.report.charts.curves import chart
-from drivax.report.pages.page import asset, page
-from drivax.report.pages.player import player_data, player_html, player_scripts
+from drivax.report.charts.curves import chart, series_legend
+from drivax.report.episodes import logged_motion
+from drivax.report.pages.page import asset, page, player_data, player_html, player_scripts
 from drivax.report.pictures.drawing import Rollout
 from drivax.report.pictures.palette import stroke
 from drivax.report.pictures.player_data import pack_episode
-from drivax.report.rollouts import logged_motion
 from drivax.scenario.schema import DT_S, Scenario
 from drivax.scenario.store import ScenarioSet
 

@@ -13,11 +13,10 @@ import numpy as np
 
 from drivax.errors import UsageError, did_you_mean, missing_package
 from drivax.files import atomic_write, check_output
-from drivax.report.episode_selection import EpisodeGroup, ranked
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, ranked, rollouts_of
 from drivax.report.pictures.drawing import Rollout, with_traffic_of
 from drivax.report.pictures.frames import Canvas, Picture, Scenery, draw_frame, legend_strip
 from drivax.report.pictures.palette import THEMES, rgb
-from drivax.report.rollouts import EvaluatedSet, rollouts_of
 from drivax.report.runs import Evaluation, read_evaluations
 from drivax.scenario.schema import Scenario
 

@@ -1,8 +1,8 @@
-"""What a step needs to know of the lane graph: strands of road, which lie side by side, and which end or join another.
+"""Strands of lanes: their neighbours, and the strands that they merge onto.
 
-A strand is a sequence of lanes that lead straight on into each other. Where several lanes begin or end, the one
-whose course changes least goes on; the others are strands of their own. Passing along a strand is nothing,
-passing to a strand beside it is a lane change (``scenario.bank.passages``).
+A strand is a sequence of lanes that continue each other. Where several lanes begin or end, the lane with the smallest
+change of course continues the strand; the others belong to other strands. Passing to an adjacent strand is a lane
+change (``scenario.bank.passages``).
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from drivax.scenario.schema import Scenario
 
 Array = np.ndarray[Any, Any]
 
-#: Coordinates of an end that does not exist, m.
+#: Coordinates of missing ends, m.
 NOWHERE_M = 1e6
-#: Lanes are looked at so far before their ends and behind their beginnings, m; headings right at the ends this far.
+#: Stretch of a lane at its ends that decides its course, and distance from the ends for headings, m.
 _BEND_M, _END_M = 20.0, 1.0
-#: What counts as the turn onto a lane of which the part that would tell is not stored, rad.
+#: Turn onto a lane of which that stretch is not stored, rad.
 _UNKNOWN = 100.0
-#: Lanes that meet in one merge where they run within this angle of each other so far before; others cross or turn in.
+#: Lanes that meet merge if their headings differ by less 20 m before; others cross or turn in.
 _MERGING_RAD = np.deg2rad(30.0)
-#: A lane beside one that ends goes on if it reaches further than this, m.
+#: An adjacent lane continues beyond the end of a lane if it reaches further than this, m.
 _ON_M = 10.0
-#: Further from the box around ego's log than this lanes may end because the map was cropped there, m.
+#: Distance from the box of the ego's log beyond which lanes may end at the crop of the map, m.
 _KNOWN_M = 95.0
-#: Lanes are longer than they are drawn by at most this (height, rounding), m, and all are shorter than a key.
+#: Largest excess of the length of a lane over its drawing (height, rounding), and upper bound of lengths, m.
 _SLACK_M, _KEY_M = 1.0, 1e6
 
 
 def lane_codes(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
-    """The table of a scenario, a row per stored lane; see the columns of this module.
+    """Return the table :class:`StrandColumn` of a scenario, a row per stored lane.
 
-    A strand is named by its last lane, or by the highest one of a ring. It merges where its last lane leads onto
-    another strand beside which it comes in (a ramp, two lanes that become one), or ends while its neighbour goes on (a
-    lane drop). Turns that join a lane at a junction do not merge.
+    A strand is named by its last lane, or by the highest lane of a ring. It merges if its last lane leads onto another
+    strand at a small angle (a ramp, two lanes that join), or ends next to a lane that continues (a lane drop). Turns
+    that join a lane at a junction do not merge.
     """
     table = np.full((len(scenario.lane_id), 6), -1.0, np.float32)
     table[:, StrandColumn.END] = NOWHERE_M
@@ -62,13 +62,13 @@ def lane_codes(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
     stop, course = courses.stop, np.stack([np.cos(courses.end), np.sin(courses.end)], axis=1)
     stops = (successor < 0).all(axis=1) & _known(scenario, stop)
     for side in ("lane_right", "lane_left"):
-        beside = getattr(scenario, side)[:count].astype(np.int64)
-        further = ((stop[last[beside]] - stop) * course).sum(axis=1)
-        # What is not stored lies beyond the crop.
-        goes_on = (beside >= 0) & ((successor[last[beside]] >= 0).any(axis=1) | ~(further <= _ON_M))
-        onto = np.where(stops & goes_on, strand[beside], onto)
+        adjacent = getattr(scenario, side)[:count].astype(np.int64)
+        further = ((stop[last[adjacent]] - stop) * course).sum(axis=1)
+        # Lanes that are not stored lie beyond the crop.
+        goes_on = (adjacent >= 0) & ((successor[last[adjacent]] >= 0).any(axis=1) | ~(further <= _ON_M))
+        onto = np.where(stops & goes_on, strand[adjacent], onto)
         column = StrandColumn.LEFT if side == "lane_left" else StrandColumn.RIGHT
-        table[:count, column] = np.where(beside >= 0, strand[beside], -1)
+        table[:count, column] = np.where(adjacent >= 0, strand[adjacent], -1)
     onto = np.where(follows[last] < 0, onto[last], -1)
     table[:count, StrandColumn.STRAND], table[:count, StrandColumn.ONTO] = strand, onto
     table[:count, StrandColumn.END] = np.where(onto[:, None] >= 0, stop[last], NOWHERE_M)
@@ -77,7 +77,7 @@ def lane_codes(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
 
 @dataclass(frozen=True)
 class _Courses:
-    """How lanes run at their ends; NaN where that part is not stored. Lanes shorter than 20 m are looked at whole.
+    """Courses of lanes at their ends; NaN where that stretch is not stored.
 
     Attributes:
         begin, end: Headings, rad.
@@ -95,7 +95,7 @@ class _Courses:
 
     @classmethod
     def of(cls, scenario: Scenario, count: int) -> _Courses:
-        """The courses of the first ``count`` lanes."""
+        """Return the courses of the first ``count`` lanes."""
         part = slice(int(scenario.segment_blocks[1]), int(scenario.segment_blocks[2]))
         lane = scenario.segment_lane[part].astype(np.int64)
         start = scenario.segment_start_m[part].astype(float)
@@ -106,13 +106,13 @@ class _Courses:
         row, length = np.arange(count), scenario.lane_length[:count].astype(float)
 
         def values(of: Array, arc: Array) -> Array:
-            """What the segment holds that is at an arc length of each lane."""
+            """Values of the segments at an arc length of each lane."""
             at = np.searchsorted(lane * _KEY_M + start, row * _KEY_M + arc, side="right") - 1
             stored = at >= 0
             stored[stored] = (lane[at] == row)[stored] & (arc - start[at] <= span[at] + _SLACK_M)[stored]
-            found = np.full((count, *of.shape[1:]), np.nan)
-            found[stored] = of[at[stored]]
-            return found
+            result = np.full((count, *of.shape[1:]), np.nan)
+            result[stored] = of[at[stored]]
+            return result
 
         if not len(lane):
             nothing = np.full(count, np.nan)
@@ -124,19 +124,19 @@ class _Courses:
         return cls(begin, end, early, late, before, values(b, length))
 
     def turn(self, lane: Int[Array, "*n"], onto: Int[Array, "*n"]) -> Float[Array, "*n"]:
-        """How much the course turns and changes its curvature where one lane leads onto another, rad over 20 m."""
+        """Turn and change of curvature from a lane onto another, rad over 20 m."""
         kink = np.abs(wrap(self.begin[onto] - self.end[lane]))
         return kink + _BEND_M * np.abs(self.early[onto] - self.late[lane])
 
 
 def _straightest(links: Int[Array, "lane 4"], turn: Float[Array, "lane 4"]) -> Int[Array, " lane"]:
-    """Of each lane's links the one that turns least, the first of equals and where nothing is known; -1 for none."""
+    """Link of each lane with the smallest turn, the first if equal or unknown; -1 for none."""
     turn = np.where(links >= 0, np.where(np.isnan(turn), _UNKNOWN, np.round(turn, 2)), np.inf)
     return links[np.arange(len(links)), np.argmin(turn, axis=1)]
 
 
 def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Array, " lane"]]:
-    """Name of each lane's strand, and the last lane of it (any one in a ring); the ways ahead double every time."""
+    """Strand of each lane and its last lane (any lane of a ring), by pointer doubling."""
     row = np.arange(len(follows))
     last = np.where(follows >= 0, follows, row)
     highest = np.maximum(row, last)
@@ -146,7 +146,7 @@ def _strands(follows: Int[Array, " lane"]) -> tuple[Int[Array, " lane"], Int[Arr
 
 
 def _known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
-    """Which places are so near to ego's log that the map around them is stored."""
+    """Mask of points so near to the log of the ego that the map around them is stored."""
     log = scenario.agent_xy[scenario.agent_valid[:, 0], 0]
     if not len(log):
         return np.zeros(len(xy), bool)
@@ -155,7 +155,7 @@ def _known(scenario: Scenario, xy: Float[Array, "lane 2"]) -> Array:
 
 
 def corridor_lanes(scenario: Scenario) -> Bool[np.ndarray, " lane"]:
-    """Which lanes are the route's own or their same-direction neighbours (at any distance sideways)."""
+    """Mask of lanes of the route and of their same-direction neighbours (at any distance sideways)."""
     member = np.zeros(len(scenario.lane_id), bool)
     todo = list(np.unique(scenario.route_lane[0][: int(scenario.route_points[0])]))
     while todo:

@@ -1,7 +1,4 @@
-"""From a recording to a scenario: checked, moved into the local frame, padded, indexed and routed.
-
-``assemble`` is the only way into the scenario format; readers and the built-in world produce recordings.
-"""
+"""Assembly of scenarios from recordings: checks, local frame, padding, map index and routes."""
 
 from __future__ import annotations
 
@@ -39,16 +36,16 @@ from drivax.scenario.select.tags import scenario_tags
 
 Array = np.ndarray[Any, Any]
 
-#: The map is cropped to the box of the ego's log, widened by this much.
+#: Margin of the map around the box of the ego's log.
 MARGIN_M = 100.0
-#: All lines of a map together are shorter than this; a whole city is cropped by its reader.
+#: Largest total length of map lines; readers crop the map of a city.
 MAP_M = 500_000.0
-#: Steps may differ from the median step by this much before a recording counts as jittered.
+#: Largest deviation from the median step without ``JITTERED_TIME``.
 JITTER_S = 0.002
-#: Heights that differ by less are one level: the source has no elevation.
+#: Smallest range of heights that counts as elevation.
 FLAT_M = 0.01
-#: Flags that are decided here, whatever the reader said. That lights are known is not among them: a source may know
-#: that there are none.
+#: Flags that are measured here and override those of the reader. ``LIGHTS`` is not among them: a source may know that
+#: there are no lights.
 MEASURED = (
     Flag.LANE_GRAPH
     | Flag.DEFAULT_LIMITS
@@ -73,7 +70,7 @@ _COUNTED = {
 
 
 def count_source(recording: Recording) -> SourceCounts:
-    """Counts what the source holds: every feature and every point as given, before cropping and capping."""
+    """Count the features and points of the source, before cropping and capping."""
     kinds = np.array([feature.kind for feature in recording.features], dtype=np.int64)
     tracks = recording.tracks
     return SourceCounts(
@@ -89,15 +86,15 @@ def count_source(recording: Recording) -> SourceCounts:
 def assemble(
     recording: Recording, capacity: Capacity = CAPACITIES["default"], routes: RouteStyle = "graph"
 ) -> Scenario:
-    """Turns a recording into a scenario.
+    """Assemble a scenario from a recording.
 
     Args:
-        recording: At most ``capacity.steps`` steps; cut longer ones with :func:`windows`.
-        capacity: Padded sizes; what does not fit is counted in ``overflow``, the farthest from the ego's log first.
-        routes: How candidate routes are made (``scenario.build.routes``).
+        recording: At most ``capacity.steps`` steps; cut longer recordings with ``windows``.
+        capacity: Padded sizes; the farthest items from the ego's log that do not fit are counted in ``overflow``.
+        routes: Source of candidate routes (``scenario.build.routes``).
 
     Raises:
-        DataError: The recording makes no sense; the message names what and its record.
+        DataError: The recording is invalid.
     """
     check(recording, capacity)
     try:
@@ -107,7 +104,6 @@ def assemble(
 
 
 def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Scenario:
-    """``assemble`` of a checked recording."""
     now, ego = recording.current_step, recording.ego
     origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
     tracks = local_tracks(recording.tracks, ego, origin)
@@ -160,23 +156,23 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
 
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
-    """What the source says about the intended route in dense indices, and how many of its lanes are missing."""
+    """Intended route in dense indices, and the numbers of its missing lanes."""
     index = graph.index()
-    named = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
-    found = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in named.items()}
-    missing = {f"{name}_missing": len(named[name]) - len(found[name]) for name in named}
-    return Intent(found["route_lanes"], found["route_corridor"]), missing
+    source = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
+    known = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in source.items()}
+    missing = {f"{name}_missing": len(source[name]) - len(known[name]) for name in source}
+    return Intent(known["route_lanes"], known["route_corridor"]), missing
 
 
-def _lost(recording: Recording, found: Mapping[str, int]) -> dict[str, int]:
-    """What the reader and the assembly left out, by name; only what is not zero."""
-    names = dict.fromkeys((*recording.lost, *found))
-    counts = {name: int(recording.lost.get(name, 0)) + found.get(name, 0) for name in names}
+def _lost(recording: Recording, lost: Mapping[str, int]) -> dict[str, int]:
+    """Nonzero numbers of items that the reader and the assembly left out, by name."""
+    names = dict.fromkeys((*recording.lost, *lost))
+    counts = {name: int(recording.lost.get(name, 0)) + lost.get(name, 0) for name in names}
     return {name: count for name, count in counts.items() if count}
 
 
 def _refuse_endless(roads: RoadLines) -> None:
-    """Raises where the map's lines are so long that they cannot be those of one place."""
+    """Refuse maps that are too long for one place."""
     length = float(roads.lines.length.sum())
     if length > MAP_M:
         problem = f"the map's lines are {length / 1000:.0f} km long together, more than {MAP_M / 1000:.0f} km"
@@ -184,14 +180,14 @@ def _refuse_endless(roads: RoadLines) -> None:
 
 
 def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
-    """The ego's own log."""
+    """Return the log of the ego."""
     row = tracks.ego
     speed = np.hypot(*tracks.velocity[row].T)
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
 
 
 def _lanes_of(routes: RouteSet) -> Int[Array, " lane"]:
-    """Dense indices of all lanes under routes."""
+    """Return the dense indices of all lanes under routes."""
     lanes = np.unique(np.concatenate([route.lane for route in routes.routes]))
     return lanes[lanes >= 0]
 
@@ -203,10 +199,9 @@ def _kept_lanes(
     path: Float[Array, "step 2"],
     most: int,
 ) -> tuple[Int[Array, " kept"], int]:
-    """Lanes to store: those with a segment in the crop; where too many, routes first, bike lanes and far ones last.
+    """Return the lanes to store, in order of the source, and the number that did not fit.
 
-    Returns:
-        Dense indices in order of the source, and how many did not fit.
+    These are the lanes with a segment in the crop; routes come first, bike lanes and distant lanes last.
     """
     rows = np.flatnonzero(np.isin(graph.feature, near))
     far = np.full(graph.count, np.inf)
@@ -221,7 +216,7 @@ def _kept_lanes(
 def _kept_polylines(
     roads: RoadLines, grid: GridSegments, path: Float[Array, "step 2"], most: int
 ) -> tuple[Int[Array, " polyline"], int]:
-    """Polylines to store as features: those with a stored segment, the nearest where too many."""
+    """Return the nearest polylines with a stored segment, and the number that did not fit."""
     rows = np.unique(grid.segments.polyline)
     far = np.full(roads.lines.count, np.inf)
     np.minimum.at(far, grid.segments.polyline, path_distance(grid.segments.middle, path))
@@ -229,14 +224,14 @@ def _kept_polylines(
 
 
 def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteSet:
-    """Routes in the dense indices of the stored lanes."""
+    """Return routes in the dense indices of the stored lanes."""
     new = np.full(count + 1, -1)
     new[keep] = np.arange(len(keep))
     return replace(routes, routes=tuple(replace(r, lane=new[r.lane]) for r in routes.routes))
 
 
 def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict[str, int]) -> dict[str, int]:
-    """All that did not fit, by name; only what is not zero."""
+    """Nonzero numbers of items that did not fit, by name."""
     actors = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in recording.events)
     counts = {
         **parts.placement.overflow,
@@ -253,7 +248,8 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
 
 
 def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) -> Flag:
-    """The reader's flags, and those that the data show, which the reader cannot know better."""
+    """Flags of the reader, with those that are measured here."""
+    heights = parts.roads.lines.points[:, 2]
     facts: Sequence[tuple[Flag, Any]] = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
@@ -262,10 +258,7 @@ def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) 
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
         (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),
-        (
-            Flag.ELEVATION,
-            np.ptp(parts.roads.lines.points[:, 2]) > FLAT_M if len(parts.roads.lines.points) else False,
-        ),
+        (Flag.ELEVATION, len(heights) > 0 and np.ptp(heights) > FLAT_M),
     )
     flags = (recording.flags & ~MEASURED) | parts.graph.flags
     for flag, holds in facts:

@@ -8,7 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
@@ -24,6 +23,7 @@ from drivax.simulator.traffic.agent_paths import (
     AgentPaths,
     with_paths,
 )
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
 from drivax.simulator.types import AgentContext, Frame
 
@@ -83,9 +83,9 @@ class IdmTraffic:
         """Everyone where the log has them at ``step``.
 
         Raises:
-            UsageError: If the bank has no paths.
+            UsageError: The bank has no paths.
         """
-        paths = _paths(bank)
+        paths = data_of(bank, AgentPaths)
         index, step = jnp.asarray(index, jnp.int32), jnp.asarray(step, jnp.int32)
         slot = paths.slot[index].astype(jnp.int32)
         entry = paths.appears[index, step].astype(jnp.int32)
@@ -109,7 +109,7 @@ class IdmTraffic:
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of the moving slots ``back`` steps ago (at most 9): who reacts on its path, others as logged."""
-        paths, now = _paths(bank), context.traffic
+        paths, now = data_of(bank, AgentPaths), context.traffic
         step = context.step - back
         logged = bank.agents[context.index, jnp.clip(step, 0, bank.steps - 1)]
         at = PAST - 1 - min(back, PAST - 1)
@@ -125,7 +125,7 @@ class IdmTraffic:
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
         """One step of 0.1 s: everyone looks at the present frame, then all move."""
-        paths, now = _paths(bank), context.traffic
+        paths, now = data_of(bank, AgentPaths), context.traffic
         slot = paths.slot[context.index].astype(jnp.int32)
         movers, most = _movers(bank, context, slot)
         movers, ignored = _without_parted(movers, frame, now.phase == WAITS)
@@ -169,21 +169,13 @@ class IdmTraffic:
         return IdmParameters(**table)
 
 
-def _paths(bank: ScenarioBank) -> AgentPaths:
-    if bank.paths is None:
-        raise UsageError(
-            "the bank has no paths for reactive traffic", cure="use IdmTraffic().prepare(bank) first"
-        )
-    return bank.paths
-
-
 def _movers(
     bank: ScenarioBank, context: AgentContext, slot: Int[Array, " R"]
 ) -> tuple[Movers, Float[Array, " R"]]:
     """The vehicles where they are now (waiting ones where they will appear), and the speed that their paths allow."""
     now = context.traffic
     arc, speed = now.arc[-1], now.speed[-1]
-    here, profile = path_poses(bank.paths, context.index, arc)
+    here, profile = path_poses(data_of(bank, AgentPaths), context.index, arc)
     size = bank.agent_box[context.index, jnp.maximum(slot, 0), SizeColumn.FOOTPRINT]
     box, z = jnp.concatenate([here, size], axis=-1), profile[:, PROFILE_Z]
     return Movers(box, z, arc, speed, slot, now.ignored.astype(jnp.int32)), profile[:, PROFILE_SPEED]
@@ -218,7 +210,7 @@ def _stop_gap(
 
     A red light asks everyone who can still stop, a yellow one those who can do so comfortably.
     """
-    paths = bank.paths
+    paths = data_of(bank, AgentPaths)
     light = paths.stop_light[context.index].astype(jnp.int32)
     state = bank.light_state[context.index, jnp.clip(context.step, 0, bank.steps - 1)][light]
     line = paths.stop_arc[context.index] - movers.arc[:, None]

@@ -1,15 +1,25 @@
-"""Episodes that a report shows: the policy's failures first, each kind in turn, then some successes."""
+"""Episodes that a report shows: their selection (failures first), scenarios and rollouts."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable
+from drivax.errors import DataError
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.pairing import comparable
+from drivax.evaluation.traffic_trajectories import unpacked
+from drivax.report.charts.motion import COMMANDED
+from drivax.report.pictures.drawing import Rollout
 from drivax.report.runs import Evaluation
+from drivax.scenario.schema import Scenario
+from drivax.scenario.store import ScenarioSet
 
 #: Kinds of failure, gravest first: (words, metric, value that means failure).
 FAILURES = (
@@ -76,7 +86,7 @@ def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]
         known = 1.0 if np.isnan(score) else score
         return rank[outcome(run, row)], known, -completed[scenarios[row]], scenarios[row][1], row
 
-    return sorted(range(run.episodes), key=key)
+    return sorted(range(len(run)), key=key)
 
 
 def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
@@ -119,14 +129,85 @@ def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
 
 
 def _first_rows(run: Evaluation) -> dict[ScenarioKey, int]:
-    """Return the first episode of each scenario with a stored trajectory."""
+    """Return the first episode of each scenario."""
     rows: dict[ScenarioKey, int] = {}
-    for row, (key, dataset) in enumerate(zip(run.occurrences, run.keys["dataset"], strict=True)):
-        if key in run.trajectories.rows:
-            rows.setdefault((dataset, key[0]), row)
+    for row, key in enumerate(run.scenarios):
+        rows.setdefault(key, row)
     return rows
 
 
 def _value(run: EpisodeTable, metric: str, row: int) -> float:
     """Return a metric of an episode; NaN where it is undefined or missing."""
     return float(run.metrics[metric][row]) if metric in run.metrics else float("nan")
+
+
+class EvaluatedSet:
+    """The scenarios of an evaluation.
+
+    Args:
+        run: The evaluation.
+        data: Path of its scenario set, if it has moved.
+
+    Raises:
+        DataError: The set is missing, or has another hash.
+    """
+
+    def __init__(self, run: Evaluation, data: Path | None = None) -> None:
+        self.scenarios: ScenarioSet = run.open_set(data)
+        self._rows = {
+            (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
+        }
+
+    def scenario(self, key: ScenarioKey) -> Scenario:
+        """Return a scenario by data set and id.
+
+        Raises:
+            DataError: It is not in the set.
+        """
+        row = self._rows.get(key)
+        if row is None:
+            raise DataError(
+                "is not in the scenario set",
+                file=self.scenarios.path,
+                record=key[1],
+                cure="pass the set that was evaluated with --data SET",
+            )
+        return self.scenarios[row]
+
+    def tags(self) -> dict[ScenarioKey, Mapping[str, str]]:
+        """Return the tags of every scenario."""
+        return {key: self.scenarios.entries[row]["tags"] for key, row in self._rows.items()}
+
+
+def rollouts_of(runs: Sequence[Evaluation], group: EpisodeGroup, scenario: Scenario) -> list[Rollout]:
+    """Return the rollout of each run that has an episode in the group."""
+    rows = zip(runs, group.rows, strict=True)
+    return [_rollout(run, row, scenario) for run, row in rows if row is not None]
+
+
+def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
+    stored = run.trajectories
+    steps, start = int(scenario.steps), int(stored.start[row])
+    ego = np.full((steps, 4), np.nan)
+    ego[:start] = logged_motion(scenario)[:start]
+    motion = stored.ego[row, : steps - start]
+    ego[start : start + len(motion)] = motion
+    events = {name: int(at[row]) for name, at in stored.events.items()}
+    crash = run.crash_by_scenario.get(run.scenarios[row])
+    events["crashed"] = -1 if crash is None else crash.step
+    action = np.full((steps, COMMANDED), np.nan)
+    commands = stored.action[row, : steps - start, :COMMANDED]
+    action[start : start + len(commands), : commands.shape[1]] = commands
+    others = None
+    if stored.others is not None:
+        others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
+        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
+    return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
+
+
+def logged_motion(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
+    """Return position, heading and speed of the logged ego; NaN where it is not valid."""
+    steps = int(scenario.steps)
+    speed = np.linalg.norm(scenario.agent_velocity[:steps, 0], axis=-1)
+    pose = np.column_stack((scenario.agent_xy[:steps, 0], scenario.agent_heading[:steps, 0], speed))
+    return np.where(scenario.agent_valid[:steps, 0, None], pose, np.nan).astype(np.float64)

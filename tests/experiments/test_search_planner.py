@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from search_planner import SearchPlanner, advanced, rolled_out
 
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.planners.prediction import rolled_out
-from drivax.planners.search import SearchPlanner, advanced
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
