@@ -87,7 +87,7 @@ def train(
     if resume:
         config, folders = _resumed_folders(data, validation, weights, out, seeds)
     else:
-        refuse_existing(out, overwrite, "training")
+        RunFolder.check(out, overwrite, "training")
         config = with_step(config)
     if config.patience and validation is None:
         raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
