@@ -309,7 +309,7 @@ def fit(
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
         indices = draw(experience.critic, key, (cloning.batch,))
-        observation, action, _ = moments(environment, experience, indices)
+        observation, action, _ = expert_actions(environment, experience, indices)
 
         def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
             others = fold[indices[0]] != member[0]
@@ -318,11 +318,11 @@ def fit(
             batch = jax.tree.map(lambda leaf: leaf[order], observation)
 
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
-                return cloning.of_moments(
+                return cloning.imitation_loss(
                     learner.distribution(parameters, batch), action[order], others[order]
                 )
 
-            return updated(member[1], learner.optimiser, loss)[0]
+            return imitation_update(member[1], learner.optimiser, loss)[0]
 
         size = config.folds if together else None
         return jax.lax.map(update_member, (jnp.arange(config.folds), trained), batch_size=size), None

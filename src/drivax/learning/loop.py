@@ -26,7 +26,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, refuse_existing, seed_folders
+from drivax.tracking.run_folder import RunFolder, seed_folders
 
 
 def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
@@ -68,8 +68,7 @@ def train(
             :class:`WeightedSet`, otherwise uniformly.
         out: Run folder.
         validation: Scenarios that rank checkpoints.
-        resume: Continue the run in ``out`` from its newest checkpoint with its own configuration and seeds, bit for
-            bit on one CPU device.
+        resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
         seeds: Number of seeds to train in one program, from ``config.seed`` on; several have a run folder each inside
             ``out``: ``seed-0``, ``seed-1``, ...
@@ -89,10 +88,7 @@ def train(
     else:
         RunFolder.check(out, overwrite, "training")
         config = with_step(config)
-    if config.patience and validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    if seeds < 1:
-        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+    _check(config, validation, seeds)
     environment, bank = _environment(config, data)
     learner = _learner(config, environment, bank)
     held_out = None if validation is None else Validation.of(validation)
@@ -107,10 +103,8 @@ def train(
     networks = None if resume else pretrained_networks(config.begin_from, program, log)
     folders = folders or _create_folders(config, data, validation, weights, out, numbers, overwrite)
     with contextlib.ExitStack() as stack:
-        logs = [
-            stack.enter_context(TrainingLog(folder, config.checkpoint_rule, config.keep, config.patience))
-            for folder in folders
-        ]
+        rules = (config.checkpoint_rule, config.keep, config.patience)
+        logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
         _learn(_Run(config, program, logs, held_out, held_out_data, networks, log))
     return RunFolder.open(out)
 
@@ -149,6 +143,14 @@ def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
         if count > 0:
             row[name] = value / count
     return row
+
+
+def _check(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:
+    """Raise UsageError for impossible settings before any work is done."""
+    if config.patience and validation is None:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    if seeds < 1:
+        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
 
 
 def _learner(config: TrainConfig, environment: Driving, bank: ScenarioBank) -> Learner:
