@@ -152,7 +152,7 @@ def test_seeds_of_one_folder_are_averaged(runs, plan, tmp_path, capsys):
     [
         (["A"], 2, "1 runs are named"),
         ([], 2, "no runs are named"),
-        (["A", "MISSING"], 1, "no such run folder"),
+        (["A", "MISSING"], 1, "run folder not found"),
         (["A", "TRAINING"], 1, "not evaluation"),
         (["A", "A"], 2, "the same run"),
         (["A", "B", "--primary", "succes"], 2, "did you mean 'success'?"),

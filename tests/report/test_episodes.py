@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import comparable, mismatch
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.report.episodes import choose, outcome
@@ -64,11 +64,11 @@ def test_higher_is_worse_for_metrics_to_minimise(evaluations):
 def test_only_equal_scenarios_traffic_and_starts_are_compared(evaluations):
     expert, _, policy = evaluations
     assert comparable(expert, policy)
-    other = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
-    moved = dataclasses.replace(expert, about={**expert.about, "data": {"hash": "0000", "path": "x"}})
+    other = dataclasses.replace(expert, info={**expert.info, "traffic": "idm"})
+    moved = dataclasses.replace(expert, info={**expert.info, "data": {"hash": "0000", "path": "x"}})
     assert not comparable(other, policy) and not comparable(moved, policy)
     assert mismatch(other, policy) == (
-        "drove in different traffic (idm and log)", "evaluate both with the same --traffic",
+        "differ in traffic (idm and log)", "evaluate both with the same --traffic",
     )  # fmt: skip
     (expert.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
     expert, policy = (dataclasses.replace(run) for run in (expert, policy))
@@ -96,13 +96,15 @@ def test_failures_of_each_kind_are_selected_in_turn(evaluations):
 
 def test_groups_leave_out_runs_without_the_scenario_and_unmatched_runs(evaluations):
     expert, constant, policy = evaluations
-    trajectories = dataclasses.replace(
-        constant.trajectories, rows={k: v for k, v in constant.trajectories.rows.items() if k[0] != "hand-01"}
+    rows = [row for row, name in enumerate(constant.keys["scenario_id"]) if name != "hand-01"]
+    constant = dataclasses.replace(
+        constant,
+        keys={name: tuple(column[row] for row in rows) for name, column in constant.keys.items()},
+        metrics={name: values[rows] for name, values in constant.metrics.items()},
     )
-    constant = dataclasses.replace(constant, trajectories=trajectories)
-    expert = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
+    expert = dataclasses.replace(expert, info={**expert.info, "traffic": "idm"})
     rows = {choice.scenario_id: choice.rows for choice in choose([expert, constant, policy], 8)}
-    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 3, 3)
+    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 2, 3)
 
 
 def test_metric_labels_and_order():

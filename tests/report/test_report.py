@@ -190,7 +190,7 @@ def test_moved_set_is_an_error_unless_given(runs, tmp_path, hand_set):
 def test_other_set_is_refused(runs, tmp_path):
     with ScenarioWriter(tmp_path / "other", SMALL) as writer:
         writer.add(make_scenario(0))
-    with pytest.raises(DataError, match="is not the set that 'policy' was evaluated on"):
+    with pytest.raises(DataError, match="not the set that 'policy' was evaluated on"):
         write_report(runs, tmp_path / "report.html", data=tmp_path / "other")
     about = json.loads((runs[2] / "run.json").read_text())
     (runs[2] / "run.json").write_text(json.dumps(about | {"data": {"path": str(tmp_path / "other")}}))
@@ -303,9 +303,9 @@ def test_runs_in_other_traffic_are_not_compared(runs, tmp_path):
         read_runs(runs)
     react(runs[0])
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
-    said = "expert and policy drove in different traffic (idm and log)."
+    said = "expert and policy differ in traffic (idm and log)."
     assert said in parsed.text and "constant and policy" not in parsed.text
-    assert all(row[1] == "no pairs: drove in different traffic (log and idm)" for row in parsed.tables[2][1:])
+    assert all(row[1] == "no pairs: differ in traffic (log and idm)" for row in parsed.tables[2][1:])
 
 
 def test_page_names_runs_with_other_starts_or_fewer_scenarios(runs, tmp_path):
