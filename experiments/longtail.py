@@ -25,11 +25,11 @@ from typing import Any, get_args
 
 import numpy as np
 
-from drivax.evaluation.stored import read_evaluation
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.studies import longtail_page
 from drivax.studies.longtail_drives import has_driven, names
 from drivax.studies.longtail_plan import DRIVES, REFERENCES, RUNS, SCORES, drive_of, run_of
-from drivax.studies.longtail_results import Group
+from drivax.studies.longtail_results import ClaimGroup
 from experiments.learning.tables import table
 from experiments.repository import DOCS, RESULTS, STATE, fetched
 
@@ -74,7 +74,7 @@ def finish(study: Path) -> None:
     results = json.loads((study / "results.json").read_text())
     collisions = {
         name: [
-            int(read_evaluation(folder).metrics["collision"].sum()) for folder in _evaluations(study, name)
+            int(EpisodeTable.read(folder).metrics["collision"].sum()) for folder in _evaluations(study, name)
         ]
         for name in results["rates"]
     }
@@ -94,7 +94,7 @@ def filled(page: str, results: dict[str, Any]) -> str:
         "rankings": longtail_page.rankings(results),
         "mean q": longtail_page.mean_q(results),
         "mean q curve": longtail_page.mean_q_curve(results),
-        **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(Group)},
+        **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(ClaimGroup)},
         **{f"rates {kind}": longtail_page.rates(results, kind) for kind in ("ordinary", "common", "rare")},
         "detectable": (
             ("metric", "smallest difference"),

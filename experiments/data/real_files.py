@@ -23,7 +23,6 @@ from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.stored import EpisodeTable
 from drivax.learning.policy_traffic import find_traffic
 from drivax.report.episodes import outcome
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -64,12 +63,11 @@ def measured(data: Path) -> dict[str, Any]:
     for planner in PLANNERS:
         driver, task = find_planner(MODULES.get(planner, planner), bank, False)
         for kind in TRAFFIC:
-            results = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
-            table = EpisodeTable.of(results)
+            table = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
             found[kind][planner] = [
                 {
                     "outcome": outcome(table, row),
-                    **{name: _number(results.metrics[name][row]) for name in ("vmax_score", "progress")},
+                    **{name: _number(table.metrics[name][row]) for name in ("vmax_score", "progress")},
                 }
                 for row in range(len(rows))
             ]

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results, interval_of
+from drivax.evaluation.episode_table import EpisodeTable, interval_of
 from drivax.evaluation.rollout import drive, judging
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.tables import paired_differences
@@ -84,7 +84,7 @@ def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -
     return {"drivers": {name: _summary(found, wanted) for name, found in driven.items()}, "minus": against}
 
 
-def _summary(found: Results, wanted: tuple[str, ...]) -> dict[str, Any]:
+def _summary(found: EpisodeTable, wanted: tuple[str, ...]) -> dict[str, Any]:
     metrics = found.summary()["metrics"]
     return {name: metrics[name] for name in wanted}
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import SHARES, Results, interval_of
+from drivax.evaluation.episode_table import SHARES, EpisodeTable, interval_of
 from drivax.evaluation.runner import evaluate
 from drivax.learning.policies import load_policy
 from drivax.learning.policy_traffic import find_traffic
@@ -94,12 +94,13 @@ def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
     return [(replace(planner, name=name), task) for planner, task in loaded]
 
 
-def until_failure(results: Results) -> Metrics:
+def until_failure(results: EpisodeTable) -> Metrics:
     """Steps until the first collision, off-road step or red light (else to the end), and metres driven until then."""
-    events = np.stack([*results.events.values()])
-    last = results.motion.shape[1] - 1
-    steps = np.where(events < 0, last, events - results.start).min(axis=0)
-    moved = np.hypot(*np.moveaxis(np.diff(results.motion[:, :, :2], axis=1), -1, 0))
+    driven = results.trajectories
+    events = np.stack([*driven.events.values()])
+    last = driven.ego.shape[1] - 1
+    steps = np.where(events < 0, last, events - driven.start).min(axis=0)
+    moved = np.hypot(*np.moveaxis(np.diff(driven.ego[:, :, :2], axis=1), -1, 0))
     within = np.arange(last) < steps[:, None]
     return {"steps_until_failure": steps, "metres_until_failure": np.where(within, moved, 0.0).sum(axis=1)}
 

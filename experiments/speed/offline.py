@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from drivax import settings
-from drivax.curation.ensemble import ScoutsConfig, train_scouts
+from drivax.curation.ensemble import EnsembleConfig, train_ensemble
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
 from drivax.learning.program import Agents, Program
@@ -101,7 +101,7 @@ def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
 
 def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
     """Seconds per iteration of the default ensemble and of one of its scouts alone, by turns."""
-    config = ScoutsConfig()
+    config = EnsembleConfig()
     iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
     began, all_of_them, alone = [0.0], list[float](), list[float]()
@@ -114,7 +114,7 @@ def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
             alone.append(time.perf_counter() - ended)
         began[0] = time.perf_counter()
 
-    train_scouts(config, data, turn)
+    train_ensemble(config, data, turn)
     one, together = statistics.median(alone), statistics.median(all_of_them)
     return {
         "scouts": config.folds,

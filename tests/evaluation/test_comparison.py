@@ -13,8 +13,8 @@ import scipy.stats
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.comparison import compare
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.stored import EpisodeTable, read_evaluation, read_seeds
 from drivax.stats.effects import power, scenarios_needed
 from drivax.stats.intervals import paired_bootstrap, rate
 from drivax.stats.significance import holm, mcnemar, paired_permutation
@@ -274,8 +274,8 @@ def test_what_cannot_be_compared_is_refused(change, words):
     ("change", "words"),
     [
         ({"primary": "vmaxscore"}, "has no metric 'vmaxscore'; did you mean 'vmax_score'?"),
-        ({"secondary": ("steps",)}, "no mean of steps"),
-        ({"primary": "vmax_score_partial"}, "made up differently"),
+        ({"secondary": ("steps",)}, "steps is a code or count without a mean"),
+        ({"primary": "vmax_score_partial"}, "combines different inputs"),
         ({"primary": "ade"}, "neither better high nor low"),
         ({"split": "stratified"}, "--data"),
         ({"split": "random", "ratio": 0.999}, "leave an arm empty"),
@@ -329,21 +329,21 @@ def written(folder, lines, about='{"kind": "evaluation", "planner": "p"}'):
 
 def test_runs_are_read_back_and_damage_is_named(tmp_path):
     run = written(tmp_path / "run", ["p,d,s1,,0,log,1", "p,d,s1,,1,log,0", "p,d,s2,r,0,log,"])
-    found = read_evaluation(run)
+    found = EpisodeTable.read(run)
     assert found.by_scenario("success")["d", "s1"] == 0.5 and np.isnan(
         found.by_scenario("success")["d", "s2"]
     )
     assert found.clusters == ["d/s1", "d/s1", "d/r"]
     bad = written(tmp_path / "nan", ["p,d,s1,,0,log,nan"])
     with pytest.raises(Exception, match="record 1: success is NaN"):
-        read_evaluation(bad)
+        EpisodeTable.read(bad)
     with pytest.raises(Exception, match="of kind 'training', not evaluation"):
-        read_evaluation(written(tmp_path / "train", [], '{"kind": "training"}'))
+        EpisodeTable.read(written(tmp_path / "train", [], '{"kind": "training"}'))
     for seed in range(2):
         written(tmp_path / "seeds" / f"seed-{seed}", [f"seed-{seed},d,s1,,0,log,1"])
-    assert len(read_seeds(tmp_path / "seeds")) == 2 and len(read_seeds(run)) == 1
-    with pytest.raises(Exception, match="there is no such run folder"):
-        read_seeds(tmp_path / "nowhere")
+    assert len(EpisodeTable.read_seeds(tmp_path / "seeds")) == 2 and len(EpisodeTable.read_seeds(run)) == 1
+    with pytest.raises(Exception, match="run folder not found"):
+        EpisodeTable.read_seeds(tmp_path / "nowhere")
 
 
 def test_other_starts_are_refused(tmp_path):
@@ -351,4 +351,4 @@ def test_other_starts_are_refused(tmp_path):
     (a / "config.yaml").write_text("noisy_start: true\nstart_step: 10\n")
     (b / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
     with pytest.raises(UsageError, match=r"differ in noisy_start \(True and False\)"):
-        compare(PLAN, [read_evaluation(a)], [read_evaluation(b)])
+        compare(PLAN, [EpisodeTable.read(a)], [EpisodeTable.read(b)])

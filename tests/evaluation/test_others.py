@@ -81,8 +81,8 @@ def test_a_collision_in_reactive_traffic_is_drawn_as_a_contact(tmp_path):
 @pytest.mark.slow
 def test_where_the_log_is_replayed_nothing_is_kept(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
-    assert drivax.evaluate("constant_velocity", tmp_path / "set").others is None
-    found = drivax.evaluate("constant_velocity", tmp_path / "set", traffic="idm").others
+    assert drivax.evaluate("constant_velocity", tmp_path / "set").trajectories.others is None
+    found = drivax.evaluate("constant_velocity", tmp_path / "set", traffic="idm").trajectories.others
     scenarios = ScenarioSet.open(tmp_path / "set")
     for rows, scenario in zip(found, scenarios, strict=True):
         # Nobody has moved yet when the episode begins.

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import EpisodeTable
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.tables import (
     COLLISION_KINDS,
     collisions_table,

@@ -123,7 +123,7 @@ def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
             r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; begin from a run with the same net",
         ),
         (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 agents; name one of them"),
-        (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
+        (replace(onward, begin_from=str(tmp_path)), "not a run folder"),
         (replace(onward, begin_from=f"{former}@7"), "there is no checkpoint of step 7"),
         (replace(onward, begin_from="zoo:aggressive"), "is packed, and has no networks to learn on from"),
     ):

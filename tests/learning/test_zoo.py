@@ -114,7 +114,7 @@ def test_traffic_is_found_by_name(run, tmp_path):
     ):
         with pytest.raises(UsageError, match=words):
             find_traffic(name)
-    with pytest.raises(DataError, match="is no run folder"):
+    with pytest.raises(DataError, match="not a run folder"):
         find_traffic(str(tmp_path))
 
 

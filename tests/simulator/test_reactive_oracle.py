@@ -97,7 +97,7 @@ def test_company_changes_nothing():
         evaluate(ConstantVelocity(), ScenarioBank.from_scenarios(some), scenario_names(some), traffic=TRAFFIC)
         for some in (scenarios, scenarios[1:])
     )
-    np.testing.assert_array_equal(whole.motion[1:], part.motion)
+    np.testing.assert_array_equal(whole.trajectories.ego[1:], part.trajectories.ego)
     for name, values in whole.metrics.items():
         np.testing.assert_array_equal(values[1:], part.metrics[name], err_msg=name)
     assert whole.traffic == "idm"

@@ -184,10 +184,10 @@ def test_evaluation_begins_where_the_noise_leads_and_counts_from_there():
         for seed in (3, 4)
     )
     for found in (same, other):
-        motion = found.motion[0]
+        motion = found.trajectories.ego[0]
         assert len(motion) == 81 and motion[0, 3] > 2.0
         assert found.metrics["distance"][0] == pytest.approx(8.0 * motion[0, 3], rel=1e-3)
         assert 0.0 <= found.metrics["progress_ratio"][0] <= 1.0
-    assert same.motion[0, 0, 3] != other.motion[0, 0, 3]
-    with pytest.raises(UsageError, match="cannot begin elsewhere"):
+    assert same.trajectories.ego[0, 0, 3] != other.trajectories.ego[0, 0, 3]
+    with pytest.raises(UsageError, match="cannot start elsewhere"):
         evaluate(Expert(), data, start=NoisyStart())

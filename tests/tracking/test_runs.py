@@ -75,7 +75,7 @@ def test_existing_folders(tmp_path: Path):
     RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="seeds")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").write_text("years of work")
-    with pytest.raises(UsageError, match="is no run folder"):
+    with pytest.raises(UsageError, match="is not a run folder"):
         RunFolder.create(tmp_path / "thesis", Config(), overwrite=True)
     (tmp_path / "empty").mkdir()
     RunFolder.create(tmp_path / "empty", Config())
@@ -92,11 +92,11 @@ def test_a_configuration_that_cannot_be_written_leaves_nothing(tmp_path: Path):
 
 
 def test_what_is_no_run(tmp_path: Path):
-    with pytest.raises(DataError, match=r"no run folder \(no config\.yaml\); name a folder"):
+    with pytest.raises(DataError, match=r"not a run folder: no run\.json; give a folder"):
         RunFolder.open(tmp_path)
     run = RunFolder.create(tmp_path / "run", Config())
     (run.path / "run.json").write_text("{")
-    with pytest.raises(DataError, match=r"run\.json: is damaged"):
+    with pytest.raises(DataError, match=r"run\.json: not valid JSON"):
         RunFolder.open(run.path)
 
 
@@ -148,5 +148,5 @@ def test_steps_of_runs():
         "runs/a",
         20,
     )
-    with pytest.raises(UsageError, match="'best' is no step of a checkpoint; write RUN@STEP"):
+    with pytest.raises(UsageError, match="'best' is not a checkpoint step; write RUN@STEP"):
         runs.run_and_step("runs/a@best")

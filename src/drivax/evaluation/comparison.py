@@ -18,11 +18,10 @@ from jaxtyping import Bool, Float64
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, judged
+from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
+from drivax.evaluation.pairing import Pairs, check_metric, check_pairs, undefined_metric
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.results import RATES, SHARES, interval_of
 from drivax.evaluation.split import Split, assign, strata_of
-from drivax.evaluation.stored import EpisodeTable, Pairs
-from drivax.evaluation.unmatched import refuse_metric, refuse_misfits, refuse_undefined
 from drivax.stats.clusters import defined, design_effect
 from drivax.stats.effects import (
     ROUNDING,
@@ -83,7 +82,7 @@ class Comparison:
 
     plan: ComparisonPlan
     names: tuple[str, str]
-    folders: tuple[Path, Path]
+    folders: tuple[Path | None, Path | None]
     traffic: str
     scenarios: tuple[int, int]
     recordings: tuple[int, int]
@@ -95,9 +94,10 @@ class Comparison:
     decision: Decision
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what cannot be said is null."""
-        found = asdict(self) | {"plan": settings.plain(self.plan), "folders": [*map(str, self.folders)]}
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+        """Plain values for JSON; null where undefined."""
+        folders = [None if folder is None else str(folder) for folder in self.folders]
+        values = asdict(self) | {"plan": settings.plain(self.plan), "folders": folders}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,14 @@ class _Side:
         return np.where(self.arm, self.by_seed(metric).mean(axis=0), np.nan)
 
     @property
-    def folder(self) -> Path:
-        return self.tables[0].folder if len(self.tables) == 1 else self.tables[0].folder.parent
+    def folder(self) -> Path | None:
+        folder = self.tables[0].folder
+        return folder if folder is None or len(self.tables) == 1 else folder.parent
 
     @property
     def name(self) -> str:
-        return self.tables[0].name if len(self.tables) == 1 else self.folder.name
+        folder = self.folder
+        return self.tables[0].name if folder is None or len(self.tables) == 1 else folder.name
 
     @property
     def recordings(self) -> int:
@@ -145,9 +147,9 @@ def compare(
     Raises:
         UsageError: The evaluations cannot be compared, or lack a metric of the plan.
     """
-    refuse_misfits(a, b)
+    check_pairs(a, b)
     for metric in (plan.primary, *plan.secondary):
-        refuse_metric(metric, (*a, *b), primary=metric == plan.primary)
+        check_metric(metric, (*a, *b), primary=metric == plan.primary)
     pairs = Pairs.of(*a, *b)
     if not pairs.keys:
         raise UsageError("A and B have no scenario in common", cure="evaluate both on the same scenarios")
@@ -159,7 +161,7 @@ def compare(
     sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
     first = _compared(plan, plan.primary, sides, split)
     if min(first.a.n, first.b.n) == 0:
-        refuse_undefined(plan.primary, (*a, *b))
+        raise undefined_metric(plan.primary, (*a, *b))
     others = [_compared(plan, metric, sides, split) for metric in plan.secondary]
     adjusted = holm([one.evidence.p for one in others])
     secondary = tuple(judged(plan, one, p) for one, p in zip(others, adjusted, strict=True))
@@ -184,7 +186,8 @@ def compare(
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
     if a.name != b.name:
         return a.name, b.name
-    return f"{a.name} ({a.folder.name})", f"{b.name} ({b.folder.name})"
+    labels = [side.folder.name if side.folder else arm for side, arm in ((a, "A"), (b, "B"))]
+    return f"{a.name} ({labels[0]})", f"{b.name} ({labels[1]})"
 
 
 def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:

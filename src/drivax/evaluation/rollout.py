@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int16
 
-from drivax.evaluation.results import FAILED
+from drivax.evaluation.episode_table import FAILED
 from drivax.evaluation.traffic_trajectories import packed
 from drivax.metrics.episode import episode_metrics, event_steps
 from drivax.metrics.scores import Value

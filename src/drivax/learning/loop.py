@@ -26,7 +26,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, refuse_existing
+from drivax.tracking.run_folder import RunFolder
 
 
 def train(
@@ -68,7 +68,7 @@ def train(
     if resume:
         config, folders = resumed_folders(data, validation, weights, out, seeds)
     else:
-        refuse_existing(out, overwrite, "training")
+        RunFolder.check(out, overwrite, "training")
         config = with_step(config)
     _refuse(config, validation, seeds)
     numbers = tuple(config.seed + number for number in range(len(folders) or seeds))

@@ -1,4 +1,4 @@
-"""The picture of an observation shows what is in it, and only that."""
+"""The picture of an observation, and the table of its statistics."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def observed(config=CONFIG):
     }
 
 
-def test_columns_are_taken_apart_with_their_units():
+def test_columns_are_split_with_their_units():
     from drivax.report.pictures.observation import ObservationGroups
 
     seen = ObservationGroups.of(CONFIG, observed())
@@ -63,7 +63,7 @@ def test_columns_are_taken_apart_with_their_units():
     )
 
 
-def test_what_is_seen_is_drawn_and_nothing_else():
+def test_only_observed_things_are_drawn():
     from drivax.report.pictures.observation import draw_observation
 
     full = observed()
@@ -83,7 +83,7 @@ def test_what_is_seen_is_drawn_and_nothing_else():
     np.testing.assert_array_equal(pixels(draw_observation(CONFIG, littered, "a title")), image)
 
 
-def test_a_lean_observation_can_be_drawn():
+def test_small_observation_can_be_drawn():
     from drivax.report.pictures.observation import draw_observation
 
     features = Features(
@@ -102,7 +102,7 @@ def test_a_lean_observation_can_be_drawn():
     assert share(image, "vehicle") > 20 and share(image, "ego") > 20
 
 
-def test_a_missing_matplotlib_is_named(monkeypatch):
+def test_missing_matplotlib_is_an_error(monkeypatch):
     from drivax.report.pictures.observation import draw_observation
 
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
@@ -125,7 +125,7 @@ def printed(table):
     return [line.split() for line in out.getvalue().splitlines()]
 
 
-def test_the_table():
+def test_table_has_a_row_per_feature():
     rows = printed(observation_table(statistics()))
     assert rows[0][-3:] == ["r", "collision", "importance"]
     assert rows[1:3] == [

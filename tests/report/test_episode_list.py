@@ -1,4 +1,4 @@
-"""The list of all episodes: what it holds, and what a reader can do with it in a browser."""
+"""The list of all episodes: its data, and sorting and filtering in a browser."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def page(runs, tmp_path):
     return write_report(runs, tmp_path / "report.html", episodes=8)
 
 
-def test_every_episode_of_every_run_is_there(page, runs):
+def test_list_holds_every_episode_of_every_run(page, runs):
     data = listed(page.read_text())
     assert [run["name"] for run in data["runs"]] == ["expert", "constant", "policy"]
     names = [metric["name"] for metric in data["metrics"]]
@@ -54,7 +54,7 @@ def test_every_episode_of_every_run_is_there(page, runs):
     assert sorted(data["played"].values()) == list(range(8))
 
 
-def test_worst_first(runs):
+def test_episodes_are_ranked_by_failure_score_and_other_planners(runs):
     policy = read_runs(runs)[0][-1]
     order = [FAILURES.index(next(f for f in FAILURES if f[0] == words)) if words != "success" else 99
              for words in (outcome(policy, row) for row in worst_first(policy))]  # fmt: skip
@@ -69,7 +69,7 @@ def test_worst_first(runs):
     assert [choice.scenario_id for choice in ranked(evaluations)][:2] == ["hand-05", "hand-01"]
 
 
-def test_a_page_without_drives_says_so(runs, tmp_path):
+def test_page_without_rollouts_says_so(runs, tmp_path):
     text = write_report(runs, tmp_path / "report.html", episodes=0).read_text()
     assert (
         "Rollouts and tags were left out" in text and listed(text)["tags"] == [] and 'id="plots"' not in text
@@ -111,7 +111,7 @@ ACT = """
 
 
 @needs_browser
-def test_sorting_sieving_and_one_click_to_the_episode(page, tmp_path):
+def test_list_sorts_filters_and_opens_episodes(page, tmp_path):
     dom = browse(acted(page, ACT), tmp_path, "--dump-dom", "--window-size=1280,1000")
     assert "data-error" not in re.search(r"<html[^>]*>", dom)[0]
     found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
@@ -129,7 +129,7 @@ def test_sorting_sieving_and_one_click_to_the_episode(page, tmp_path):
 
 @pytest.fixture
 def half_tagged(tmp_path):
-    """A page of one drive; of the scenarios 6 and 7 nobody knows how hard they are."""
+    """A page with one rollout; the scenarios 6 and 7 have no difficulty."""
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         for number in range(8):
             scenario = make_scenario(number)
@@ -158,7 +158,7 @@ BEHIND = """
 
 
 @needs_browser
-def test_cells_whose_drives_are_not_in_the_page_say_so(half_tagged, tmp_path):
+def test_cells_without_playable_episodes_say_so(half_tagged, tmp_path):
     dom = browse(acted(half_tagged, BEHIND), tmp_path, "--dump-dom", "--window-size=1280,1000")
     assert "data-error" not in re.search(r"<html[^>]*>", dom)[0]
     found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
@@ -170,7 +170,7 @@ def test_cells_whose_drives_are_not_in_the_page_say_so(half_tagged, tmp_path):
 
 
 def thousandfold(folder):
-    """Make a run of eight episodes one of a thousand, the drives of the first eight kept."""
+    """Extend a run of eight episodes to a thousand, with trajectories of the first eight."""
     header, *rows = (folder / "episodes.csv").read_text().splitlines()
     more = [row.replace("hand-", f"copy-{number}-") for number in range(125) for row in rows]
     (folder / "episodes.csv").write_text("\n".join([header, *rows, *more[8:]]) + "\n")
@@ -178,8 +178,8 @@ def thousandfold(folder):
 
 @pytest.mark.slow
 @needs_browser
-def test_a_thousand_episodes_open_in_two_seconds(runs, tmp_path):
-    """From the start of loading until everything is laid out and drawn, on the clock of the wall."""
+def test_thousand_episodes_open_in_two_seconds(runs, tmp_path):
+    """Measure wall-clock time from the start of loading to the final layout."""
     for folder in runs[:3]:
         thousandfold(folder)
     html = write_report(runs, tmp_path / "report.html")

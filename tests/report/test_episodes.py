@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import comparable, mismatch
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import difference, headline, metric_label, ordered, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.report.episodes import choose, outcome
@@ -20,7 +20,7 @@ def evaluations(runs):
     return read_runs(runs)[0]
 
 
-def test_rates_get_wilson_with_clusters_and_the_rest_a_bootstrap(evaluations):
+def test_rates_have_wilson_intervals_and_other_means_a_bootstrap(evaluations):
     policy = evaluations[-1]
     assert summarise(policy, "collision") == rate(policy.metrics["collision"], SEGMENTS)
     progress = summarise(policy, "progress_ratio")
@@ -41,7 +41,7 @@ def test_differences_are_paired_by_scenario(evaluations):
     assert difference(policy, expert, "red_light").verdict == "unclear"
 
 
-def test_order_does_not_matter_and_repeats_are_averaged(evaluations):
+def test_repeated_scenarios_are_averaged_in_any_order(evaluations):
     expert, _, policy = evaluations
     back = list(reversed(range(8)))
     keys = {name: tuple(column[i] for i in [*back, 0]) for name, column in expert.keys.items()}
@@ -52,7 +52,7 @@ def test_order_does_not_matter_and_repeats_are_averaged(evaluations):
     assert found.n == 8 and found.mean == pytest.approx(0.1 - 0.2 / 8)
 
 
-def test_worse_is_said_where_less_is_better(evaluations):
+def test_higher_is_worse_for_metrics_to_minimise(evaluations):
     expert, constant, _ = evaluations
     found = difference(constant, expert, "offroad")
     assert found.interval.mean == 0.5 and found.verdict in ("worse", "unclear")
@@ -61,14 +61,14 @@ def test_worse_is_said_where_less_is_better(evaluations):
     assert certain.interval == Interval(1.0, 1.0, 1.0, 8) and certain.verdict == "worse"
 
 
-def test_only_the_same_scenarios_and_traffic_are_compared(evaluations):
+def test_only_equal_scenarios_traffic_and_starts_are_compared(evaluations):
     expert, _, policy = evaluations
     assert comparable(expert, policy)
-    other = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
-    moved = dataclasses.replace(expert, about={**expert.about, "data": {"hash": "0000", "path": "x"}})
+    other = dataclasses.replace(expert, info={**expert.info, "traffic": "idm"})
+    moved = dataclasses.replace(expert, info={**expert.info, "data": {"hash": "0000", "path": "x"}})
     assert not comparable(other, policy) and not comparable(moved, policy)
     assert mismatch(other, policy) == (
-        "drove in different traffic (idm and log)", "evaluate both with the same --traffic",
+        "differ in traffic (idm and log)", "evaluate both with the same --traffic",
     )  # fmt: skip
     (expert.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
     expert, policy = (dataclasses.replace(run) for run in (expert, policy))
@@ -78,7 +78,7 @@ def test_only_the_same_scenarios_and_traffic_are_compared(evaluations):
     assert mismatch(expert, policy) == ("differ in start_step (40 and 10)", "evaluate both with the same")
 
 
-def test_outcomes_and_choice(evaluations):
+def test_failures_of_each_kind_are_selected_in_turn(evaluations):
     policy = evaluations[-1]
     assert [outcome(policy, row) for row in range(8)] == [
         "success", "collision", "success", "off-road", "red light", "collision", "goal not reached", "success",
@@ -94,15 +94,17 @@ def test_outcomes_and_choice(evaluations):
     assert sum(choice.outcome != "success" for choice in choose(evaluations, 8)) == 5
 
 
-def test_a_run_that_lacks_a_scenario_or_is_not_comparable_is_left_out(evaluations):
+def test_groups_leave_out_runs_without_the_scenario_and_unmatched_runs(evaluations):
     expert, constant, policy = evaluations
-    trajectories = dataclasses.replace(
-        constant.trajectories, rows={k: v for k, v in constant.trajectories.rows.items() if k[0] != "hand-01"}
+    rows = [row for row, name in enumerate(constant.keys["scenario_id"]) if name != "hand-01"]
+    constant = dataclasses.replace(
+        constant,
+        keys={name: tuple(column[row] for row in rows) for name, column in constant.keys.items()},
+        metrics={name: values[rows] for name, values in constant.metrics.items()},
     )
-    constant = dataclasses.replace(constant, trajectories=trajectories)
-    expert = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
+    expert = dataclasses.replace(expert, info={**expert.info, "traffic": "idm"})
     rows = {choice.scenario_id: choice.rows for choice in choose([expert, constant, policy], 8)}
-    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 3, 3)
+    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 2, 3)
 
 
 def test_metric_labels_and_order():

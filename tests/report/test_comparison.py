@@ -1,4 +1,4 @@
-"""``drivax compare``: what is printed, the JSON, the page, and the exit status."""
+"""``drivax compare``: text, JSON, page, and exit status."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def called(capsys, *arguments):
     return status, captured.out, captured.err
 
 
-def test_the_text(runs, plan, capsys):
+def test_text_has_conditions_tables_and_recommendation(runs, plan, capsys):
     status, out, _ = called(capsys, runs[2], runs[1], "--config", plan)
     lines = out.splitlines()
     assert status == 0 and max(map(len, lines)) <= 100
@@ -75,7 +75,7 @@ def test_the_text(runs, plan, capsys):
     assert "recommendation: not enough scenarios" in lines
 
 
-def test_the_json_is_what_the_csv_files_say(runs, plan, capsys):
+def test_json_equals_the_csv_files(runs, plan, capsys):
     status, out, _ = called(capsys, runs[2], runs[1], "--config", plan, "--json")
     found = json.loads(out)
     jsonschema.validate(found, SCHEMA)
@@ -90,7 +90,7 @@ def test_the_json_is_what_the_csv_files_say(runs, plan, capsys):
     assert found["names"] == ["policy", "constant"] and found["plan"]["minimum_scenarios"] == 4
 
 
-def test_the_page_stands_alone(runs, plan, tmp_path, capsys):
+def test_page_is_self_contained(runs, plan, tmp_path, capsys):
     page = tmp_path / "out" / "comparison.html"
     status, out, _ = called(capsys, runs[2], runs[1], "--config", plan, "--html", page)
     assert status == 0 and f"wrote {page}" in out
@@ -107,7 +107,7 @@ def test_the_page_stands_alone(runs, plan, tmp_path, capsys):
     assert called(capsys, runs[2], runs[1], "--config", plan, "--html", page, "--overwrite")[0] == 0
 
 
-def test_a_plan_is_written_before_it_is_run(runs, tmp_path, capsys):
+def test_save_writes_the_plan_and_config_runs_it(runs, tmp_path, capsys):
     file = tmp_path / "plans" / "plan.yaml"
     words = ("--primary", "accuracy", "--secondary", "collision", "--minimum-scenarios", "8", "--save", file)
     status, out, _ = called(capsys, runs[0], runs[1], *words)
@@ -125,7 +125,7 @@ def test_a_plan_is_written_before_it_is_run(runs, tmp_path, capsys):
     assert settings.load(ComparisonPlan, file).secondary == usual[1:]
 
 
-def test_splits(runs, plan, capsys):
+def test_random_and_stratified_splits_are_reported(runs, plan, capsys):
     words = ("--primary", "accuracy", "--secondary", "progress_ratio", "--minimum-scenarios", "2")
     status, out, _ = called(capsys, runs[0], runs[1], *words, "--split", "random")
     assert status == 0 and "split at random: 4 scenarios of 2 recordings for A, 4 of 2 for B" in out
@@ -134,7 +134,7 @@ def test_splits(runs, plan, capsys):
     assert status == 0 and "split within 1 stratum" in out
 
 
-def test_seeds_in_one_folder(runs, plan, tmp_path, capsys):
+def test_seeds_of_one_folder_are_averaged(runs, plan, tmp_path, capsys):
     seeds = tmp_path / "seeds"
     for number, run in enumerate(runs[1:3]):
         folder = seeds / f"seed-{number}"
@@ -152,7 +152,7 @@ def test_seeds_in_one_folder(runs, plan, tmp_path, capsys):
     [
         (["A"], 2, "1 runs are named"),
         ([], 2, "no runs are named"),
-        (["A", "MISSING"], 1, "no such run folder"),
+        (["A", "MISSING"], 1, "run folder not found"),
         (["A", "TRAINING"], 1, "not evaluation"),
         (["A", "A"], 2, "the same run"),
         (["A", "B", "--primary", "succes"], 2, "did you mean 'success'?"),
@@ -161,7 +161,7 @@ def test_seeds_in_one_folder(runs, plan, tmp_path, capsys):
         (["--save", "FOLDER"], 2, "name a file to write"),
     ],
 )
-def test_wrong_calls_get_one_line(arguments, status, words, runs, tmp_path, capsys):
+def test_wrong_calls_print_one_line(arguments, status, words, runs, tmp_path, capsys):
     places = {
         "A": runs[0], "B": runs[1], "TRAINING": runs[3], "MISSING": tmp_path / "m", "FOLDER": tmp_path,
         "MISSING.yaml": tmp_path / "m.yaml",
