@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_metrics
 from drivax.metrics.scores import Value
 from drivax.report.pictures.still import draw_pixels
