@@ -29,7 +29,7 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.studies import longtail_page
 from drivax.studies.longtail_drives import has_driven, names
 from drivax.studies.longtail_plan import DRIVES, REFERENCES, RUNS, SCORES, drive_of, run_of
-from drivax.studies.longtail_results import Group
+from drivax.studies.longtail_results import ClaimGroup
 from experiments.learning.tables import table
 from experiments.repository import DOCS, RESULTS, STATE, fetched
 
@@ -94,7 +94,7 @@ def filled(page: str, results: dict[str, Any]) -> str:
         "rankings": longtail_page.rankings(results),
         "mean q": longtail_page.mean_q(results),
         "mean q curve": longtail_page.mean_q_curve(results),
-        **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(Group)},
+        **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(ClaimGroup)},
         **{f"rates {kind}": longtail_page.rates(results, kind) for kind in ("ordinary", "common", "rare")},
         "detectable": (
             ("metric", "smallest difference"),

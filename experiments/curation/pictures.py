@@ -15,11 +15,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drivax.curation.ensemble import ScoutsConfig, train_scouts
-from drivax.curation.methods import Wanted, curate, ensemble_table
+from drivax.curation.ensemble import EnsembleConfig, train_ensemble
+from drivax.curation.logged import score_steps
+from drivax.curation.methods import Request, curate, ensemble_table
 from drivax.curation.rarity import ExpertActions, KernelRarity
 from drivax.curation.scores import ScoreTable
-from drivax.curation.scoring import score_steps
 from drivax.report.pictures.palette import LIGHT, SERIES
 from drivax.report.pictures.still import draw_on
 from drivax.scenario.schema import DT_S, STEPS
@@ -30,7 +30,7 @@ mpl.use("Agg")
 
 #: Width, height, inches; dots per inch; half the side of the scene, m.
 SIZE, DPI, REACH_M = (11.0, 4.4), 100, 40.0
-#: Draws what stands beside the scene: of a row of the table, at a step.
+#: DrawStatistics what stands beside the scene: of a row of the table, at a step.
 Beside = Callable[[list[Axes], int, int], None]
 
 
@@ -59,7 +59,7 @@ def over_time(axes: Axes, step: int, what: str) -> None:
 
 def kinematic(data: ScenarioSet, out: Path) -> None:
     """Components over time, each as it counts, and the score."""
-    table = curate("kinematic", Wanted(data))
+    table = curate("kinematic", Request(data))
 
     def beside(axes: list[Axes], row: int, step: int) -> None:
         valid = np.flatnonzero(table.valid[row])
@@ -81,14 +81,16 @@ def _weights(table: ScoreTable) -> dict[str, float]:
 
 def ensemble(data: ScenarioSet, out: Path) -> None:
     """What each scout would do, what the expert did, and the score."""
-    scouts = train_scouts(ScoutsConfig(), data)
-    table, opinions = ensemble_table(scouts, data), scouts.opinions(data)
+    scouts = train_ensemble(EnsembleConfig(), data)
+    table, predictions = ensemble_table(scouts, data), scouts.predictions(data)
 
     def beside(axes: list[Axes], row: int, step: int) -> None:
-        known = np.flatnonzero(opinions.known[row])
+        known = np.flatnonzero(predictions.known[row])
         for number, (name, part) in enumerate({"acceleration": axes[0], "steering": axes[1]}.items()):
-            part.plot(known * DT_S, opinions.action[row, known, :, number], color=LIGHT["ego"], linewidth=0.9)
-            part.plot(known * DT_S, opinions.expert[row, known, number], color=LIGHT["ink"], linewidth=1.6)
+            part.plot(
+                known * DT_S, predictions.action[row, known, :, number], color=LIGHT["ego"], linewidth=0.9
+            )
+            part.plot(known * DT_S, predictions.expert[row, known, number], color=LIGHT["ink"], linewidth=1.6)
             over_time(
                 part, step, f"{name}: five scouts, and (black) what the expert did; units of the action space"
             )
@@ -102,7 +104,7 @@ def ensemble(data: ScenarioSet, out: Path) -> None:
 
 def rarity(data: ScenarioSet, out: Path) -> None:
     """The density of all actions, and the actions of the scenario."""
-    table = curate("action_rarity", Wanted(data))
+    table = curate("action_rarity", Request(data))
     found = score_steps(data, ExpertActions(), None)
     action, known = np.asarray(found["action"]), np.asarray(found["known"])
     side = np.linspace(-1.0, 1.0, 201)

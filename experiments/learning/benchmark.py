@@ -24,8 +24,7 @@ from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import SHARES, EpisodeTable, interval_of
 from drivax.evaluation.runner import evaluate
-from drivax.learning.policies import load_policy
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.planner import Planner
 from drivax.planners.simple import RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank

@@ -24,13 +24,14 @@ import jax
 import numpy as np
 
 from drivax import settings
-from drivax.curation.ensemble import ScoutsConfig, train_scouts
+from drivax.curation.ensemble import EnsembleConfig, train_ensemble
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.program import Agents, Program
-from drivax.learning.sampler import draw, sampler
+from drivax.learning.experience import draw, sampler
+from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
 
@@ -55,13 +56,13 @@ def elapsed(call: Callable[[], Any]) -> float:
 
 def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
     """What runs an iteration of a training, and its size: gradients change so many parameters."""
-    environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
+    environment, bank = config.environment(LogTraffic()), ScenarioBank.from_scenarios(data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     began = time.perf_counter()
     weights = np.ones((len(bank), bank.steps))
     made = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
     prepared = time.perf_counter() - began
-    program = Program(Agents(learner, (0,)), made, 1)
+    program = Program(Seeds(learner, (0,)), made, 1)
     state = [program.first_state()]
     trained = state[0].parameters, getattr(state[0], "rest", ())
     size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
@@ -101,7 +102,7 @@ def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
 
 def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
     """Seconds per iteration of the default ensemble and of one of its scouts alone, by turns."""
-    config = ScoutsConfig()
+    config = EnsembleConfig()
     iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
     began, all_of_them, alone = [0.0], list[float](), list[float]()
@@ -114,7 +115,7 @@ def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
             alone.append(time.perf_counter() - ended)
         began[0] = time.perf_counter()
 
-    train_scouts(config, data, turn)
+    train_ensemble(config, data, turn)
     one, together = statistics.median(alone), statistics.median(all_of_them)
     return {
         "scouts": config.folds,

@@ -11,9 +11,8 @@ from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
-from drivax.learning.collector import collect
 from drivax.learning.driving import Driving, _draw
-from drivax.learning.environment import Environment
+from drivax.learning.environment import Environment, collect
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig

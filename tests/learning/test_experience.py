@@ -77,7 +77,9 @@ def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, 
         np.testing.assert_allclose(
             found.observation[name][~first], value[~first], atol=1e-3, rtol=1e-4, err_msg=name
         )
-        np.testing.assert_allclose(found.following[name], following[name], atol=1e-3, rtol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            found.next_observation[name], following[name], atol=1e-3, rtol=1e-4, err_msg=name
+        )
     np.testing.assert_allclose(found.action, action, atol=1e-4)
     np.testing.assert_allclose(found.reward, reward, atol=1e-4, rtol=1e-4)
     np.testing.assert_array_equal(found.terminated, terminated)
@@ -122,7 +124,7 @@ def test_what_follows_the_weights(bank, experience):
     for made in (both, apart):
         np.testing.assert_array_equal(made.usable, usable)
         # What features are normalised by.
-        np.testing.assert_array_equal(made.alike.cumulative, experience.critic.cumulative)
+        np.testing.assert_array_equal(made.uniform.cumulative, experience.critic.cumulative)
 
 
 def test_steps_that_weights_are_made_for_are_those_that_are_drawn(data):
@@ -131,7 +133,7 @@ def test_steps_that_weights_are_made_for_are_those_that_are_drawn(data):
     usable = usable_steps(config, data)
     np.testing.assert_array_equal(usable, own.expert.usable & ~own.expert.clipped)
     assert usable.any() and not usable[:, :10].any()
-    with pytest.raises(UsageError, match="PpoConfig learns from no recorded steps"):
+    with pytest.raises(UsageError, match="PpoConfig does not learn from logged steps"):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
 
 
@@ -146,5 +148,5 @@ def test_what_cannot_be_learned_from_is_refused(bank):
             ExperienceConfig().of(DRIVING, bank, weights)
     with pytest.raises(DataError, match="no step has any weight"):
         ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
-    with pytest.raises(UsageError, match="Pendulum holds no recorded episodes"):
+    with pytest.raises(UsageError, match="Pendulum has no logged episodes"):
         ExperienceConfig().of(Pendulum(), ())

@@ -10,11 +10,11 @@ import pytest
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.algorithm import training_data
-from drivax.learning.algorithms.fitted_q import FittedQ, FittedQConfig
 from drivax.learning.algorithms.iql import IqlConfig
+from drivax.learning.algorithms.offline import FittedQ, FittedQConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import ExperienceConfig
-from drivax.learning.validation import rank
+from drivax.learning.training_log import rank
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from recorded import Table, Told
@@ -78,11 +78,11 @@ def test_a_learner_is_judged_by_it(table):
     found = {}
     for normalise in (True, False):
         learner = replace(config, normalise=normalise).build(Told(), near, 4)
-        made = training_data(learner.settings, Told(), near, np.asarray(right, np.float64))
+        made = training_data(learner.config, Told(), near, np.asarray(right, np.float64))
         state = jax.jit(learner.init)(made, jax.random.key(0))
         for _ in range(4):
             state, _ = jax.jit(learner.iterate)(made, state)
-        found[normalise] = learner.judge(ExperienceConfig().of(Told(), near), state)
+        found[normalise] = learner.held_out_metrics(ExperienceConfig().of(Told(), near), state)
     assert found[True]["fitted_q"] == pytest.approx(worth, rel=0.05)
     assert abs(found[False]["fitted_q"] - worth) > 0.2 * worth
 
@@ -94,7 +94,7 @@ def test_checkpoints_are_compared_by_it():
     assert rank("score", row) == (0.5,)
     values = {"checkpoint_rule": "fitted_q", "evaluate_every": 1}
     for algorithm in ({"kind": "bc"}, {"kind": "iql"}):
-        with pytest.raises(UsageError, match="evaluates by no fitted Q"):
+        with pytest.raises(UsageError, match="needs fitted-Q evaluation"):
             settings.load(TrainConfig, values | {"algorithm": algorithm})
     fits = {"kind": "iql", "fitted_q": {"updates": 5}}
     assert settings.load(TrainConfig, values | {"algorithm": fits}).checkpoint_rule == "fitted_q"

@@ -56,7 +56,7 @@ def test_losses_against_numpy(mask):
     density = stats.norm.logpdf(np.arctanh(action.astype(float)), loc, scale) - np.log1p(-(action**2.0))
     for loss, expected in (("mse", (error**2).mean(axis=-1)), ("likelihood", -density.sum(axis=-1))):
         cloning = Cloning(loss=loss, mask_clipped=mask)
-        found, logs = cloning.of_batch(gaussian, parameters, Told(), data, jax.random.key(0))
+        found, logs = cloning.batch_loss(gaussian, parameters, Told(), data, jax.random.key(0))
         assert float(found) == pytest.approx(expected[counts].mean(), rel=1e-4)
         assert float(logs["imitation_error"]) == pytest.approx(np.abs(error)[counts].mean(), rel=1e-4)
         assert float(logs["left_out"]) == pytest.approx(2 / 6 if mask else 0.0, abs=1e-6)
@@ -69,7 +69,7 @@ def test_clipped_moments_teach_nothing():
     for loss in ("mse", "likelihood"):
 
         def of(parameters, loss=loss):
-            return Cloning(loss=loss).of_batch(gaussian, parameters, Told(), data, jax.random.key(0))[0]
+            return Cloning(loss=loss).batch_loss(gaussian, parameters, Told(), data, jax.random.key(0))[0]
 
         slope = jax.grad(of)(parameters)["loc"][:, 0]
         assert slope[0] == 0.0 and slope[1] < 0.0
@@ -97,7 +97,7 @@ def test_a_grid_and_missing_experts_are_refused(shown):
     learner = BcConfig(network=network, loss="likelihood", batch=8, updates=2).build(environment, shown, 1)
     state = jax.jit(learner.init)(shown, jax.random.key(0))
     assert isinstance(learner.distribution(state.parameters, {"pendulum": jnp.zeros(3)}), Grid)
-    with pytest.raises(UsageError, match="gradient through its samples"):
+    with pytest.raises(UsageError, match="reparameterised samples"):
         SacConfig(network=network)
 
 
@@ -108,8 +108,8 @@ def test_imitation_fades():
     with pytest.raises(UsageError, match="use 0 or more"):
         WarmStart(weight=-1.0)
     with pytest.raises(UsageError, match="raise total_steps"):
-        WarmStart(iterations=5).rest(5)
-    assert WarmStart(iterations=5).rest(8) == 3
+        WarmStart(iterations=5).remaining(5)
+    assert WarmStart(iterations=5).remaining(8) == 3
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.learning.loop import logged, train
+from drivax.learning.loop import mean_logs, train
 from drivax.learning.training_log import Preempted
 from drivax.tracking.sinks import MetricLog, read_rows
 
@@ -99,7 +99,7 @@ def test_means_of_an_iteration():
         "rollout/red_light": 0.0, "rollout/red_light/n": 0.0, "rollout/reward/progress": 5.0, "loss/value": 0.5,
         "loss/critic": 6.0, "loss/critic/n": 3.0, "loss/imitation": 0.0, "loss/imitation/n": 0.0,
     }  # fmt: skip
-    assert logged(raw) == {
+    assert mean_logs(raw) == {
         "rollout/episodes": 4.0, "rollout/success": 0.75, "reward/progress": 0.1, "loss/value": 0.5,
         "loss/critic": 2.0,
     }  # fmt: skip

@@ -24,6 +24,7 @@ from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.sinks import read_rows
@@ -45,7 +46,7 @@ def part():
         action=jax.random.uniform(keys[1], (COUNT, 1), minval=-0.9, maxval=0.9),
         reward=jax.random.normal(keys[2], (COUNT,)),
         terminated=jax.random.bernoulli(keys[3], 0.3, (COUNT,)),
-        following={"pendulum": jax.random.normal(keys[4], (COUNT, 3))},
+        next_observation={"pendulum": jax.random.normal(keys[4], (COUNT, 3))},
     )
 
 
@@ -85,7 +86,7 @@ def test_cql_against_numpy(part, improved):
         critic_key, policy_key = jax.random.split(key)
         next_key, sample_key = jax.random.split(critic_key)
         uniform_key, now_key, then_key = jax.random.split(sample_key, 3)
-        following = learner.distribution(trained["policy"], part.following)
+        following = learner.distribution(trained["policy"], part.next_observation)
         now = learner.distribution(trained["policy"], part.observation)
         there = learner.distribution(trained["policy"], improved[0])
         then = jnp.stack([jnp.tanh(following.sample(own)) for own in jax.random.split(next_key, 2)])
@@ -94,16 +95,18 @@ def test_cql_against_numpy(part, improved):
         for number in range(ACTIONS):
             for name, policy, own in (("now", now, now_key), ("then", following, then_key)):
                 choice = policy.sample(jax.random.split(own, ACTIONS)[number])
-                q = learner.q(trained["critic"], part.observation, jnp.tanh(choice))
+                q = learner.q_values(trained["critic"], part.observation, jnp.tanh(choice))
                 rows[name].append((q, policy.log_prob(choice)))
-            rows["uniform"].append((learner.q(trained["critic"], part.observation, uniform[number]), None))
+            rows["uniform"].append(
+                (learner.q_values(trained["critic"], part.observation, uniform[number]), None)
+            )
         choice = there.sample(policy_key)
         return {
-            "target": learner.q(target["critic"], part.following, then),
-            "q": learner.q(trained["critic"], part.observation, part.action),
+            "target": learner.q_values(target["critic"], part.next_observation, then),
+            "q": learner.q_values(trained["critic"], part.observation, part.action),
             **{f"q_{name}": jnp.stack([q for q, _ in found]) for name, found in rows.items()},
             **{f"p_{name}": jnp.stack([p for _, p in rows[name]]) for name in ("now", "then")},
-            "judged": learner.q(trained["critic"], improved[0], jnp.tanh(choice)),
+            "judged": learner.q_values(trained["critic"], improved[0], jnp.tanh(choice)),
             "log_prob": there.log_prob(choice),
             "mode": there.mode(),
         }
@@ -150,13 +153,13 @@ def test_the_published_penalty_puts_the_action_of_the_data_among_the_others(part
     _, logs = losses(learner, trained, target, part, improved, key)
     sample_key = jax.random.split(jax.random.split(key)[0])[1]
     now, following = (
-        learner.distribution(trained["policy"], seen) for seen in (part.observation, part.following)
+        learner.distribution(trained["policy"], seen) for seen in (part.observation, part.next_observation)
     )
     action, density = learner._sampled(now, following, part.action, sample_key)
     assert action.shape == (2 * ACTIONS + 1, COUNT, 1) and not np.asarray(density).any()
     np.testing.assert_array_equal(action[-1], part.action)
-    q = np.asarray(learner.q(trained["critic"], part.observation, action), np.float64)
-    data = np.asarray(learner.q(trained["critic"], part.observation, part.action), np.float64)
+    q = np.asarray(learner.q_values(trained["critic"], part.observation, action), np.float64)
+    data = np.asarray(learner.q_values(trained["critic"], part.observation, part.action), np.float64)
     # The study's, but for a constant: the logarithm of how many there are.
     expected = (special.logsumexp(q, axis=1) - data).mean() - np.log(2 * ACTIONS + 1)
     assert logs["penalty"] == pytest.approx(expected, rel=1e-4)
@@ -170,11 +173,11 @@ def test_iql_against_numpy(part, improved):
     def outputs(trained):
         policy = learner.distribution(trained["policy"], improved[0])
         return {
-            "target": learner.q(target["critic"], part.observation, part.action),
-            "q": learner.q(trained["critic"], part.observation, part.action),
+            "target": learner.q_values(target["critic"], part.observation, part.action),
+            "q": learner.q_values(trained["critic"], part.observation, part.action),
             "value": learner._value(trained["value"], part.observation),
-            "then": learner._value(trained["value"], part.following),
-            "there": learner.q(target["critic"], *improved),
+            "then": learner._value(trained["value"], part.next_observation),
+            "there": learner.q_values(target["critic"], *improved),
             "value_there": learner._value(trained["value"], improved[0]),
             "log_prob": policy.log_prob(jnp.arctanh(improved[1])),
         }
@@ -205,14 +208,14 @@ def test_td3_bc_against_numpy(part, improved):
 
     @jax.jit
     def outputs(trained):
-        mode = learner.distribution(target["policy"], part.following).mode()
+        mode = learner.distribution(target["policy"], part.next_observation).mode()
         noise = 0.5 * jax.random.normal(key, mode.shape)
         then = jnp.clip(mode + jnp.clip(noise, -0.3, 0.3), -1.0, 1.0)
         action = learner.distribution(trained["policy"], improved[0]).mode()
         return {
-            "target": learner.q(target["critic"], part.following, then),
-            "q": learner.q(trained["critic"], part.observation, part.action),
-            "judged": learner.q(trained["critic"], improved[0], action)[0],
+            "target": learner.q_values(target["critic"], part.next_observation, then),
+            "q": learner.q_values(trained["critic"], part.observation, part.action),
+            "judged": learner.q_values(trained["critic"], improved[0], action)[0],
             "off": action - improved[1],
             "noise": noise,
         }
@@ -302,7 +305,7 @@ def test_arms_that_nobody_pulled(bandit, config, stays):
     learner, state, _ = learned(config, bandit)
     seen = {"pendulum": jnp.ones(3)}
     action = learner.distribution(state.parameters, seen).mode()
-    believed = float(learner.q(state.rest["critic"], seen, action).min())
+    believed = float(learner.q_values(state.rest["critic"], seen, action).min())
     true = float(action[0]) if abs(float(action[0])) <= 0.5 else -1.0
     assert (abs(float(action[0])) <= 0.55) == stays, float(action[0])
     assert (believed - true > 0.5) == (not stays), (believed, true)
@@ -359,10 +362,10 @@ def test_what_cannot_be_learned_is_refused():
     assert IqlConfig(network=grid).loss == "likelihood"
     for config, words in (
         (partial(IqlConfig, expectile=1.0), "an expectile of 1"),
-        (partial(IqlConfig, inverse_temperature=-1.0), "weights of IQL"),
+        (partial(IqlConfig, inverse_temperature=-1.0), "inverse_temperature or largest_weight"),
         (partial(CqlConfig, actions=0), "too small"),
         (partial(CqlConfig, backup_actions=0), "too small"),
-        (partial(CqlConfig, penalty=0.0, gap=1.0), "nothing for a multiplier"),
+        (partial(CqlConfig, penalty=0.0, gap=1.0), "penalty is 0 with a gap"),
         (partial(Td3BcConfig, delay=0), "a delay of 1"),
     ):
         with pytest.raises(UsageError, match=words):
@@ -434,10 +437,12 @@ def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
     assert rows[0]["sampler/policy_effective"] > 100
     bank = ScenarioBank.from_scenarios(data)
     planner, _ = load_policy(run.path, bank)
-    learner = config.algorithm.build(config.environment(), bank, config.iterations)
-    held_out = training_data(config.algorithm, config.environment(), bank)
+    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+    held_out = training_data(config.algorithm, config.environment(LogTraffic()), bank)
     state = Checkpoints(run.checkpoints).restore(jax.eval_shape(learner.init, bank, jax.random.key(0)))
-    assert rows[-1]["validation/mean_q"] == pytest.approx(learner.judge(held_out, state)["mean_q"], rel=1e-5)
+    assert rows[-1]["validation/mean_q"] == pytest.approx(
+        learner.held_out_metrics(held_out, state)["mean_q"], rel=1e-5
+    )
     assert isinstance(planner, Planner)
 
 

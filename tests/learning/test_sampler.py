@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from drivax.errors import DataError
-from drivax.learning.sampler import Sampler, draw, sampler
+from drivax.learning.experience import Sampler, draw, sampler
 
 COUNT = 200_000
 _draw = partial(jax.jit, static_argnums=2)(draw)

@@ -10,7 +10,7 @@ import pytest
 PROGRAM = """
 import os
 from drivax.cli import train
-from drivax.learning.devices import widen_pool
+from drivax.learning.program import widen_pool
 os.cpu_count = lambda: 2
 widen_pool()
 import jax

@@ -15,7 +15,7 @@ from drivax.rl.offline import (
     scaled_policy_loss,
     smoothed_action,
 )
-from drivax.rl.temporal_difference import td_target
+from drivax.rl.online import td_target
 
 STATES, ACTIONS, GAMMA = 6, 4, 0.9
 

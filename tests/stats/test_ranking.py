@@ -26,14 +26,14 @@ def by_pairs(scores, labels, weights):
     return (pairs * ((a > b) + (a == b) / 2)).sum() / pairs.sum()
 
 
-def test_auc_is_that_of_all_pairs():
+def test_auc_equals_the_share_of_ordered_pairs():
     assert roc_auc(SCORES, LABELS) == pytest.approx(by_pairs(SCORES, LABELS, np.ones(150)), rel=1e-12)
     assert roc_auc(SCORES, LABELS, WEIGHTS) == pytest.approx(by_pairs(SCORES, LABELS, WEIGHTS), rel=1e-12)
     assert roc_auc(np.ones(150), LABELS) == 0.5
     assert roc_auc(LABELS.astype(float), LABELS) == 1.0
 
 
-def test_the_interval_is_that_of_the_placement_values():
+def test_interval_equals_that_of_placement_values():
     a, b = SCORES[LABELS][:, None], SCORES[~LABELS]
     right = (a > b) + (a == b) / 2
     spread = np.sqrt(right.mean(1).var(ddof=1) / len(a) + right.mean(0).var(ddof=1) / len(b))
@@ -41,7 +41,7 @@ def test_the_interval_is_that_of_the_placement_values():
     np.testing.assert_allclose(auc_interval(SCORES, LABELS), wanted, rtol=1e-6)
 
 
-def test_the_interval_covers_the_truth():
+def test_interval_covers_the_true_value():
     """Normal scores a standard deviation apart: the truth is Phi(1 / sqrt 2) = 0.7592."""
     covered = 0
     for _ in range(400):
@@ -70,7 +70,7 @@ def test_weights_are_repetitions():
         assert measure(SCORES, LABELS, times.astype(float)) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_what_cannot_be_meant():
+def test_invalid_arguments_are_refused():
     for measure in (roc_auc, precision_at_base_rate):
         with pytest.raises(UsageError, match="all true or all false"):
             measure(SCORES, np.zeros(150, bool))
@@ -78,14 +78,14 @@ def test_what_cannot_be_meant():
         auc_interval(SCORES, np.arange(150) == 0)
 
 
-def test_rank_correlation_is_scipys():
+def test_rank_correlation_equals_scipy():
     rng = np.random.default_rng(0)
     one, other = rng.integers(0, 20, 200).astype(float), rng.normal(size=200)
     other += 0.1 * one
     assert rank_correlation(one, other) == pytest.approx(stats.spearmanr(one, other).statistic)
 
 
-def test_a_cluster_bootstrap_covers_and_knows_what_belongs_together():
+def test_cluster_bootstrap_covers_the_true_value():
     """Forty scenarios of twenty steps that share most of their score: by steps alone intervals are far too short."""
     rng, truth, covered, apart = np.random.default_rng(3), 0.7592, [], []
     labels = np.repeat(np.arange(40) < 20, 20)

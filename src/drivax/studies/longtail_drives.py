@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.controls import event_kinds
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.methods import Request, curate
 from drivax.errors import UsageError
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
@@ -60,7 +60,7 @@ def rare_rows(config: LongtailConfig, test: ScenarioSet) -> Bool[np.ndarray, " n
     labelled = event_kinds(test) > 0
     if labelled.any():
         return labelled
-    scores = curate("kinematic", Wanted(test)).scenarios
+    scores = curate("kinematic", Request(test)).scenarios
     return scores >= np.quantile(scores, 1.0 - config.rare)
 
 

@@ -21,7 +21,7 @@ Rows = Bool[np.ndarray, " scenario"]
 Counts = Float[np.ndarray, " scenario"]
 Verdict = Literal["supported", "contradicted", "undecided"]
 #: Against the baseline, against a lot, in common and in rare scenarios, in other failures, between methods.
-Group = Literal["baseline", "lot", "where", "failures", "methods"]
+ClaimGroup = Literal["baseline", "lot", "where", "failures", "methods"]
 
 #: What is reported of every agent, and whether more of it is better.
 METRICS = {
@@ -98,7 +98,7 @@ class Claim:
     words: str
     one: str
     other: str
-    group: Group
+    group: ClaimGroup
     metric: str = "collision"
     rows: str = "ordinary"
     change: float | None = None
