@@ -78,14 +78,14 @@ def bootstrap_intervals(
 
     Args:
         scores: Scores.
-        labels: What is to be samples.
+        labels: True for positives.
         weights: Weight of each.
         clusters: What belongs together: the scenario of a step.
         resamples: How often.
         confidence: Of both intervals.
 
     Raises:
-        UsageError: There is nothing to be samples, or nothing else.
+        UsageError: There are no positives, or no negatives.
     """
     _check(labels)
     place, rng = _places(scores), np.random.default_rng(0)
