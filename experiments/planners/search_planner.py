@@ -54,15 +54,15 @@ _CROSSES_MPS = 4.5
 
 @record
 class Trend:
-    """How everybody's motion changes, smoothed over about half a second.
+    """How the motion of all agents changes, smoothed over about half a second.
 
     Attributes:
         direction: Cosine and sine of the heading one step ago.
         speed: Speed then, m/s.
-        valid: Whether there was somebody.
+        valid: Whether the slot had an agent.
         turning: Yaw rate, rad/s.
         acceleration: Along the heading, m/s2.
-        stood_s: For how long somebody has been seen to stand, s.
+        stood_s: How long the agent has stood, s.
     """
 
     direction: Float[Array, "S 2"]
@@ -154,7 +154,7 @@ class Others:
         Args:
             bank: The scenarios.
             context: Who is ego, and where.
-            frame: Everybody.
+            frame: All agents.
             trend: How they have moved.
             route: Ego's route: points ahead, whether they exist, their offsets in m.
         """
@@ -238,8 +238,8 @@ def _along_lanes(
             bent = jnp.stack([heading[0] * cos - heading[1] * sin, heading[0] * sin + heading[1] * cos])
             lane, left, there = lane_course(bank, context.index, xy + bent * way / 2, bent, context.z)
             back = jnp.clip(-left / jnp.maximum(3.0 * way, 4.0), -0.4, 0.4)
-            wanted = lane + back * jnp.stack([-lane[1], lane[0]])
-            heading = jnp.where(there, wanted / _length(wanted), bent)
+            steered = lane + back * jnp.stack([-lane[1], lane[0]])
+            heading = jnp.where(there, steered / _length(steered), bent)
             xy = xy + heading * way
             return (xy, heading), (jnp.concatenate([xy, heading]), there)
 
@@ -306,22 +306,22 @@ def prediction_times() -> Float[Array, " H"]:
 #: Lateral offsets from the route to go to, m, and accelerations that are not exceeded on the way, m/s2.
 _SHIFTS = (0.0, -1.2, 1.2, -2.4, 2.4, -3.5, 3.5)
 _CAPS = (2.0, 0.0, -1.5, -3.0, -6.0, 2.0)
-#: By how much each exceeds the speed that is wanted: the last one hurries out of others' way.
+#: By how much each exceeds the desired speed: the last one hurries past conflicts.
 _HASTE = (1.0, 1.0, 1.0, 1.0, 1.0, 1.4)
 #: Points along the route and their spacing, m.
 _POINTS, _STEP_M = 46, 2.0
 #: Lateral acceleration with which the car goes aside, m/s2.
 _ASIDE_MPS2 = 3.5
-#: Free space before and beside the car that is as good as none, that is enough, and to what may come, m.
+#: Free space ahead of and next to the car: too small, enough, and to uncertain agents, m.
 _TIGHT_M, _FREE_M, _MAYBE_M = (0.1, 0.1), (0.6, 0.5), (0.6, 0.3)
-#: Who shifts by more leaves the lane, m.
+#: A larger shift leaves the lane, m.
 _LANE_M = 2.0
 #: What has stood this long is no queue, s, unless something stands this near before it, or a red light, m.
 _STUCK_S, _QUEUE_M, _LIGHT_M = 2.5, 14.0, 60.0
 #: Who crosses may come sooner or later than expected by this, s, and m per squared s of foresight, at most by m.
 _EARLY_S, _EARLY_MPS2, _EARLY_M = 0.25, 0.2, 6.0
-#: Who walks or rides is passed with this much more space beside them, m.
-_BESIDE_M = 0.6
+#: Extra lateral space for pedestrians and cyclists, m.
+_VULNERABLE_SPACE_M = 0.6
 #: Prices: of a hit, more the sooner it comes, of one from behind, of one that is only possible, of leaving the road
 #: and of being off it all the time, of driving outside the lanes that go one's way, of passing closely.
 _HIT, _SOONER, _REAR, _MAYBE, _OFF, _ASTRAY, _CLOSE = 60.0, 100.0, 0.3, 40.0, 50.0, 30.0, 4.0
@@ -337,7 +337,7 @@ class SearchPlanner:
     """Chooses among 42 manoeuvres along the route; knows the present truth, and nothing of the future.
 
     A manoeuvre is a lateral offset to go to and an acceleration that is not exceeded; below that, the car follows
-    what is ahead of it by IDM; one more goes faster than usual, to get out of somebody's way. Each is driven for
+    what is ahead of it by IDM; one more drives faster to clear conflicts. Each is driven for
     5 s with the dynamics and the steering law that the car really has. It loses by hitting others, the sooner the
     more, by crossing the way of who may come a little sooner or later than expected, by leaving the road and its
     lanes, by passing closely, by losing way and by braking.
@@ -351,7 +351,7 @@ class SearchPlanner:
     replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Trend:
-        """What everybody did in the half second before the start."""
+        """Return the motion trend of the half second before the start."""
         return Trend.logged(bank, state.context)
 
     def act(
@@ -368,7 +368,7 @@ class SearchPlanner:
         me, speed = frame.box[context.slot], context.history[-1, 3]
         offsets = jnp.arange(_POINTS) * _STEP_M
         path, there = route_ahead(bank, context.index, context.route_m, offsets)
-        wanted = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
+        desired = jnp.where(there[1], desired_speed(path, there, offsets), 0.0)
         stop = stop_line_m(bank, context, frame)
         trend = carry.updated(frame)
         others = Others.near(bank, context, frame, trend, (path, there, offsets))
@@ -377,7 +377,7 @@ class SearchPlanner:
 
         def line_costs(shift: Array) -> tuple[Array, Array, Array]:
             line = _line(path, offsets, (lateral, shift), me, speed)
-            pose, way, first = self._driven(line, there, offsets, others, (me, speed, wanted, stop))
+            pose, way, first = self._driven(line, there, offsets, others, (me, speed, desired, stop))
             cost = jax.vmap(lambda driven: _danger(driven, me, others))(pose)
             off, astray = _bad_ground(bank, situation, pose[0], (line, there), me)
             astray_price = jnp.where(stuck, 0.1, 1.0) * _ASTRAY
@@ -398,7 +398,7 @@ class SearchPlanner:
         self, line: Array, there: Array, offsets: Array, others: Others, ego: tuple[Array, ...]
     ) -> tuple[Float[Array, "C H 4"], Float[Array, " C"], Float[Array, "C 2"]]:
         """Poses along a line under each cap, the way made, and the first acceleration and curvature."""
-        me, start, wanted, stop = ego
+        me, start, desired, stop = ego
         sharpest = self.actions.sharpest(me[LENGTH])
         rear, leader_speed = jax.vmap(lambda now: _corridor(line, there, offsets, others, now, me))(
             (others.box, others.speed)
@@ -406,7 +406,7 @@ class SearchPlanner:
         left_m = jnp.sum(there) * _STEP_M
 
         def cap_driven(cap: Array, haste: Array) -> tuple[Array, Array, Array]:
-            hurried = wanted * haste
+            hurried = desired * haste
 
             def step(now: tuple[Array, ...], ahead: tuple[Array, Array]) -> Any:
                 pose, way, v = now
@@ -452,19 +452,19 @@ def _line(
     me: Array,
     speed: Array,
 ) -> Float[Array, "P 7"]:
-    """The route, shifted: from where the car is beside it, the way it looks, to an offset.
+    """Route shifted laterally from the present offset and heading of the car to a target offset.
 
     A cubic whose largest lateral acceleration, 6 d / T^2 for a shift by d within T, is 3.5 m/s2.
     """
-    beside, shift = aside
+    lateral, shift = aside
     cos, sin = path[:, RouteColumn.COS], path[:, RouteColumn.SIN]
     forward, left = me[COS] * cos[0] + me[SIN] * sin[0], me[SIN] * cos[0] - me[COS] * sin[0]
     slope = jnp.clip(left / jnp.maximum(forward, 0.3), -0.5, 0.5)
-    takes_s = jnp.clip(jnp.sqrt(6.0 * jnp.abs(shift - beside) / _ASIDE_MPS2), 1.0, 2.5)
+    takes_s = jnp.clip(jnp.sqrt(6.0 * jnp.abs(shift - lateral) / _ASIDE_MPS2), 1.0, 2.5)
     length = jnp.clip(takes_s * speed, 6.0, 40.0)
     u = jnp.clip(offsets / length, 0.0, 1.0)
-    d = beside + (shift - beside) * u * u * (3.0 - 2.0 * u) + slope * length * u * (1.0 - u) ** 2
-    slopes = (shift - beside) * 6.0 * u * (1.0 - u) / length + slope * (1.0 - u) * (1.0 - 3.0 * u)
+    d = lateral + (shift - lateral) * u * u * (3.0 - 2.0 * u) + slope * length * u * (1.0 - u) ** 2
+    slopes = (shift - lateral) * 6.0 * u * (1.0 - u) / length + slope * (1.0 - u) * (1.0 - 3.0 * u)
     norm = jnp.sqrt(1.0 + slopes * slopes)
     turned = jnp.stack([(cos - sin * slopes) / norm, (sin + cos * slopes) / norm], axis=-1)
     xy = path[:, RouteColumn.XY] + d[:, None] * jnp.stack([-sin, cos], axis=-1)
@@ -522,7 +522,7 @@ def _danger(pose: Float[Array, "H 4"], me: Array, others: Others) -> Array:
     times = prediction_times()[:, None]
     early = jnp.minimum(_EARLY_S * others.speed + _EARLY_MPS2 * times * times, _EARLY_M)
     wide = others.box.at[..., LENGTH].add(jnp.where(crosses, 2.0 * early, 0.0))
-    wide = wide.at[..., WIDTH].add(jnp.where(others.vulnerable, 2.0 * _BESIDE_M, 0.0))
+    wide = wide.at[..., WIDTH].add(jnp.where(others.vulnerable, 2.0 * _VULNERABLE_SPACE_M, 0.0))
     near = meets(wide, _FREE_M) & ~others.behind
     cut = (near & crosses).any(axis=1)
     worst += jnp.where(cut.any(), _CUTS, 0.0) + _CUTS_LONG * jnp.mean(cut)

@@ -58,7 +58,7 @@ def test_gymnasiums_own_checker(data):
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_ids(name):
+def test_environment_ids_are_registered(name):
     """The spec says what the environment is; none is made here."""
     spec = gymnasium.spec(f"drivax/{name}-v0")
     assert spec.kwargs == {"task": TASKS[name]}
@@ -112,7 +112,7 @@ def test_spaces_are_the_tasks_groups(data):
     assert without.reset(seed=0)[0] in without.observation_space
 
 
-def test_a_step_is_the_simulators(env, data):
+def test_step_equals_the_simulator(env, data):
     simulator = drivax.make_simulator(SMALL)
     action = np.array([0.5, -0.1], np.float32)
 
@@ -207,7 +207,7 @@ def test_errors_are_one_line(env):
         env.step(STILL)
 
 
-def test_without_gymnasium(monkeypatch):
+def test_missing_gymnasium_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     spec = importlib.util.spec_from_file_location("gym_again", gym.__file__)
     with pytest.raises(UsageError) as error:
@@ -230,7 +230,7 @@ def test_steps_are_compiled_once(data):
 
 
 @pytest.mark.slow
-def test_a_batch_is_as_many_single_environments(data, env):
+def test_vector_environment_equals_single_environments(data, env):
     """Every number of a batch of three against the same episodes one by one, through ends and new beginnings."""
     vector = VectorDrivingEnv(3, data, SMALL)
     assert vector.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
@@ -282,8 +282,8 @@ def test_seeds_and_errors_of_a_batch(data):
 
 
 @pytest.mark.slow
-def test_pictures(data):
-    """Ego is drawn where it drove: the picture changes when it brakes, not in size."""
+def test_render_draws_ego_at_its_simulated_pose(data):
+    """Rendering shows ego at its simulated pose; braking changes the picture, not its size."""
     env = DrivingEnv(data, SMALL, render_mode="rgb_array")
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.render()

@@ -94,7 +94,7 @@ def test_a_list_names_sets_and_metrics_and_brings_what_they_need():
     assert select_metrics(("full", "own_terms:lane_changes")).reads == FACTS | {"lane_changed"}
 
 
-def test_misspelt_names_get_one_line():
+def test_misspelt_names_fail_with_one_line():
     for wanted in ("trainin", ("training", "min_tcc")):
         with pytest.raises(UsageError, match="did you mean"):
             Task(metrics=wanted)
@@ -115,20 +115,20 @@ def test_configuration_files_choose_a_set():
     assert Task().metrics == "full"
 
 
-def test_what_is_not_selected_is_not_computed(traced):
+def test_unselected_metrics_are_not_computed(traced):
     assert traced["none"].called == traced["training"].called == {"check_lights"}
     assert traced["full"].called == set(COSTLY)
     assert traced[("at_fault_collision",)].called == {"check_lights", "classify_contacts"}
     assert traced["none"].operations < traced["training"].operations < 0.85 * traced["full"].operations
 
 
-def test_what_is_not_selected_is_not_carried(traced):
+def test_unselected_metrics_are_not_carried(traced):
     for less, more in pairwise(traced[name].state for name in ("none", "training", "full")):
         assert size(less.episode) < size(more.episode) and size(less.facts) < size(more.facts)
     assert size(traced["none"].state.episode) == 0 and size(traced["full"].state.episode) <= 200
 
 
-def test_facts_that_nobody_reads_are_none(traced):
+def test_unread_facts_are_none(traced):
     facts = traced["none"].state.facts
     kept = {name for name in FACTS if getattr(facts, name) is not None}
     assert kept == Task(metrics="none").reads

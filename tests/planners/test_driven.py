@@ -1,4 +1,4 @@
-"""Others than ego, driven by a network: as several driven agents would be, and nobody else."""
+"""Traffic driven by a network equals several driven agents."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Untrained(nnx.Module):
 
 @pytest.fixture(scope="module")
 def bank():
-    """Ego; a car beside, a parked-like one, a cyclist, a car ahead, and two further away."""
+    """Ego; a car alongside, one that is nearly parked, a cyclist, a car ahead, and two further away."""
     cars = [
         car(speed=8.0), car(-3, 3.7, 0, 9), car(15, 3.7, 0, 0.1), car(10, 0, 0, 5, kind=AgentKind.CYCLIST),
         car(25, 0, 0, 7), car(60, 3.7, 0, 10), car(90, 0, 0, 10),
@@ -74,7 +74,7 @@ def test_the_nearest_moving_vehicles_are_driven(bank):
     assert slots[:3] == nearest(bank) and slots[4:] == [bank.agents.shape[2]] * 2
 
 
-def test_what_cannot_drive_is_refused(bank):
+def test_planners_unfit_for_traffic_are_refused(bank):
     with pytest.raises(UsageError, match="cannot drive others"):
         with_driver(bank, Expert())
     with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):
@@ -82,7 +82,7 @@ def test_what_cannot_drive_is_refused(bank):
 
 
 @pytest.mark.slow
-def test_they_drive_as_agents_that_are_stepped_together(bank):
+def test_driven_traffic_equals_agents_stepped_together(bank):
     """The same policy in two loops that share no step: as traffic of ego, and in a stack of driven agents with ego."""
     simulator, ego = Simulator(TASK, TRAFFIC), jnp.array([0.3, 0.05])
 

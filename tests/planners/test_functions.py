@@ -23,7 +23,7 @@ STEPS = (10, 15, 40)
 
 @pytest.fixture(scope="module")
 def bank():
-    """Nobody else is in the second scenario."""
+    """The second scenario has ego only."""
     return bank_of(straight_road([car(0, 0.5, 0.1, 9), car(30, 0, 0, 5)]), straight_road([car(0, 0, 0, 3)]))
 
 
@@ -51,7 +51,7 @@ def actions(planner, bank, moments, batched=True):
 
 
 @pytest.mark.slow
-def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
+def test_python_and_jax_planners_agree_batched_or_alone(bank, moments):
     with raised() as errors:
         python, in_jax = (actions(planner, bank, moments) for planner in (slow_python, slow_jax))
         np.testing.assert_allclose(
@@ -70,7 +70,7 @@ def test_python_and_jax_drive_alike_batched_or_alone(bank, moments):
 
 @pytest.mark.slow
 def test_python_and_jax_make_the_same_episodes(bank):
-    """Inside the compiled loop over all steps; both crash where nobody else is, at step 15."""
+    """Inside the compiled loop over all steps; both crash at step 15 of the scenario with ego only."""
     rows = jnp.arange(2)
     keys = episode_keys(bank, rows, 0)
     with raised() as errors:
@@ -84,7 +84,7 @@ def test_python_and_jax_make_the_same_episodes(bank):
     assert (python.motion[1, 5:] == python.motion[1, 5]).all(), "nobody drives it any more"
 
 
-def test_what_is_no_action_is_told(bank, moments):
+def test_invalid_actions_are_reported(bank, moments):
     @python_planner
     def three(situation, observation):
         return 0.0, 0.0, 0.0
@@ -100,12 +100,12 @@ def test_what_is_no_action_is_told(bank, moments):
         assert all(words in text for text in errors.values()), errors
 
 
-def test_errors_end_a_loop_of_ones_own(bank, moments):
+def test_errors_end_a_custom_loop(bank, moments):
     with pytest.raises(Exception, match="nobody"):
         actions(slow_python, bank, moments)
 
 
-def test_by_name():
+def test_planner_functions_are_loaded_by_name():
     for name in ("slow_python", "slow_jax"):
         planner = make_planner(f"own_drivers:{name}")
         assert isinstance(planner, Planner) and planner.name == name and not planner.replays

@@ -77,13 +77,13 @@ def on_a_circle(bank, radius):
     return replace(bank, routes=routes, route_points=jnp.full_like(bank.route_points, 120))
 
 
-def test_lines_are_as_far_from_the_route_as_asked_and_evenly_spaced():
+def test_lines_keep_their_offset_from_the_route_and_even_spacing():
     radius = 25.0
     bank = on_a_circle(bank_of(straight_road([car(0, 0, 0, 9)])), radius)
     me = jnp.asarray([0.0, 0.0, 1.0, 0.0, 4.8, 2.0])
 
     def lines(bank):
-        return Lines.beside_route(bank, jnp.asarray(0), jnp.asarray(7.0), (0.0, -1.0, 1.0), me)
+        return Lines.along_route(bank, jnp.asarray(0), jnp.asarray(7.0), (0.0, -1.0, 1.0), me)
 
     found = quick(lines, bank)
     assert found.left_m == pytest.approx(112.0) and found.limit == pytest.approx(10.0)
@@ -104,7 +104,7 @@ def test_without_a_route_the_lines_lead_straight_ahead():
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
     bank = replace(bank, route_points=jnp.zeros_like(bank.route_points))
     me = jnp.asarray([5.0, 3.0, 0.6, 0.8, 4.8, 2.0])
-    found = quick(lambda b: Lines.beside_route(b, jnp.asarray(0), jnp.asarray(0.0), (0.0, 1.0), me), bank)
+    found = quick(lambda b: Lines.along_route(b, jnp.asarray(0), jnp.asarray(0.0), (0.0, 1.0), me), bank)
     way = np.arange(160)[:, None] * np.array([0.6, 0.8])
     np.testing.assert_allclose(found.points[0, :, :2], way + np.array([5.0, 3.0]), atol=1e-3)
     np.testing.assert_allclose(found.points[1, :, :2], way + np.array([4.2, 3.6]), atol=1e-3)
@@ -142,7 +142,7 @@ def idm_oracle(boxes, velocities, speed, wanted, stop, offset):
 
 @pytest.mark.parametrize("stop", (np.inf, 22.0))
 def test_idm_is_unrolled_as_in_double_precision(stop):
-    """A slower leader ahead, somebody who crosses from the right, one who leaves, and one beside the road."""
+    """A slower leader ahead, an agent crossing from the right, one that leaves, and one off the road."""
     boxes = [(30.0, 0.0, 2.4, 1.0), (38.0, -14.1, 1.0, 2.4), (12.0, 1.05, 1.0, 2.4), (20.0, 8.0, 2.4, 1.0)]
     velocities = [(4.0, 0.0), (0.0, 4.0), (0.0, 3.0), (9.0, 0.0)]
     heading = [0.0, np.pi / 2, np.pi / 2, 0.0]
@@ -160,7 +160,7 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
     def proposals(bank, others, stop):
         along = bank.routes[0, 0, :, 0]
         start = jnp.argmin(jnp.abs(along)).astype(jnp.float32)
-        lines = Lines.beside_route(bank, jnp.asarray(0), start, (0.0, -1.0, 1.0), me)
+        lines = Lines.along_route(bank, jnp.asarray(0), start, (0.0, -1.0, 1.0), me)
         first = lines.points[0, 0, 0]
         moved = replace(others, box=others.box.at[:, 0].add(first))
         wanted, driver = jnp.asarray(fractions, jnp.float32), (PUBLISHED_DRIVER, 40, 2)
@@ -191,20 +191,20 @@ def test_on_a_free_road_the_fastest_proposal_in_the_middle_wins():
     assert not after.touched.any()
 
 
-def test_it_follows_a_slower_leader_without_a_collision():
+def test_pdm_follows_a_slower_leader_without_a_collision():
     action, _, weighed = decide(straight_road([car(0, 0, 0, 10), car(18, 0, 0, 5)]))
     best = int(np.argmax(weighed.score))
     assert action[0] < -0.05 and weighed.judgement.collision[best] == 1.0
 
 
-def test_it_stops_for_red_and_not_for_green():
+def test_pdm_stops_for_red_and_not_for_green():
     bank = bank_of(straight_road([car(0, 0, 0, 10)], light=RED, light_x=30.0))
     red, _, _ = considering(bank)
     green, _, _ = considering(replace(bank, light_state=jnp.full_like(bank.light_state, 6)))
     assert red[0] < -0.05 and green[0] > 0.0
 
 
-def test_it_passes_beside_what_reaches_a_little_into_the_lane():
+def test_pdm_passes_obstacles_that_reach_slightly_into_the_lane():
     """A box that reaches 0.45 m into the middle line's corridor leaves room a metre to the left."""
     box = partial(car, length=1.0, width=1.0, kind=AgentKind.OTHER)
     action, _, weighed = decide(straight_road([car(0, 0, 0, 10), box(30, -1.05, 0, 0)]))
@@ -212,7 +212,7 @@ def test_it_passes_beside_what_reaches_a_little_into_the_lane():
     assert best // 5 == 2 and action[1] > 0.0
 
 
-def test_the_brake_is_pulled_where_no_proposal_can_help():
+def test_emergency_brake_applies_when_no_proposal_is_safe():
     """1.2 m before a car that stands, at 4 m/s: IDM brakes with 3 m/s2 and the car lags."""
     action, after, weighed = decide(straight_road([car(0, 0, 0, 4), car(6.0, 0, 0, 0)]))
     best = int(np.argmax(weighed.score))
@@ -224,7 +224,7 @@ def test_the_brake_is_pulled_where_no_proposal_can_help():
     assert -3.0 < fast[0] * 6.0 < 0.0
 
 
-def test_who_touches_ego_is_ignored_from_then_on():
+def test_agents_that_touched_ego_are_ignored():
     overlapping = straight_road([car(0, 0, 0, 4), car(4.0, 0, 0, 0)])
     action, after, _ = decide(overlapping)
     assert after.touched.sum() == 1 and action[0] > 0.0
@@ -232,7 +232,7 @@ def test_who_touches_ego_is_ignored_from_then_on():
     assert decide(ahead, touched=True)[0][0] > 0.0
 
 
-def test_it_knows_nothing_of_the_future():
+def test_pdm_does_not_read_the_future():
     bank = bank_of(
         straight_road([car(0, 0, 0, 10), car(30, 0, 0, 5), PERSON(25, -5, np.pi / 2, 1.0)], light=RED)
     )
@@ -240,7 +240,7 @@ def test_it_knows_nothing_of_the_future():
     assert np.array_equal(seen[0], other[0]) and np.array_equal(seen[2].score, other[2].score)
 
 
-def test_the_world_may_be_turned_shifted_and_littered():
+def test_pdm_is_invariant_to_rotation_shift_and_padding_values():
     recording = straight_road([car(0, 0, 0, 10), car(24, 0.5, 0, 6), PERSON(40, -4, np.pi / 2, 1.0)])
     action, _, weighed = decide(recording)
     turned, _, other = decide(moved(recording, 0.7, 1000.0, -500.0))
@@ -256,7 +256,7 @@ def test_one_program_serves_all_planners_of_one_configuration():
     assert considered._cache_size() == 1
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_settings_are_refused():
     with pytest.raises(UsageError, match="no proposals"):
         PdmConfig(fractions=())
     with pytest.raises(UsageError, match="leader_every is 3, steps 40; use a divisor"):
@@ -270,7 +270,7 @@ def test_what_makes_no_sense_is_refused():
 # The brake -------------------------------------------------------------------------------------------------------
 
 
-def test_the_brake_by_hand():
+def test_emergency_brake_equals_hand_computation():
     acceleration = lambda v, a: float(braking(jnp.asarray(v), jnp.asarray(a)))  # noqa: E731
     assert acceleration(5.0, 0.0) == pytest.approx(-4.05)
     assert acceleration(0.3, -9.0) == pytest.approx(-3.0)  # -10 v above 0.2 m/s
@@ -282,7 +282,7 @@ def test_the_brake_by_hand():
     assert bool(is_emergency(jnp.asarray(2.5), jnp.asarray(9.0), BrakeConfig(within_s=3.0, up_to_mps=10.0)))
 
 
-def test_any_planner_can_have_the_brake():
+def test_any_planner_accepts_the_emergency_brake():
     """At 4 m/s: 6 m to the bumper of who stands are 1.5 s, 9 m are more than 2 s."""
     planner = EmergencyBrake(ConstantVelocity())
 
@@ -302,8 +302,8 @@ def test_any_planner_can_have_the_brake():
 
 
 @pytest.mark.slow
-def test_it_copes_with_an_obstacle_a_leader_a_person_and_a_red_light():
-    """Closed loop; whoever keeps a velocity of 10 m/s for the 8 s fails in each of them."""
+def test_pdm_handles_an_obstacle_a_leader_a_pedestrian_and_a_red_light():
+    """Closed loop; constant velocity of 10 m/s for 8 s fails in each of them."""
     scenes = [
         straight_road([car(0, 0, 0, 10), car(40, 0, 0, 0)]),
         straight_road([car(0, 0, 0, 10), car(20, 0, 0, 4)]),

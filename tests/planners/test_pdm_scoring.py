@@ -65,7 +65,7 @@ def test_a_collision_ahead_is_ego_s_fault_when_it_begins(judge):
     assert beside.collision == 1.0 and np.isinf(beside.fault_s)
 
 
-def test_things_cost_half_people_and_vehicles_all(judge):
+def test_hitting_objects_costs_half_and_people_or_vehicles_all(judge):
     for kind, gate in (
         (AgentKind.PEDESTRIAN, 0.0), (AgentKind.CYCLIST, 0.0), (AgentKind.OTHER, 0.5), (AgentKind.STATIC, 0.5)
     ):  # fmt: skip
@@ -74,7 +74,7 @@ def test_things_cost_half_people_and_vehicles_all(judge):
     assert judge(straight(10.0), both).collision == 0.0
 
 
-def test_who_is_hit_from_behind_or_stands_is_not_at_fault(judge):
+def test_ego_hit_from_behind_or_standing_is_not_at_fault(judge):
     rear = others((-12, 0, 0, 10, AgentKind.VEHICLE))
     assert judge(straight(5.0), rear).collision == 1.0
     front = others((12, 0, np.pi, 10, AgentKind.VEHICLE))
@@ -95,7 +95,7 @@ def test_a_collision_is_foreseen_for_nine_tenths_of_a_second(judge):
     assert judge(straight(5.0), others((-9, 0, 0, 6, AgentKind.VEHICLE))).ttc == 1.0
 
 
-def test_ways_astray_cost_half_or_all():
+def test_wrong_way_driving_costs_half_or_all():
     drive = straight(10.0)  # a metre each step
     for steps, gate in (([*range(5, 6)], 1.0), ([*range(5, 8)], 0.5), ([*range(5, 12)], 0.0)):
         astray = jnp.zeros(41, bool).at[jnp.asarray(steps)].set(True)
@@ -138,7 +138,7 @@ def test_comfort_is_that_of_scipy():
     assert found.tolist() == wanted and 10 < sum(wanted) < 50
 
 
-def test_scores_by_hand():
+def test_scores_equal_hand_computation():
     """Weights 5, 5, 2; progress counts relative to the best, 20 m x 0.5 here, and gates multiply all."""
     parts = {
         "collision": [1.0, 1.0, 0.0], "road": [1.0, 1.0, 1.0], "direction": [1.0, 0.5, 1.0],
@@ -157,7 +157,7 @@ def test_scores_by_hand():
     assert np.asarray(scores(still, CONFIG)) == pytest.approx([10 / 12, 0.5 * 7 / 12, 0.0])
 
 
-def test_where_a_box_lies():
+def test_ground_at_marks_several_lanes_off_road_and_wrong_way():
     """Lanes of 3.7 m on y = 0 and y = 3.7 of a one-way road; its edges are at -1.85 and 5.55."""
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
 
@@ -183,8 +183,8 @@ def test_ground_is_looked_up_ahead_of_each_step():
     assert not found.off[0].any() and found.off[1].tolist() == [False] * 21 + [True] * 20
 
 
-def test_the_forecast_keeps_those_who_come_near():
-    """Of many who stand beside the road only two come into it."""
+def test_forecast_keeps_agents_that_come_near():
+    """Of many agents standing off the road only two enter it."""
     count = 40
     x, y = np.arange(count) * 2.0 - 20, np.full(count, 30.0)
     x[7], y[7], x[9], y[9] = 30.0, -20.0, 45.0, 2.0
@@ -252,7 +252,7 @@ def meets(a, b):
 
 
 def test_fault_is_decided_at_the_first_contact_only():
-    """A follower runs into a slow ego, which later runs into somebody who stands: only the second is its fault."""
+    """A follower runs into a slow ego, which later runs into a standing agent: only the second is its fault."""
     both = others((-12, 0, 0, 10, AgentKind.VEHICLE), (15, 0, 0, 0, AgentKind.VEHICLE))
 
     def times(motion, others):

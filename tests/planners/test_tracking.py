@@ -128,7 +128,7 @@ def oracle(motion, pose, speeds, curvatures):
 
 @pytest.fixture(scope="module")
 def drives():
-    """A lane beside, a circle of 20 m to the left, and a stop."""
+    """A lane to the side, a circle of 20 m to the left, and a stop."""
     t = np.arange(41) * DT
     straight = np.stack([10.0 * t, 0 * t, 1 + 0 * t, 0 * t], 1)
     angle = 5.0 * t / 20.0
@@ -148,13 +148,13 @@ def drives():
     return cars, [oracle(*one) for one in zip(begin, pose, speed, bend, strict=True)], pose
 
 
-def test_drives_are_those_of_double_precision(drives):
+def test_tracked_motions_equal_double_precision(drives):
     cars, expected, _ = drives
     for found, right in zip(cars.motion, expected, strict=True):
         np.testing.assert_allclose(found, right, atol=2e-3)
 
 
-def test_it_gets_to_the_line_keeps_the_circle_and_stops(drives):
+def test_tracker_reaches_the_line_keeps_the_circle_and_stops(drives):
     cars, _, _ = drives
     # A metre aside is closed within the 4 s, without swinging far beyond.
     assert abs(cars.motion[0, -1, 1]) < 0.1 and cars.motion[0, :, 1].min() > -0.2

@@ -75,14 +75,14 @@ def gaps(cases):
 
 @pytest.mark.parametrize("left", [-0.9, -0.5, 0.0, 0.5, 0.9])
 @pytest.mark.parametrize("size", [PERSON, CAR])
-def test_whoever_reaches_into_the_corridor_behind_a_turn_is_seen(left, size):
+def test_gap_counts_agents_reaching_into_the_corridor_behind_a_turn(left, size):
     at = BEFORE + QUARTER + 6.0
     arcs = np.array([6.0, 10.0, 14.0, 18.0, 22.0, 26.0])
     found = gaps([(arc, 8.0, [thing(at, left, size)]) for arc in arcs])
     np.testing.assert_allclose(found, at - arcs - 2.4 - size[0] / 2, atol=0.15)
 
 
-def test_bystanders_do_not_hide_who_is_in_the_way():
+def test_bystanders_do_not_hide_obstacles():
     car = thing(BEFORE + 16.0, 0.0, CAR)
     # Nine of them, on the inside of the turn and along the way to it, each nearer than the car.
     people = [thing(arc, 3.0, PERSON) for arc in np.linspace(5.0, 33.0, 9)]
@@ -92,7 +92,7 @@ def test_bystanders_do_not_hide_who_is_in_the_way():
     assert (alone < 40.0).all()
 
 
-def test_the_corridor_ends_where_it_says_on_straights_and_in_turns():
+def test_corridor_ends_at_its_length_on_straights_and_in_turns():
     border = CAR[1] / 2 + SIDE_M + POST[1] / 2
     cases, inside = [], []
     for arc in (0.0, 6.0, 12.0):

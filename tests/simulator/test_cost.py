@@ -64,7 +64,7 @@ def test_a_step_costs_at_most_in_proportion_to_agents(bank, plain):
 
 
 @pytest.mark.slow
-def test_the_count_would_see_pairs_of_agents(bank):
+def test_operation_count_detects_pairwise_agent_work(bank):
     class Pairs(Simulator):
         def observe(self, bank, context, cast=None):
             xy = bank.agents[context.index, context.step, :, :2]
@@ -76,7 +76,7 @@ def test_the_count_would_see_pairs_of_agents(bank):
 
 
 @pytest.mark.slow
-def test_what_is_measured_on_request_costs_nothing_where_nobody_asks(bank, monkeypatch):
+def test_optional_facts_cost_nothing_unless_requested(bank, monkeypatch):
     asked = set()
 
     def noted(name):
@@ -110,7 +110,7 @@ every_traffic = pytest.mark.parametrize(
 
 
 def told(bank):
-    """The bank, with four agents that are told to stand at the origin."""
+    """The bank, with four agents overridden to stand at the origin."""
     return with_override(bank, jnp.arange(1, 5)[None], jnp.zeros((1, bank.steps, 4, 4)))
 
 
@@ -125,7 +125,7 @@ def test_states_are_small(bank, traffic, most):
 
 @every_traffic
 def test_a_state_has_the_same_types_after_a_reset_and_after_a_step(bank, traffic, most):
-    """Else whoever steps compiles twice, and every loop over steps is traced twice."""
+    """Otherwise the step compiles twice and every loop over steps is traced twice."""
     simulator, bank = (
         Simulator(Task(observation=GLIMPSE), traffic),
         jax.eval_shape(told, prepare_bank(traffic, bank)),
@@ -158,7 +158,7 @@ def test_one_configuration_is_compiled_once(traffic):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["reset", "metrics"])
-def test_parts_are_timed_on_states_as_they_are(part):
+def test_components_are_timed_on_unmodified_states(part):
     # Empty accumulators are infinite or undefined; what is timed in the next round must not be.
     bank = ScenarioBank.from_scenarios([assemble(generate_recording(7, 0))])
     simulator, config = Simulator(Task(observation=GLIMPSE)), BenchConfig(batch=2, steps=3)

@@ -1,4 +1,4 @@
-"""Agents that do what they are told, and kinds of traffic by name."""
+"""Overridden agents, and traffic models by name."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def bank():
 
 
 def _frames(bank, motion, valid):
-    """Everyone at every step from 10 on, when slot 1 does what it is told; ego stands."""
+    """Frames of all agents from step 10 on, with slot 1 overridden and ego standing."""
     told = with_override(bank, jnp.asarray([[1, -1]]), motion, valid)
 
     def one(context, _):
@@ -60,7 +60,7 @@ def driven(bank, brakes):
 THERE = jnp.ones((1, 91, 2), bool)
 
 
-def test_given_trajectories_are_driven_and_the_others_replay(bank):
+def test_overridden_agents_follow_given_trajectories_and_others_replay(bank):
     line = np.zeros((1, 91, 2, 4), np.float32)
     line[0, :, 0] = np.stack([np.arange(91) * 0.5, np.full(91, -3.7), np.full(91, 0.1), np.full(91, 5.0)], -1)
     frames = frames_of(bank, jnp.asarray(line), THERE.at[0, 60:].set(False))
@@ -73,7 +73,7 @@ def test_given_trajectories_are_driven_and_the_others_replay(bank):
     np.testing.assert_array_equal(frames.valid[:, 1], np.arange(10, 10 + STEPS) < 60)
 
 
-def test_given_actions_are_driven_as_an_agent_would(bank):
+def test_override_actions_drive_like_an_agent(bank):
     motion = np.asarray(driven(bank, -0.5))
     assert motion.shape == (1, 91, 2, 4)
     np.testing.assert_allclose(motion[0, :11, 0, :2], np.asarray(bank.agents[0, :11, 1, :2]), atol=1e-4)
@@ -82,7 +82,7 @@ def test_given_actions_are_driven_as_an_agent_would(bank):
     assert motion[0, -1, 0, 3] == 0.0 and (np.diff(motion[0, :, 0, 0]) >= 0).all()
 
 
-def test_reactive_vehicles_give_way_to_what_is_told_to_stop(bank):
+def test_reactive_vehicles_stop_behind_an_overridden_agent(bank):
     frames = frames_of(bank, driven(bank, -0.5), THERE)
     x, speed = np.asarray(frames.box)[:, 1:3, 0], np.asarray(frames.velocity)[:, 2, 0]
     assert (x[:, 0] - x[:, 1] - 4.8 > 1.0).all()
@@ -90,7 +90,7 @@ def test_reactive_vehicles_give_way_to_what_is_told_to_stop(bank):
 
 
 @pytest.mark.slow
-def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
+def test_ego_collides_with_a_car_overridden_to_stand():
     """At 10 m/s the 5.2 m to its rear end take 0.52 s: the sixth step overlaps, is at fault, and ends the episode."""
     bank = bank_of(straight_road([car(0, 0, 0, 10), car(10, 3.7, 0, 5)]))
     task = Task(observation=GLIMPSE, metrics=("collision", "at_fault_collision", "collision_type"))
@@ -120,8 +120,8 @@ def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
 
 
 @pytest.mark.slow
-def test_gradients_reach_the_actions_of_others(bank):
-    """How far the follower gets depends on what another is told to do: as finite differences say."""
+def test_gradients_reach_override_actions(bank):
+    """The follower's distance has the finite-difference gradient with respect to another agent's override."""
 
     @jax.jit
     def place(brakes):
@@ -132,7 +132,7 @@ def test_gradients_reach_the_actions_of_others(bank):
     assert np.isfinite(slope) and slope == pytest.approx(finite, rel=0.03) and slope > 1.0
 
 
-def test_a_bank_that_tells_nobody_what_to_do_is_refused(bank):
+def test_bank_without_overrides_is_refused(bank):
     with pytest.raises(UsageError, match="no OverrideMotions"):
         SIMULATOR.context(bank, 0, 10)
     assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")

@@ -82,7 +82,7 @@ def ramp(ego):
 
 
 def fork(ego):
-    """Lane 1 goes on as lane 2, and as lane 3, which goes over to y = 3.7 within 60 m and runs beside it."""
+    """Lane 1 goes on as lane 2, and as lane 3, which goes over to y = 3.7 within 60 m and runs alongside it."""
     return lanes(
         ego,
         lane(1, line((-150, 0), (0, 0)), successors=(2, 3)),

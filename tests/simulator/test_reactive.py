@@ -121,13 +121,13 @@ def test_a_light_that_turns_green_lets_the_queue_go():
     assert run.speed[-1, 1] == pytest.approx(10.0, abs=0.5)
 
 
-def test_who_cannot_stop_before_a_red_light_drives_on():
+def test_vehicle_that_cannot_stop_before_red_drives_on():
     # The front bumper is 5 m before the line at 10 m/s: that takes 10 m/s2, and brakes give 6.
     run = Run(straight_road([EGO, car(40 - 2.4 - 5, 0, 0, 10)], light=RED))
     assert run.speed[:, 1].min() > 9.9
 
 
-def test_who_stands_with_the_front_over_the_line_waits():
+def test_vehicle_with_its_front_over_the_stop_line_waits():
     moves = np.where(np.arange(91) < 60, 0.0, 8.0)
     run = Run(straight_road([EGO, profile(39.0, 0, moves)], light=RED))
     assert np.ptp(run.x[:, 1]) < 0.1
@@ -193,7 +193,7 @@ def test_a_car_enters_no_faster_than_it_can_stop_behind_its_leader():
     assert min(run.gap(1, 0, step) for step in range(20, 81)) > 1.0
 
 
-def test_of_two_that_wait_for_one_place_the_first_goes_first():
+def test_first_of_two_waiting_vehicles_enters_first():
     near = profile(20, 0, 4.0, steps=range(20, 91))
     begin = float(near["xy"][20, 0])
     other = profile(20, 0, 4.0, steps=range(40, 91))
@@ -237,7 +237,7 @@ def test_curves_limit_the_speed():
     np.testing.assert_allclose(radius, 10.0, atol=0.1)
 
 
-def test_a_pair_that_overlaps_when_it_begins_is_left_alone_until_it_parts():
+def test_initially_overlapping_pair_is_ignored_until_it_separates():
     slow = profile(1.0, 0.4, 5.0, kind=AgentKind.CYCLIST, length=4.8, width=2.0)
     run = Run(straight_road([EGO, slow, profile(0, 0, np.where(np.arange(91) < 2, 9.0, 6.0))]))
     # Without the rule it would brake hard behind something 1 m ahead; instead it overtakes what it overlaps.
@@ -246,7 +246,7 @@ def test_a_pair_that_overlaps_when_it_begins_is_left_alone_until_it_parts():
     assert run.slots[1] in ignored[0] and (ignored[80] == -1).all()
 
 
-def test_only_vehicles_that_go_forward_react():
+def test_only_forward_moving_vehicles_react():
     standing = car(60, 0, 0, 0, kind=AgentKind.CYCLIST, length=4.8, width=2.0)
     backing = profile(100, 3.7, -2.0)
     creeping = profile(30, 3.7, np.where(np.arange(91) < 40, 0.0, 0.35))  # 1.8 m
@@ -260,7 +260,7 @@ def test_only_vehicles_that_go_forward_react():
     assert (run.phase(6)[:81] == DRIVES).all()
 
 
-def test_whoever_drove_before_the_episode_and_then_stays_replays():
+def test_agents_that_stop_at_the_start_replay():
     stops = profile(0, 0, np.where(np.arange(91) < 10, 8.0, np.where(np.arange(91) < 12, 2.0, 0.0)))
     run = Run(straight_road([EGO, stops]))
     assert run.row[1] >= 0 and (run.phase(1) == REPLAYS).all()
@@ -277,7 +277,7 @@ def test_each_class_has_its_own_parameters():
     assert run.phase(3)[80] == DRIVES
 
 
-def test_at_the_first_step_everyone_is_where_the_log_has_them():
+def test_all_agents_start_at_logged_poses():
     recording = straight_road([car(0, 0, 0, 8), circle(30.0, 8.0), car(-20, 3.7, 0.05, 9)], light=RED)
     bank = TRAFFIC.prepare(bank_of(recording))
 
@@ -289,7 +289,7 @@ def test_at_the_first_step_everyone_is_where_the_log_has_them():
     np.testing.assert_array_equal(past(bank), np.asarray(bank.agents[0, 10:0:-1]))
 
 
-def test_the_past_of_a_vehicle_is_what_it_drove():
+def test_history_of_a_vehicle_is_its_simulated_motion():
     bank = TRAFFIC.prepare(bank_of(straight_road([EGO, car(0, 0, 0, 8)], light=RED)))
     _, traffic = _drive(TRAFFIC, bank, 0, jnp.zeros((151, 4)))
 
@@ -319,7 +319,7 @@ def test_paths_go_through_the_log_and_on_along_the_lane():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_in_random_traffic_everyone_does_what_the_law_says(seed):
+def test_all_agents_follow_idm_in_random_traffic(seed):
     rng = np.random.default_rng(seed)
     colours = np.repeat(rng.choice([RED, GREEN, LightState.CAUTION], 4), 23)[:91]
     cars = [car(rng.uniform(-40, 40), 3.7, 0, rng.uniform(2, 9))]
@@ -342,7 +342,7 @@ def test_a_bank_without_paths_is_refused_and_one_with_paths_is_kept():
     assert TRAFFIC.prepare(ready) is ready
 
 
-def test_paths_that_were_made_for_other_classes_are_made_anew():
+def test_paths_prepared_for_other_classes_are_recomputed():
     bank = bank_of(straight_road([EGO, car(0, 0, 0, 8), car(-30, 0, 0, 5, kind=AgentKind.CYCLIST)]))
     both = IdmTraffic(drivers=((1, IdmParameters()), (int(AgentKind.CYCLIST), IdmParameters())))
     few = TRAFFIC.prepare(bank)
@@ -351,7 +351,7 @@ def test_paths_that_were_made_for_other_classes_are_made_anew():
     assert both.prepare(more) is more
 
 
-def test_nobody_reacts_where_nobody_can():
+def test_traffic_with_ego_alone_stays_empty():
     bank = TRAFFIC.prepare(bank_of(straight_road([car(0, 0, 0, 8)])))
     assert int((np.asarray(data_of(bank, AgentPaths).slot) >= 0).sum()) == 1  # ego, when it is not driven
     frames, _ = _drive(TRAFFIC, bank, 0, jnp.zeros((151, 4)))

@@ -35,7 +35,7 @@ def runs(bank):
     return runs_of(bank)
 
 
-def test_every_vehicle_does_what_the_law_says(bank, runs):
+def test_every_vehicle_follows_idm(bank, runs):
     found = np.concatenate([compare(bank, index, *run) for index, run in enumerate(runs)])
     away, acceleration = found.T
     assert len(found) > 300 and (acceleration < 0).sum() > 60
@@ -43,7 +43,7 @@ def test_every_vehicle_does_what_the_law_says(bank, runs):
     assert np.quantile(away, 0.99) < 1e-3 and away.max() < 5e-3
 
 
-def test_nobody_leaves_the_path_and_nobody_enters_an_occupied_place(bank, runs):
+def test_vehicles_stay_on_their_paths_and_never_enter_occupied_space(bank, runs):
     for index, (frames, traffic) in enumerate(runs):
         slots = np.asarray(data_of(bank, AgentPaths).slot[index])
         for row in np.flatnonzero((traffic.phase == DRIVES).any(0) & (slots > 0)):
@@ -59,7 +59,7 @@ def test_nobody_leaves_the_path_and_nobody_enters_an_occupied_place(bank, runs):
                 assert not hits.any()
 
 
-def test_the_same_again_and_beside_others(bank):
+def test_results_repeat_in_any_batch_order(bank):
     def speeds(rows):
         return np.asarray(rolled(bank, jnp.asarray(rows))[1].speed[:, :, -1])
 
@@ -68,7 +68,7 @@ def test_the_same_again_and_beside_others(bank):
     np.testing.assert_array_equal(whole[[1, 2, 0]], speeds([1, 2, 0]))
 
 
-def test_a_state_is_small_however_many_react(bank):
+def test_state_fits_16_kib_with_128_reactive_agents(bank):
     state = jax.eval_shape(lambda b: SIMULATOR.reset(b, 0), bank)
     rows = data_of(bank, AgentPaths).slot.shape[1]
     whole, traffic = (
@@ -79,7 +79,7 @@ def test_a_state_is_small_however_many_react(bank):
     assert whole - traffic + traffic / rows * 128 <= 16384
 
 
-def test_meetings_in_the_built_in_world():
+def test_reactive_pairs_rarely_overlap_in_the_built_in_world():
     bank = world(40, seed=7)
     found = [meetings(bank, index, *run) for index, run in enumerate(runs_of(bank))]
     reacting = sum(len(agents) for _, agents in found)
@@ -91,7 +91,7 @@ def test_meetings_in_the_built_in_world():
     assert reacting > 500 and between <= 0.01 * reacting
 
 
-def test_company_changes_nothing():
+def test_results_do_not_depend_on_other_scenarios():
     scenarios = [assemble(generate_recording(9, i)) for i in range(3)]
     whole, part = (
         evaluate(ConstantVelocity(), ScenarioBank.from_scenarios(some), scenario_names(some), traffic=TRAFFIC)

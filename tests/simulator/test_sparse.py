@@ -1,4 +1,4 @@
-"""Computing rows of a batch where they are wanted."""
+"""Sparse evaluation of a batched function."""
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,11 @@ from drivax.simulator.sparse import AT_ONCE, map_where
 ROWS = 3 * AT_ONCE + 1
 
 
-@pytest.mark.parametrize("wanted", [0, 1, AT_ONCE, AT_ONCE + 1, ROWS])
-def test_rows_that_are_wanted_are_those_of_vmap_and_others_are_zero(wanted):
-    rng = np.random.default_rng(wanted)
+@pytest.mark.parametrize("requested", [0, 1, AT_ONCE, AT_ONCE + 1, ROWS])
+def test_map_where_equals_vmap_where_requested_and_zero_elsewhere(requested):
+    rng = np.random.default_rng(requested)
     mask = np.zeros(ROWS, bool)
-    mask[rng.permutation(ROWS)[:wanted]] = True
+    mask[rng.permutation(ROWS)[:requested]] = True
     number, keys = rng.normal(size=(ROWS, 2)).astype(np.float32), jax.random.split(jax.random.key(3), ROWS)
 
     def draw(number, key):
@@ -27,7 +27,7 @@ def test_rows_that_are_wanted_are_those_of_vmap_and_others_are_zero(wanted):
         np.testing.assert_allclose(found[name], expected, atol=1e-6)
 
 
-def test_a_batch_of_batches_wants_different_rows():
+def test_nested_batches_may_request_different_elements():
     mask = jnp.asarray(np.random.default_rng(0).random((3, ROWS)) < 0.4)
     number = jnp.arange(3.0 * ROWS).reshape(3, ROWS) + 1.0
     found = jax.jit(jax.vmap(lambda mask, number: map_where(mask, jnp.square, number)))(mask, number)

@@ -66,7 +66,7 @@ def test_draws_are_distributed_as_published(speed):
 
 
 @pytest.mark.slow
-def test_the_second_before_was_driven_with_one_action(open_road):
+def test_perturbed_history_uses_one_action(open_road):
     scenes = noisy(open_road, 10, keys(64))
     history = scenes.history
     logged = LogStart().begin(open_road, jnp.int32(0), jnp.int32(0), jnp.int32(0), None)[0]
@@ -97,7 +97,7 @@ def test_no_start_collides_or_is_off_the_road():
     assert np.ptp(y) > 0.2, "some draws are kept"
 
 
-def test_where_every_draw_fails_the_episode_begins_as_logged():
+def test_episode_starts_as_logged_when_every_draw_fails():
     # Half a metre behind a car, a hand's breadth beside a column.
     beside = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
     bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *beside]))
@@ -109,7 +109,7 @@ def test_where_every_draw_fails_the_episode_begins_as_logged():
 
 
 @pytest.mark.slow
-def test_a_start_is_free_of_those_who_are_told_where_to_be():
+def test_noisy_start_does_not_collide_with_overridden_agents():
     # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
     bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
     told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
@@ -150,7 +150,7 @@ def test_a_noisy_start_without_a_key_is_refused(open_road):
 
 
 @pytest.mark.parametrize("options", [{"steps": 16}, {"steps": 0}, {"strong": 1.5}, {"tries": 0}])
-def test_settings_that_cannot_be_meant_are_refused(options):
+def test_invalid_settings_are_refused(options):
     with pytest.raises(UsageError):
         NoisyStart(**options)
 
@@ -169,14 +169,14 @@ def test_an_episode_begins_at_any_step_as_logged():
     assert (np.asarray(states.start) == np.arange(90)).all()
 
 
-def test_training_can_begin_so():
+def test_training_accepts_noisy_starts():
     config = load(TrainConfig, {"start": {"kind": "noisy_start", "scale": 0.5}})
     assert config.start == NoisyStart(scale=0.5) and load(TrainConfig, {}).start == LogStart()
     assert load(TrainConfig, parse_yaml(dump(config))) == config
 
 
 @pytest.mark.slow
-def test_evaluation_begins_where_the_noise_leads_and_counts_from_there():
+def test_evaluation_starts_and_counts_from_the_noisy_start():
     """80 steps at the speed and heading that the noise left: nothing of the second before is in any metric."""
     data = load_scenarios([assemble(straight_road([car(0, 1.8, 0, 2)]), SMALL)])
     same, other = (

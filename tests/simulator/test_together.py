@@ -1,4 +1,4 @@
-"""Several driven agents in one scenario, and agents that do what they are told."""
+"""Several driven agents in one scenario, and overridden agents."""
 
 from functools import partial
 
@@ -54,7 +54,7 @@ def single(simulator, bank, actions):
 
 @pytest.fixture(scope="module")
 def braking(bank):
-    """The leader (slot 1 is 15 m beside, so the order is by distance to ego) brakes hard, ego keeps its speed."""
+    """The leader (slot 1 is 15 m to the side, so the order is by distance to ego) brakes hard, ego keeps its speed."""
     leader = int(np.argmax(np.asarray(bank.agents[0, 10, :, 0])))
     slots = slots_of(bank, 0, jnp.isin(jnp.arange(16), jnp.asarray([0, leader])), 3)
     actions = np.zeros((30, 3, 2), np.float32)
@@ -62,7 +62,7 @@ def braking(bank):
     return slots, leader, together(REACTIVE, bank, slots, jnp.asarray(actions))
 
 
-def test_slots_are_those_of_the_mask_that_are_there(bank):
+def test_slots_are_present_agents_of_the_mask(bank):
     cars = [car(0, 0, 0, 5), car(20, 0, 0, 5), car(40, 0, 0, 5, steps=range(30, 91)), car(60, 0, 0, 5)]
     here = bank_of(straight_road(cars))
     there = np.flatnonzero(np.asarray(here.agents[0, 10, :, AgentColumn.VALID]) > 0)
@@ -87,7 +87,7 @@ def test_driven_agents_see_and_hit_each_other(bank, braking):
     assert np.isclose(first[0], ahead, atol=0.02).any() and np.isclose(first[1], -ahead, atol=0.02).any()
 
 
-def test_what_fills_up_the_stack_does_nothing(bank, braking):
+def test_padding_agents_do_nothing(bank, braking):
     _, _, ((states, done), _) = braking
     assert np.asarray(is_driven(bank, jax.tree.map(lambda leaf: leaf[0], states))).tolist() == [
         True,
@@ -130,7 +130,7 @@ def test_a_stack_of_one_is_a_single_agent(bank):
 
 
 @pytest.mark.slow
-def test_whose_episode_is_over_is_neither_rewarded_nor_judged_any_more(bank):
+def test_agents_whose_episode_ended_get_no_reward_and_no_metrics(bank):
     simulator = Simulator(Task(observation=GLIMPSE, metrics=("distance", "comfort")))
     crash = bank_of(straight_road([car(0, 0, 0, 10), car(22, 0, 0, 0)]))
 

@@ -77,16 +77,18 @@ def episode_start(metrics: MetricNames = "full") -> Episode:
     )
 
 
-def episode_add(episode: Episode, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]) -> Episode:
+def episode_add(
+    episode: Episode, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+) -> Episode:
     """Adds a step.
 
     Args:
         episode: Accumulators so far.
-        found: What the step led to.
+        situation: What the step led to.
         start: Step at which the episode began.
         final: The episode ends here, so the comfort of its last steps is evaluated too.
     """
-    selection, seen = episode.selection, _Seen(Moment(found, start, final))
+    selection, seen = episode.selection, _Seen(Moment(situation, start, final))
     added, number = seen.sums(selection.step_values(*_ADDED))
     low, _ = seen.extremes(selection.step_values("min"), jnp.min, jnp.inf)
     high, _ = seen.extremes(selection.step_values(*_HIGH), jnp.max, -jnp.inf)
@@ -104,7 +106,7 @@ def episode_add(episode: Episode, found: Situation, start: Int[Array, ""], final
         high=jnp.maximum(episode.high, high),
         last=jnp.where(last_counts, last, episode.last),
         first=jnp.where(waiting, first, episode.first),
-        event_step=jnp.where(begins, found.context.step.astype(jnp.int16), episode.event_step),
+        event_step=jnp.where(begins, situation.context.step.astype(jnp.int16), episode.event_step),
         second=second,
         worst=jnp.maximum(episode.worst, second.sum(axis=1)),
         selection=selection,

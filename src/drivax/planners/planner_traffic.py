@@ -102,24 +102,24 @@ class PlannerTraffic:
             rows = self.agents(bank, context, back)
             return frame_of(bank, context.index, context.step, rows, alone(context), back) if back else frame
 
-        def drive(one: AgentContext) -> AgentContext:
+        def drive(agent: AgentContext) -> AgentContext:
             apart = jnp.full(frame.valid.shape, int(Contact.APART), jnp.int8)
-            lights = remember_lights(bank, one)
-            found, contacts, lights = measure(bank, one, frame, frames(1), apart, lights)
+            lights = remember_lights(bank, agent)
+            situation, contacts, lights = measure(bank, agent, frame, frames(1), apart, lights)
             state = SimState(
-                found.context, found.facts, contacts, lights, self.task.episode_start(), now.begin
+                situation.context, situation.facts, contacts, lights, self.task.episode_start(), now.begin
             )
-            key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[one.index])
-            key = jax.random.fold_in(key, one.step)
-            seen = self.task.observe(bank, found.context, frames, frame)
+            key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[agent.index])
+            key = jax.random.fold_in(key, agent.step)
+            seen = self.task.observe(bank, situation.context, frames, frame)
             asked, _ = data_of(bank, TrafficPolicy).planner.act(
-                (), bank, state, found, seen, jax.random.fold_in(key, one.slot)
+                (), bank, state, situation, seen, jax.random.fold_in(key, agent.slot)
             )
-            motion, length = one.history[-1], bank.length_m(one.index, one.slot)
-            action = self.task.actuated(motion, asked, one.action)
+            motion, length = agent.history[-1], bank.length_m(agent.index, agent.slot)
+            action = self.task.actuated(motion, asked, agent.action)
             motion = self.task.motion(motion, action, length)
-            history = jnp.concatenate([one.history[1:], motion[None]])
-            return replace(found.context, step=one.step + 1, history=history, action=action)
+            history = jnp.concatenate([agent.history[1:], motion[None]])
+            return replace(situation.context, step=agent.step + 1, history=history, action=action)
 
         base = self.base.advance(bank, replace(context, traffic=now.base), frame)
         return Driven(now.begin, jax.vmap(drive)(now.contexts), base)

@@ -58,9 +58,9 @@ class Simulator:
         # evaluated, for which alone a frame before this one would be needed.
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
         lights = remember_lights(bank, context)
-        found, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
-        episode, step = self.task.episode_start(), found.context.step
-        return SimState(found.context, found.facts, contacts, nothing_crossed(lights), episode, step)
+        situation, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
+        episode, step = self.task.episode_start(), situation.context.step
+        return SimState(situation.context, situation.facts, contacts, nothing_crossed(lights), episode, step)
 
     def context(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
@@ -261,13 +261,13 @@ class Simulator:
     ) -> tuple[SimState, Transition]:
         """Measures an agent after all agents have moved on from a frame, and turns the step into a transition."""
         now = self.frame(bank, moved, cast, 0)
-        found, contacts, lights = measure(
+        situation, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
-        terminated, truncated = self.task.ended(bank, found.context, found.facts)
-        terms = self.task.reward(before.facts, found.facts, found.surroundings)
-        final = terminated | truncated | (found.context.step >= bank.steps - 1)
-        episode = self.task.episode_add(before.episode, found, before.start, final)
-        after = SimState(found.context, found.facts, contacts, lights, episode, before.start)
+        terminated, truncated = self.task.ended(bank, situation.context, situation.facts)
+        terms = self.task.reward(before.facts, situation.facts, situation.surroundings)
+        final = terminated | truncated | (situation.context.step >= bank.steps - 1)
+        episode = self.task.episode_add(before.episode, situation, before.start, final)
+        after = SimState(situation.context, situation.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)

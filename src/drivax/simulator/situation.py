@@ -177,14 +177,14 @@ def _requested(
     """The facts that are measured on request; what ``reads`` does not ask for is zero."""
     none, no = jnp.int16(-1), jnp.zeros((), bool)
     zero = jnp.zeros(())
-    found: dict[str, Array] = {
+    facts: dict[str, Array] = {
         "gap_m": zero, "lag_m": zero, "strand": none, "lane_changed": no, "merged": no
     }  # fmt: skip
     if "gap_m" in reads:
-        found["gap_m"] = nearest_gap(frame, context.slot, codes == Contact.IGNORED)
+        facts["gap_m"] = nearest_gap(frame, context.slot, codes == Contact.IGNORED)
     if "lag_m" in reads:
         me, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
-        found["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
+        facts["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
     if reads & _PASSAGES:
         ground, me = _ground(bank, context, frame), frame.box[context.slot]
         if strand is None:
@@ -193,8 +193,8 @@ def _requested(
             heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
             strand = lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
         passage = lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
-        found |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
-    return found
+        facts |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
+    return facts
 
 
 def _kept(facts: Facts, reads: frozenset[str]) -> Facts:

@@ -1,4 +1,4 @@
-"""Computing something for the few of a batch that need it."""
+"""Evaluate a function for the few elements of a batch that need it."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-#: How many are computed together: more than begin in most steps, and enough to fill vectors.
+#: Elements computed together: more than start in most steps, and enough to fill vectors.
 AT_ONCE = 8
 
 
 def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
-    """``jax.vmap(function)`` where ``requested``, zeros elsewhere; the cost follows how many are requested.
+    """``jax.vmap(function)`` where ``requested``, zeros elsewhere; cost grows with the number requested.
 
-    They are computed 8 at a time, as often as it takes, in a loop that cannot be differentiated in reverse.
+    A loop computes 8 elements at a time; it has no reverse-mode derivative.
 
     Args:
-        requested: Which rows of the batch are needed.
-        function: Of one row each of the arguments; gives a pytree of arrays.
+        requested: Elements of the batch to compute.
+        function: Maps one element of each argument to a pytree of arrays.
         arguments: Pytrees of arrays ``[B, ...]``.
     """
-    count, every = requested.shape[0], jax.vmap(function)
-    few = min(AT_ONCE, count)
-    one = jax.eval_shape(function, *jax.tree.map(lambda leaf: leaf[0], arguments))
-    nothing = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), one)
-    # The first requested row ranks highest; top_k of floats is the cheapest way to find a few of them.
+    count, batched = requested.shape[0], jax.vmap(function)
+    chunk = min(AT_ONCE, count)
+    element = jax.eval_shape(function, *jax.tree.map(lambda leaf: leaf[0], arguments))
+    zeros = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), element)
+    # The first requested element ranks highest; top_k of floats is the cheapest way to find a few of them.
     rank = jnp.arange(count, 0, -1).astype(jnp.float32)
 
-    def more(carry: tuple[Array, Any]) -> Array:
+    def pending(carry: tuple[Array, Any]) -> Array:
         return carry[0].any()
 
-    def some(carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        left, found = carry
-        found_rank, place = jax.lax.top_k(jnp.where(left, rank, 0.0), few)
-        place = jnp.where(found_rank > 0.0, place, count)
-        rows = every(*jax.tree.map(lambda leaf: leaf.at[place].get(mode="clip"), arguments))
-        found = jax.tree.map(lambda all_, row: all_.at[place].set(row, mode="drop"), found, rows)
-        return left.at[place].set(False, mode="drop"), found
+    def compute(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        left, results = carry
+        top_rank, index = jax.lax.top_k(jnp.where(left, rank, 0.0), chunk)
+        index = jnp.where(top_rank > 0.0, index, count)
+        values = batched(*jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), arguments))
+        results = jax.tree.map(lambda total, value: total.at[index].set(value, mode="drop"), results, values)
+        return left.at[index].set(False, mode="drop"), results
 
-    return jax.lax.while_loop(more, some, (requested, nothing))[1]
+    return jax.lax.while_loop(pending, compute, (requested, zeros))[1]

@@ -114,11 +114,11 @@ class NoisyStart:
         count = jnp.cumprod(known.astype(jnp.int32)).sum()
         base = logged_history(bank, index, step - count, slot)
 
-        def one(key: Array) -> tuple[Float[Array, "16 4"], Bool[Array, ""]]:
+        def draw_history(key: Array) -> tuple[Float[Array, "16 4"], Bool[Array, ""]]:
             history = self._driven(base, count, *self.draw(key, base[-1, MOTION_SPEED]))
             return history, _acceptable(bank, index, step, slot, agents, history)
 
-        histories, good = jax.vmap(one)(jax.random.split(key, self.tries))
+        histories, good = jax.vmap(draw_history)(jax.random.split(key, self.tries))
         logged, logged_m = LogStart().begin(bank, index, step, slot)
         history = jnp.where(good.any(), histories[jnp.argmax(good)], logged)
         near_m = bank.log_progress[index, step - count]
@@ -146,11 +146,11 @@ class NoisyStart:
     ) -> Float[Array, "16 4"]:
         """A history, ``count`` steps of one action later."""
 
-        def one(history: Array, place: Array) -> tuple[Array, None]:
+        def advance(history: Array, place: Array) -> tuple[Array, None]:
             later = jnp.concatenate([history[1:], bicycle(history[-1], acceleration, curvature)[None]])
             return jnp.where(place < count, later, history), None
 
-        return jax.lax.scan(one, history, jnp.arange(self.steps))[0]
+        return jax.lax.scan(advance, history, jnp.arange(self.steps))[0]
 
 
 def _acceptable(

@@ -174,7 +174,7 @@ class PdmPlanner:
         frame, motion = around.frame, context.history[-1]
         me = frame.box[context.slot]
         size, speed = me[LENGTH : WIDTH + 1], motion[MOTION_SPEED]
-        lines = Lines.beside_route(bank, context.index, around.route.along_m, config.offsets_m, me)
+        lines = Lines.along_route(bank, context.index, around.route.along_m, config.offsets_m, me)
         way = lines.points[0, ::_SPARSE, :2]
         others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
         # Each stage is written out: XLA would compute it again in every operation that uses it.
@@ -187,7 +187,7 @@ class PdmPlanner:
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
         wheelbase = self._wheelbase(size[0])
         car = Car(motion, carry.acceleration, carry.steering)
-        cars = jax.vmap(lambda one: tracked(car, one, wheelbase, config.tracking))(reference)
+        cars = jax.vmap(lambda path: tracked(car, path, wheelbase, config.tracking))(reference)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2

@@ -51,7 +51,7 @@ class Lines:
     limit: Float[Array, ""]
 
     @classmethod
-    def beside_route(
+    def along_route(
         cls, bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""],
         offsets_m: tuple[float, ...], me: Float[Array, " 6"],
     ) -> Lines:  # fmt: skip

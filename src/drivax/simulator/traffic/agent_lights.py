@@ -51,8 +51,8 @@ def light_arcs(
         crossed = _crossings(line[row][:, seen], points[mine], spacing[mine])
         for path, arc in zip(mine, crossed, strict=True):
             heading = np.arctan2(points[path, :, 3], points[path, :, 2])
-            found = _places(arc, heading, spacing[path], exits[row, seen])
-            for place, (where, light) in enumerate(found[:STOPS]):
+            stops = _places(arc, heading, spacing[path], exits[row, seen])
+            for place, (where, light) in enumerate(stops[:STOPS]):
                 arcs[path, place], lights[path, place] = where, seen[light]
     return arcs, lights
 
@@ -85,6 +85,6 @@ def _places(arc: Array, heading: Array, spacing: float, exits: Array) -> list[tu
     places = []
     for group in groups:
         later = min(round((arc[group[0]] + _JUDGED_AFTER_M) / spacing), len(heading) - 1)
-        light = min(group, key=lambda one: abs(float(wrap(exits[one] - heading[later]))))
+        light = min(group, key=lambda light: abs(float(wrap(exits[light] - heading[later]))))
         places.append((float(arc[light]), light))
     return places

@@ -309,7 +309,7 @@ def _appears(valid: Bool[np.ndarray, "V T"]) -> Int[np.ndarray, "V T"]:
 
 def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -> Numbers:
     """Frame slots whose box each agent's own overlaps in the log, step by step; the first two, -1 for none."""
-    found = np.full((len(bank), bank.steps, rows, OVERLAPS), -1, np.int16)
+    overlaps = np.full((len(bank), bank.steps, rows, OVERLAPS), -1, np.int16)
     tables = tuple(np.asarray(part) for part in (bank.agents, bank.agent_box, bank.parked, bank.parked_when))
     for scenario in np.unique(logs.scenario):
         mine = np.flatnonzero(logs.scenario == scenario)
@@ -327,8 +327,8 @@ def _logged_overlaps(bank: ScenarioBank, logs: _Logs, row: Numbers, rows: int) -
             place = counted.get((t, a), 0)
             counted[t, a] = place + 1
             if place < OVERLAPS:
-                found[scenario, t, row[mine[a]], place] = o
-    return found
+                overlaps[scenario, t, row[mine[a]], place] = o
+    return overlaps
 
 
 def _logged_boxes(tables: _Tables, scenario: int) -> tuple[Numbers, Numbers, Numbers]:

@@ -133,8 +133,8 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
     part, distance = _from_piece(x0, y0, x1, y1, box[..., X], box[..., Y])
     long = jnp.sqrt(jnp.maximum((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-6))
     ux, uy = (x1 - x0) / long, (y1 - y0) / long
-    beside = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), slopes) * long
-    distance = jnp.where((part > 0.0) & (part < 1.0), beside * beside, distance)
+    lateral = ux * (box[..., Y] - y0) - uy * (box[..., X] - x0) - _bulge(part, (ux, uy), slopes) * long
+    distance = jnp.where((part > 0.0) & (part < 1.0), lateral * lateral, distance)
     along = arc + part * (end - arc) - movers.arc[:, None]
     cos = jnp.abs(box[..., COS] * ux + box[..., SIN] * uy)
     sin = jnp.abs(box[..., SIN] * ux - box[..., COS] * uy)
@@ -231,10 +231,10 @@ def closest(
     key = jnp.where(near, numbered(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
     # Computed once: without the barrier XLA computes it again for each of the minima.
     key = jax.lax.optimization_barrier(key)
-    found = [jnp.min(key, axis=1, keepdims=True)]
+    minima = [jnp.min(key, axis=1, keepdims=True)]
     for _ in range(CLOSEST - 1):
-        found.append(jnp.min(jnp.where(key > found[-1], key, jnp.inf), axis=1, keepdims=True))
-    chosen = jnp.concatenate(found, axis=1)
+        minima.append(jnp.min(jnp.where(key > minima[-1], key, jnp.inf), axis=1, keepdims=True))
+    chosen = jnp.concatenate(minima, axis=1)
     real = jnp.isfinite(chosen)
     return jnp.where(real, number_of(chosen, _SLOT_BITS), 0), real
 
@@ -255,17 +255,17 @@ def reaching(
     """
     around = _rectangles(nodes, half, behind, beyond, rectangles)
     deep, wide = box[LENGTH] / 2, box[WIDTH] / 2
-    found = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
+    reached = jnp.zeros((nodes.shape[0], box.shape[1]), bool)
     for number in range(rectangles):
         x, y, cos, sin, length, width = (part[:, number : number + 1] for part in around)
         turn_cos = jnp.abs(box[COS] * cos + box[SIN] * sin)
         turn_sin = jnp.abs(box[SIN] * cos - box[COS] * sin)
         ahead = jnp.abs(box[X] * cos + (box[Y] * sin - (x * cos + y * sin)))
         left = jnp.abs(box[Y] * cos - (box[X] * sin + (y * cos - x * sin)))
-        found |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
+        reached |= (ahead < length + turn_cos * deep + turn_sin * wide) & (
             left < width + turn_sin * deep + turn_cos * wide
         )
-    return found
+    return reached
 
 
 def _rectangles(

@@ -75,10 +75,10 @@ def frame_of(
     """
     driven = cast.history[:, HISTORY - 1 - back]
     cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
-    one = jnp.ones_like(cos)
+    present = jnp.ones_like(cos)
     # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
-    rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
-    rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
+    rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(present), cos, sin]
+    rows += [driven[:, 3] * cos, driven[:, 3] * sin, present]
     # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
     z = agents[:, AgentColumn.Z].at[cast.slot].set(cast.z, mode="drop")

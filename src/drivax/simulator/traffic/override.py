@@ -147,11 +147,11 @@ def motions_of_actions(
         past = logged_history(bank, index, begin, at)
         size = bank.length_m(index, at)
 
-        def one(motion: Array, action: Array) -> tuple[Array, Array]:
+        def advance(motion: Array, action: Array) -> tuple[Array, Array]:
             after = move(motion, action, size)
             return after, after
 
-        driven = jax.lax.scan(one, past[-1], acts[desired])[1]
+        driven = jax.lax.scan(advance, past[-1], acts[desired])[1]
         before = jnp.concatenate([jnp.repeat(past[:1], max(begin + 1 - len(past), 0), 0), past])[-begin - 1 :]
         return jnp.concatenate([before, driven])
 
