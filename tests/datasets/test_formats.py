@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from datasets import samples
-from drivax.datasets.convert import convert
+from drivax.datasets.conversion import convert
 from drivax.datasets.formats import READERS, detect, find_files, reader_named, survey
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError

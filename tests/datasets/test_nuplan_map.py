@@ -14,10 +14,10 @@ import pytest
 import shapely
 
 from datasets.samples import nuplan as sample
-from drivax.datasets.nuplan import features as nuplan_features
 from drivax.datasets.nuplan import map as nuplan_map
-from drivax.datasets.nuplan.features import features_around
+from drivax.datasets.nuplan import map_features as nuplan_features
 from drivax.datasets.nuplan.map import city_map, corridor, feature_id, find_map
+from drivax.datasets.nuplan.map_features import features_around
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import LANE_KINDS, RoadKind
 

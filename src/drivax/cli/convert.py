@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from drivax.datasets.convert import Conversion, Converted, Plan, convert
+from drivax.datasets.conversion import Conversion, Converted, Plan, convert
 from drivax.datasets.estimate import counted
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drivax.curation.scores import OWN_SCORES, ScoreTable, write_scores
-from drivax.datasets.export.subset import Exported, refuse_part, write_part
+from drivax.datasets.export.writer import Exported, refuse_part, write_part
 from drivax.errors import UsageError
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.stats.clusters import recordings_of
@@ -57,7 +57,7 @@ def part_of_table(table: ScoreTable, rows: Sequence[int], part: ScenarioSet) -> 
     Args:
         table: Scores of the whole set.
         rows: Which of them, in the order of the part.
-        part: The part, as :func:`~drivax.datasets.export.subset.write_part` writes it.
+        part: The part, as :func:`~drivax.datasets.export.writer.write_part` writes it.
     """
     chosen = list(rows)
     told = part.manifest["source"]["part_of"]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -35,11 +35,7 @@ _LARGEST = 1e7
 _SMALLEST_SIZE_M, _LARGEST_SIZE_M = 0.01, 1000.0
 #: Ids fit into the 31 bits that the public tools give them.
 _ID_END = 2**31
-_AGENTS = {
-    "vehicle": AgentKind.VEHICLE,
-    "pedestrian": AgentKind.PEDESTRIAN,
-    "cyclist": AgentKind.CYCLIST,
-}
+_AGENTS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST}
 #: Kind of a road whose ``map_element_id`` says nothing; the names of ``type``.
 _ROADS = {
     "lane": RoadKind.LANE_UNDEFINED,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.womd import records as womd
 from drivax.datasets.womd import tf_example

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.datasets import readings
-from drivax.datasets.areas import Area, road_edges
-from drivax.datasets.argoverse.vehicle import FARTHEST_M
+from drivax.datasets import parsing as readings
+from drivax.datasets.argoverse.tables import FARTHEST_M
+from drivax.datasets.road_edges import Area, road_edges
 from drivax.errors import DataError
 from drivax.geometry.polylines import arc_lengths
 from drivax.scenario.recording import MapFeature

@@ -10,19 +10,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import PARQUET_MAGIC, Kind, Table, Words, has_magic, read_table
-from drivax.datasets.argoverse.vehicle import (
+from drivax.datasets.argoverse.tables import (
     CENTRE_AHEAD_M,
     DATASET,
     EGO_SIZE,
     FARTHEST_M,
     FASTEST_MPS,
     MOST_STATES,
+    PARQUET_MAGIC,
+    Kind,
+    Table,
+    Words,
+    has_magic,
+    read_table,
 )
-from drivax.datasets.ground import lift
-from drivax.datasets.places import place_tags
+from drivax.datasets.elevation import lift
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap

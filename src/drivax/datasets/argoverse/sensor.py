@@ -10,19 +10,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import FEATHER_MAGIC, Kind, Table, has_magic, read_table
-from drivax.datasets.argoverse.vehicle import (
+from drivax.datasets.argoverse.tables import (
     AXLE_HEIGHT_M,
     CENTRE_AHEAD_M,
     DATASET,
     EGO_SIZE,
     FARTHEST_M,
+    FEATHER_MAGIC,
     LARGEST_M,
     MOST_STATES,
+    Kind,
+    Table,
+    has_magic,
+    read_table,
 )
-from drivax.datasets.places import place_tags
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.scenario.recording import Recording, Tracks

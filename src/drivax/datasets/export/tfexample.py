@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.datasets.export.restore import restore
-from drivax.datasets.readings import MPS_PER_MPH
+from drivax.datasets.export.recording import restore
+from drivax.datasets.parsing import MPS_PER_MPH
 from drivax.geometry.polylines import project, resample
 from drivax.scenario.recording import MapFeature, Recording, Tracks
 from drivax.scenario.schema import (

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.datasets.nuplan.geopackage import Database
-from drivax.datasets.readings import box_centre
+from drivax.datasets.nuplan.sqlite import Database
+from drivax.datasets.parsing import box_centre
 from drivax.errors import DataError
 from drivax.geometry.vectors import rotate, wrap
 from drivax.scenario.recording import Tracks
@@ -60,11 +60,7 @@ _KINDS = {
     "czone_sign": AgentKind.STATIC,
     "generic_object": AgentKind.STATIC,
 }
-_LIGHT_STATES = {
-    "green": LightState.GO,
-    "yellow": LightState.CAUTION,
-    "red": LightState.STOP,
-}
+_LIGHT_STATES = {"green": LightState.GO, "yellow": LightState.CAUTION, "red": LightState.STOP}
 
 
 @dataclass(frozen=True)

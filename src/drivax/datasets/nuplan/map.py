@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivax.datasets import readings
-from drivax.datasets.nuplan.geopackage import Database, Layer, open_database, read_layer
+from drivax.datasets import parsing as readings
+from drivax.datasets.nuplan.sqlite import Database, Layer, open_database, read_layer
 from drivax.errors import DataError
 
 #: Layers that are read and their columns. The order gives the numbers of the layers in feature ids.

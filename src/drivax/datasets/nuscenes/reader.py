@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from drivax.datasets.ground import flatten
+from drivax.datasets.elevation import flatten
 from drivax.datasets.nuscenes.map import city
 from drivax.datasets.nuscenes.tables import Scene, Tables, has_annotations, scene_rows
-from drivax.datasets.places import place_tags
+from drivax.datasets.parsing import box_centre, check_finite, place_tags, windows_of
 from drivax.datasets.reader import BadRecord, Description
-from drivax.datasets.readings import box_centre, check_finite, windows_of
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Recording, Tracks

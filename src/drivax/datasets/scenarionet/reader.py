@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
-from drivax.datasets.ground import flatten, lift
+from drivax.datasets import parsing as readings
+from drivax.datasets.elevation import flatten, lift
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
-from drivax.datasets.places import place_tags
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.scenarionet.values import SKIP, Names, count_rows, floats, mapping
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap

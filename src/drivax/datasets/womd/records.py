@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.womd.messages import example_class, parse, scenario_class
 from drivax.datasets.womd.tf_example import Features, is_motion

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.message_tables import POINTS, STATES, read_table
-from drivax.datasets.womd.messages import parse, scenario_class
+from drivax.datasets.womd.messages import POINTS, STATES, parse, read_table, scenario_class
 from drivax.datasets.womd.tf_example import agent_kind
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError

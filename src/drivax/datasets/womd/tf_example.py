@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing as readings
 from drivax.datasets.womd.messages import example_class, parse
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivax.datasets.places import PLACES, place_tags
+from drivax.datasets.parsing import PLACES, place_tags
 
 
 @pytest.mark.parametrize(

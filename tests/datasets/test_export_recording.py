@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from datasets.samples import gpudrive as sample
-from drivax.datasets.export.restore import restore
+from drivax.datasets.export.recording import restore
 from drivax.datasets.gpudrive import GpuDrive
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature

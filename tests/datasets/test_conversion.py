@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.datasets.convert import Conversion, convert, convert_file
+from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.estimate import estimate
 from drivax.datasets.formats import survey
 from drivax.datasets.reader import BadRecord
@@ -202,9 +202,9 @@ def test_reading_and_assembling_never_import_jax(wire, write_records):
     path = write_records("x.tfrecord", wire.scenario(), wire.example())
     program = f"""
 import sys, pathlib
-import drivax.datasets.convert, drivax.scenario.build.assemble, drivax.scenario.store
+import drivax.datasets.conversion, drivax.scenario.build.assemble, drivax.scenario.store
 assert "google.protobuf" not in sys.modules and "google_crc32c" not in sys.modules
-from drivax.datasets.convert import Conversion, convert_file
+from drivax.datasets.conversion import Conversion, convert_file
 kinds = [type(item).__name__ for item in convert_file(pathlib.Path({str(path)!r}), Conversion())]
 assert kinds == ["Scenario", "BadRecord"], kinds
 assert "jax" not in sys.modules
@@ -401,7 +401,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_start(thirty, tmp_path, mon
 PROGRAM = """
 import os, sys, time
 from pathlib import Path
-from drivax.datasets.convert import Conversion, convert
+from drivax.datasets.conversion import Conversion, convert
 
 def audit(batch):
     return [{"distance_m": float(scenario.id[1:]), "batch": len(batch)} for scenario in batch]
@@ -571,7 +571,7 @@ def test_memory_of_workers(real_data, tmp_path):
         (tmp_path / "src" / f"{name}.tfrecord").write_bytes(record * 300)
     program = """
 import resource, sys
-from drivax.datasets.convert import Conversion, convert
+from drivax.datasets.conversion import Conversion, convert
 if __name__ == "__main__":
     convert(sys.argv[1], sys.argv[2], Conversion(workers=2))
     for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
@@ -658,12 +658,7 @@ def test_inspect_tables_fit_a_hundred_columns(folder, tmp_path, capsys):
     assert main(["inspect", str(tmp_path / "set")]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
-    for words in (
-        "4 (recorded segments: 4",
-        "every checksum is right",
-        "LANE_GRAPH",
-        "b2",
-    ):
+    for words in ("4 (recorded segments: 4", "every checksum is right", "LANE_GRAPH", "b2"):
         assert words in out
 
 

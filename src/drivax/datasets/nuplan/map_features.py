@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.datasets.areas import Area, road_edges
-from drivax.datasets.nuplan.geopackage import Database, geometries, open_database
 from drivax.datasets.nuplan.map import CURE, NUMBERS, City, Lane, feature_id, whole
+from drivax.datasets.nuplan.sqlite import Database, geometries, open_database
+from drivax.datasets.road_edges import Area, road_edges
 from drivax.errors import DataError, UsageError
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind

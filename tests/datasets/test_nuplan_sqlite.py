@@ -13,7 +13,7 @@ import pytest
 import shapely
 
 from datasets.samples import nuplan as sample
-from drivax.datasets.nuplan.geopackage import geometries, open_database, read_layer
+from drivax.datasets.nuplan.sqlite import geometries, open_database, read_layer
 from drivax.errors import DataError
 
 SHAPES = (

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.datasets.areas import GAP_M, road_edges
+from drivax.datasets.road_edges import GAP_M, road_edges
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import RoadKind
 
