@@ -43,9 +43,6 @@ class Estimate:
         Args:
             out: The set.
             written: How many of the scenarios are on the disk already.
-
-        Raises:
-            DataError: The disk has too little room.
         """
         needed = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
         if needed > self.free_bytes:

@@ -70,11 +70,7 @@ class GpuDrive:
         return head.lstrip().startswith(b"{") and (objects or (b'"roads"' in head and b'"geometry"' in head))
 
     def describe(self, path: Path) -> Description:
-        """What the file is.
-
-        Raises:
-            DataError: It is damaged, or lacks what a recording needs.
-        """
+        """What the file is."""
         recording = decode(_load(path))
         notes = [
             f"{len(recording.tracks.kind)} objects, {len(recording.features)} road elements",
@@ -118,9 +114,6 @@ def decode(scene: Any) -> Recording:
     Positions stay in WOMD's map frame, metres, float64; invalid steps (-10000 in the file) are zeros; steps are 0.1 s
     apart, because the file has no timestamps; the current step is 10. ``goalPosition`` is an agent's last valid
     position and therefore not kept, ``mark_as_expert`` (GPUDrive's choice of agents to replay) is dropped.
-
-    Raises:
-        DataError: The scene lacks what a recording needs, or contradicts itself.
     """
     if not isinstance(scene, Mapping):
         raise DataError("is no GPUDrive scene", cure=_SKIP)

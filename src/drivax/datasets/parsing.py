@@ -83,11 +83,7 @@ class Lights:
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
-    """Row numbers as ints.
-
-    Raises:
-        DataError: One is not a row of ``count`` tracks.
-    """
+    """Row numbers as ints."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names track {row}, there are {count}", cure="skip this record")
@@ -95,11 +91,7 @@ def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
 
 
 def check_finite(*measured: np.ndarray[Any, Any]) -> None:
-    """Refuse NaN and infinities among what is marked valid.
-
-    Raises:
-        DataError: There are some.
-    """
+    """Refuse NaN and infinities among what is marked valid."""
     if not all(np.isfinite(values).all() for values in measured):
         raise DataError("valid states hold numbers that are not finite", cure="skip this record")
 
@@ -132,11 +124,7 @@ def spacing_m(features: Sequence[MapFeature]) -> float | None:
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        DataError: It is missing or no JSON.
-    """
+    """The content of a JSON file."""
     try:
         return json.loads(path.read_bytes())
     except FileNotFoundError as error:
@@ -161,10 +149,6 @@ def one_point_features(features: Sequence[MapFeature]) -> int:
 
 
 def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
-    """Refuse numbers that nothing on a road has: NaN, infinities, and what is further from 0 than ``most``.
-
-    Raises:
-        DataError: There are some.
-    """
+    """Refuse numbers that nothing on a road has: NaN, infinities, and what is further from 0 than ``most``."""
     if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
         raise DataError(f"holds numbers that are not finite or beyond {most:g}", cure="skip this record")

@@ -41,10 +41,6 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
 
     Returns:
         One EDGE_BOUNDARY per ring, its first point repeated at the end.
-
-    Raises:
-        DataError: A coordinate is not finite, or no coordinate of a map.
-        UsageError: shapely is not installed.
     """
     try:
         import shapely

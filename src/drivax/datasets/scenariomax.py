@@ -36,11 +36,7 @@ class ScenarioMax:
         return womd.recognise(path, self.name)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows.
-
-        Raises:
-            DataError: It is damaged or of another form.
-        """
+        """What the first record shows."""
         recording = womd.first_recording(path, self.name, decode)
         notes = [*womd.notes_of(recording), "the file does not say which data set its scenarios come from"]
         limited = sum(feature.limit_mps is not None for feature in recording.features)
@@ -72,9 +68,6 @@ def decode(payload: bytes) -> Recording:
 
     Rows that are never valid are padding. Speed limits become m/s by lane, -1 mph is unknown; missing times are
     10 Hz; velocities that are missing (-1 throughout) are differentiated from positions.
-
-    Raises:
-        DataError: The payload is no such tf.Example, or a feature is missing or has the wrong length.
     """
     table = tf_example.features_of(payload)
     rows = np.arange(table.numbers("state/id").size)

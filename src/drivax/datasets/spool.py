@@ -50,9 +50,6 @@ def converted_ahead(
 
     Yields:
         The scenarios and bad records of one task; read them before asking for the next.
-
-    Raises:
-        DataError: A worker died.
     """
     spool = folder / f"spool-{os.getpid()}"
     spool.mkdir()

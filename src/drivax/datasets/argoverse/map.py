@@ -58,10 +58,6 @@ def read_map(path: Path) -> ArgoverseMap:
     """Reads a local map: lanes, painted lines (once each), road edges and crossings, in the city's frame, metres.
 
     Lanes keep their ids, their links (some lead outside the local map) and all neighbours, oncoming ones included.
-
-    Raises:
-        DataError: The file is missing or no such map.
-        UsageError: shapely is not installed.
     """
     try:
         return _decode(readings.load_json(path))
@@ -156,11 +152,7 @@ def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]
 
 
 def _points(record: Any, name: str) -> Float[Array, "point 3"]:
-    """A list of points of the map.
-
-    Raises:
-        DataError: It is missing, no list of points, or nowhere.
-    """
+    """A list of points of the map."""
     try:
         rows = [(point["x"], point["y"], point["z"]) for point in record[name]]
         points = np.array(rows, np.float64).reshape(-1, 3)

@@ -88,11 +88,7 @@ class ArgoverseMotion:
         return path.match(self.patterns[0]) and has_magic(path, PARQUET_MAGIC)
 
     def describe(self, path: Path) -> Description:
-        """Tracks, steps, city and split of one scenario.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """Tracks, steps, city and split of one scenario."""
         table = read_table(path, _COLUMNS)
         steps = 1 + int(table.numbers["timestep"].max())
         beside = _map_path(path)
@@ -129,10 +125,6 @@ def decode(path: Path) -> Recording:
 
     The city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
     those of the map; sizes those of the class; velocities as given, smoothed by the source.
-
-    Raises:
-        DataError: One of them is missing, damaged, or contradicts itself.
-        UsageError: pyarrow or shapely is not installed.
     """
     table = read_table(path, _COLUMNS)
     local_map = read_map(_map_path(path))

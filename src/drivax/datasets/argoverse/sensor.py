@@ -80,11 +80,7 @@ class ArgoverseSensor:
         return path.name in self.patterns and has_magic(path, FEATHER_MAGIC)
 
     def describe(self, path: Path) -> Description:
-        """Frames, tracks and city of a log.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """Frames, tracks and city of a log."""
         table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
@@ -132,10 +128,6 @@ def decode(path: Path) -> Recording:
 
     The city's frame, metres. Boxes are given in the car's frame and moved with its pose of the same time stamp; the
     ego is moved from its rear axle to the middle of its box; velocities are differences of positions.
-
-    Raises:
-        DataError: One of them is missing, damaged, or contradicts another.
-        UsageError: pyarrow or shapely is not installed.
     """
     boxes = read_table(path, _BOX_COLUMNS)
     poses = read_table(path.with_name(POSES), _POSE_COLUMNS)

@@ -73,10 +73,6 @@ def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
     Args:
         path: The file.
         columns: Name and kind of the columns: any number, whole numbers, or text. Other columns are not read.
-
-    Raises:
-        DataError: The file is missing or damaged, or lacks a column, a value, or a kind.
-        UsageError: pyarrow is not installed.
     """
     try:
         import pyarrow as pa

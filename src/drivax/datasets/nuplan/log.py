@@ -107,11 +107,7 @@ class Agents:
 
 
 def log_names(database: Database, path: Path) -> tuple[str, str]:
-    """Name of the log (of the file, where the table has none) and name of its map.
-
-    Raises:
-        DataError: The file is damaged, or names no map.
-    """
+    """Name of the log (of the file, where the table has none) and name of its map."""
     rows = database.rows("SELECT logfile, map_version FROM log")
     if not rows or not isinstance(rows[0][1], str) or not rows[0][1]:
         raise DataError("its table log names no map", file=path, cure="download the file again")
@@ -120,11 +116,7 @@ def log_names(database: Database, path: Path) -> tuple[str, str]:
 
 
 def time_line(database: Database) -> TimeLine:
-    """All lidar sweeps in order of time.
-
-    Raises:
-        DataError: The file is damaged or has no sweep.
-    """
+    """All lidar sweeps in order of time."""
     rows = database.rows("SELECT token, timestamp, scene_token FROM lidar_pc ORDER BY timestamp")
     if not rows:
         raise DataError("has no lidar sweep", file=database.path, cure="download the file again")
@@ -139,9 +131,6 @@ def pieces(line: TimeLine) -> list[Piece]:
 
     Of sweeps at 20 Hz every second is taken, counted from the last gap. What remains too short for a window after
     the last scene is left out: it is the future of the windows before.
-
-    Raises:
-        DataError: The sweeps come neither at 20 nor at 10 Hz.
     """
     found: list[Piece] = []
     counts: dict[Any, int] = {}
@@ -203,11 +192,7 @@ def _rows(database: Database, query: str, tokens: Sequence[Any]) -> list[tuple[A
 
 
 def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np.ndarray, "row column"]:
-    """Rows of numbers; NaN where a cell is NULL.
-
-    Raises:
-        DataError: A cell holds something else.
-    """
+    """Rows of numbers; NaN where a cell is NULL."""
     try:
         return np.array(rows, dtype=np.float64).reshape(len(rows), width)
     except (ValueError, TypeError, OverflowError) as error:
@@ -221,11 +206,7 @@ def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> Non
 
 
 def agents(database: Database) -> Agents:
-    """The tracks of a log: their kinds, and numbers counting from 1 in order of the table.
-
-    Raises:
-        DataError: The file is damaged.
-    """
+    """The tracks of a log: their kinds, and numbers counting from 1 in order of the table."""
     rows = database.rows(
         "SELECT t.token, c.name FROM track AS t LEFT JOIN category AS c ON c.token = t.category_token ORDER BY t.rowid"
     )
@@ -234,11 +215,7 @@ def agents(database: Database) -> Agents:
 
 
 def tracks(database: Database, line: TimeLine, piece: Piece, known: Agents) -> tuple[Tracks, dict[str, int]]:
-    """All tracks of a piece, the ego in row 0, and what was left out.
-
-    Raises:
-        DataError: An ego pose or a box is missing or damaged.
-    """
+    """All tracks of a piece, the ego in row 0, and what was left out."""
     steps = len(piece.sweeps)
     boxes, owners, left_out = _boxes(database, line, piece, known)
     tokens = sorted({owner for _, owner in owners}, key=lambda token: known.numbers[token])
@@ -294,11 +271,7 @@ def _ego(database: Database, line: TimeLine, piece: Piece) -> Float64[np.ndarray
 
 
 def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " pose"]:
-    """Heading of the x axis after the rotation by quaternions (w, x, y, z), radians.
-
-    Raises:
-        DataError: One is not of unit length.
-    """
+    """Heading of the x axis after the rotation by quaternions (w, x, y, z), radians."""
     w, x, y, z = quaternion.T
     if not (np.abs(np.linalg.norm(np.clip(quaternion, -2.0, 2.0), axis=1) - 1.0) < 0.01).all():
         raise DataError("an ego orientation is no unit quaternion", cure=_CURE)

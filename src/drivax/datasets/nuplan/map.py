@@ -52,9 +52,6 @@ def find_map(log: Path, name: str) -> Path:
 
     Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, beside the log or beside any folder
     above it, then where the environment variable ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
-
-    Raises:
-        DataError: There are no maps, or not this one.
     """
     listing = _listing(log)
     known = readings.load_json(listing)
@@ -124,11 +121,7 @@ class City:
 
 
 def city_map(path: Path) -> City:
-    """The index of a map, kept between calls as long as the file does not change.
-
-    Raises:
-        DataError: The file is damaged or no nuPlan map.
-    """
+    """The index of a map, kept between calls as long as the file does not change."""
     state = path.stat()
     return _city(path, state.st_mtime_ns, state.st_size)
 

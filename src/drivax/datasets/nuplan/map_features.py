@@ -38,12 +38,7 @@ _STOP_SIGN = 1
 def features_around(
     city: City, xy: Float64[np.ndarray, "point 2"]
 ) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
-    """Map features within ``MARGIN_M`` of the box of a drive, in the system of the logs, z = 0; and what was lost.
-
-    Raises:
-        DataError: The map is damaged.
-        UsageError: shapely or pyproj is not installed.
-    """
+    """Map features within ``MARGIN_M`` of the box of a drive, in the system of the logs, z = 0; and what was lost."""
     try:
         import shapely
     except ImportError as error:
@@ -122,12 +117,7 @@ class _Around:
 
 @functools.lru_cache(maxsize=8)
 def _transformer(source: int, target: int) -> Any:
-    """Projection between two EPSG systems, x (east) first.
-
-    Raises:
-        DataError: One is unknown, or the target is not in metres.
-        UsageError: pyproj is not installed.
-    """
+    """Projection between two EPSG systems, x (east) first."""
     try:
         import pyproj
         from pyproj.exceptions import ProjError

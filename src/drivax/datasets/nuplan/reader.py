@@ -45,11 +45,7 @@ class NuPlan:
             return False
 
     def describe(self, path: Path) -> Description:
-        """What the log holds, and whether its map is there.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """What the log holds, and whether its map is there."""
         with open_database(path) as database:
             log = _open_log(database, path)
             found = nuplan_log.pieces(log.line)
@@ -110,11 +106,7 @@ def _open_log(database: Database, path: Path) -> _Log:
 
 
 def _recording(log: _Log, piece: Piece, agents: Agents, city: City) -> Recording:
-    """The recording of one piece.
-
-    Raises:
-        DataError: Its part of the log or of the map is damaged, or the two do not belong together.
-    """
+    """The recording of one piece."""
     if len(piece.sweeps) <= CURRENT_STEP:
         raise DataError(
             f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}", cure="skip this record"

@@ -51,11 +51,7 @@ class Database:
         return int(self._left < 0)
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All rows of a query.
-
-        Raises:
-            DataError: The file is damaged, or lacks a table or column that the query names.
-        """
+        """All rows of a query."""
         self._left = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
         try:
             return self._connection.execute(query, values).fetchall()
@@ -72,11 +68,7 @@ class Database:
         )
 
     def require(self, table: str, *columns: str) -> None:
-        """Check that a table has columns.
-
-        Raises:
-            DataError: It has not.
-        """
+        """Check that a table has columns."""
         found = self.columns(table)
         if not found:
             raise DataError(f"has no table {table}", file=self.path, cure=_CURE)
@@ -86,11 +78,7 @@ class Database:
 
 @contextlib.contextmanager
 def open_database(path: Path) -> Iterator[Database]:
-    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written beside it.
-
-    Raises:
-        DataError: It is missing or no SQLite file.
-    """
+    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written beside it."""
     try:
         with path.open("rb") as file:
             head = file.read(len(SQLITE_MAGIC))
@@ -142,12 +130,7 @@ class Layer:
 
 
 def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> Layer | None:
-    """The rows of a layer without their geometries; None where the GeoPackage has no such layer.
-
-    Raises:
-        DataError: The file is damaged.
-        UsageError: shapely is not installed, and a geometry has no envelope.
-    """
+    """The rows of a layer without their geometries; None where the GeoPackage has no such layer."""
     found = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
     described = database.rows(
@@ -200,12 +183,7 @@ def _measure_bounds(database: Database, layer: Layer) -> None:
 
 
 def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]) -> Array:
-    """Geometries of some rows as an array of shapely objects; None where one cannot be read.
-
-    Raises:
-        DataError: The file is damaged.
-        UsageError: shapely is not installed.
-    """
+    """Geometries of some rows as an array of shapely objects; None where one cannot be read."""
     try:
         import shapely
     except ImportError as error:

@@ -99,11 +99,7 @@ class City:
 
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
-    """The map in a file of the map expansion (v1.0 to v1.3).
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """The map in a file of the map expansion (v1.0 to v1.3)."""
     content = load_json(path)
     try:
         return _Layers(content).city()

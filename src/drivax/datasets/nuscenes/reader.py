@@ -110,11 +110,7 @@ def _maps(path: Path) -> Path:
 
 
 def recording(scene: Scene, map_file: Path, version: str) -> Recording:
-    """One scene at 10 Hz in the city's frame.
-
-    Raises:
-        DataError: The map is missing, or the scene's numbers make no sense.
-    """
+    """One scene at 10 Hz in the city's frame."""
     begin = scene.keyframes_s[0]
     duration = float(scene.keyframes_s[-1] - begin)
     if not duration <= _LONGEST_S:

@@ -28,9 +28,6 @@ def rows(path: Path) -> Iterator[dict[str, Any]]:
 
     Args:
         path: The file; it is never held in memory as a whole.
-
-    Raises:
-        DataError: The file is missing or empty, is no such array, or ends early.
     """
     decoder = json.JSONDecoder()
     number = 0
@@ -147,11 +144,7 @@ class Tables:
 
     @classmethod
     def read(cls, folder: Path) -> Tables:
-        """Reads the tables of one version (``v1.0-mini``, ...), the large ones row by row.
-
-        Raises:
-            DataError: A table is missing or damaged, or there are no annotations, as in the test split.
-        """
+        """Reads the tables of one version (``v1.0-mini``, ...), the large ones row by row."""
         if not has_annotations(folder):
             raise DataError(
                 "holds no annotations, so nobody but the ego would be there",
@@ -187,11 +180,7 @@ class Tables:
         )
 
     def scene(self, row: int) -> Scene:
-        """One scene.
-
-        Raises:
-            DataError: It has no keyframes or no poses, or its log is unknown.
-        """
+        """One scene."""
         about = self.scenes[row]
         location, logfile = self.logs.get(about["log_token"], ("", ""))
         samples = np.flatnonzero(self.sample_scene == row)

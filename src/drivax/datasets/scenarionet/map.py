@@ -44,9 +44,6 @@ def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
 
     Args:
         lines: Points of the rings, metres; the first point is repeated at the end.
-
-    Raises:
-        DataError: There are too many.
     """
     ring = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
     rings = [points[:, :2] for points, closed in zip(lines, ring, strict=True) if closed]
@@ -90,9 +87,6 @@ def drivable_on_left(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Arr
     Args:
         edges: Points of road edges, metres.
         lanes: Points of lane centres.
-
-    Raises:
-        DataError: There are too many points.
     """
     centres = np.concatenate([points[:, :2] for points in lanes]) if lanes else np.zeros((0, 2))
     if sum(map(len, edges)) * len(centres) > _MOST_COMPARISONS:
@@ -192,9 +186,6 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
         table: Features by name.
         dataset: Where the data come from; decides which limits and which sides of edges can be believed.
         around: A place (x, y) where the ego has been, metres.
-
-    Raises:
-        DataError: A feature holds no numbers, or all of them together are too large.
     """
     named = {name: body for key, body in table.items() if (name := text(key)) and isinstance(body, dict)}
     numbers = sum(extent(value) for body in named.values() for value in body.values())

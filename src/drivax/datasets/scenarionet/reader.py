@@ -78,11 +78,7 @@ class ScenarioNet:
         )
 
     def describe(self, path: Path) -> Description:
-        """Data set, version and length of the scenario, and what its map lacks.
-
-        Raises:
-            DataError: The file is damaged, or no scenario.
-        """
+        """Data set, version and length of the scenario, and what its map lacks."""
         tree = _load(path)
         recording = decode(tree)
         lanes = [f for f in recording.features if f.kind in LANE_KINDS]
@@ -142,11 +138,7 @@ def _named_length(head: bytes) -> int | None:
 
 
 def decode(tree: Any) -> Recording:
-    """The recording in a ScenarioNet dictionary, in the file's map frame, metres, float64.
-
-    Raises:
-        DataError: It is none, or contradicts itself.
-    """
+    """The recording in a ScenarioNet dictionary, in the file's map frame, metres, float64."""
     metadata = mapping(tree, "metadata")
     table = {name: body for key, body in mapping(tree, "tracks").items() if (name := text(key)) is not None}
     rows = {name: row for row, name in enumerate(table)}

@@ -48,9 +48,6 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
         table: Tracks by name, in order.
         names: Their numbers.
         ego: Row of the ego.
-
-    Raises:
-        DataError: States are missing, of different lengths, too many, or no numbers.
     """
     bodies = [
         (f"track {name[:40]!r}", mapping({"": body}, "", f"tracks[{name[:40]!r}]"))

@@ -33,11 +33,7 @@ class WomdExample:
         return womd.recognise(path, self.name)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by sampling and features, truncated map, paths.
-
-        Raises:
-            DataError: It is damaged or of another form.
-        """
+        """What the first record shows: version by sampling and features, truncated map, paths."""
         recording = womd.first_recording(path, self.name, decode)
         notes = [
             *womd.notes_of(recording),
@@ -74,9 +70,6 @@ def decode(payload: bytes) -> Recording:
     entries (-1 in the file) are zeros, headings are wrapped. Lights are keyed by lane id because the 16 slots are
     used by different lanes over time. ``path_samples`` are counted as lost: which of them is the route was marked
     with the log's future.
-
-    Raises:
-        DataError: The payload is no such tf.Example, or a feature is missing or has the wrong length.
     """
     table = tf_example.features_of(payload)
     used = np.flatnonzero(table.numbers("state/id") != -1)

@@ -96,20 +96,12 @@ _PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE}
 
 
 def scenario_class(name: str = "Scenario") -> Any:
-    """The message class of a WOMD ``Scenario``, or of one of its parts.
-
-    Raises:
-        UsageError: protobuf is not installed.
-    """
+    """The message class of a WOMD ``Scenario``, or of one of its parts."""
     return _class("drivax.womd", name)
 
 
 def example_class() -> Any:
-    """The message class of a ``tf.Example``, its map of features declared as repeated entries.
-
-    Raises:
-        UsageError: protobuf is not installed.
-    """
+    """The message class of a ``tf.Example``, its map of features declared as repeated entries."""
     return _class("drivax.example", "Example")
 
 
@@ -203,11 +195,7 @@ def _layouts(numbers: Numbers) -> tuple[tuple[np.dtype[Any], tuple[int, ...]], .
 
 
 def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:
-    """One row per message, one column per field, 0 where a field is not there.
-
-    Raises:
-        DataError: One of them is damaged.
-    """
+    """One row per message, one column per field, 0 where a field is not there."""
     out = np.zeros((len(blobs), len(numbers.fields)))
     todo = np.ones(len(blobs), dtype=bool)
     sizes = np.fromiter(map(len, blobs), np.int64, len(blobs))
@@ -233,11 +221,7 @@ def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, 
 
 
 def read_one(blob: bytes, numbers: Numbers) -> list[float]:
-    """One row as protobuf reads it.
-
-    Raises:
-        DataError: The message is damaged.
-    """
+    """One row as protobuf reads it."""
     message = parse(scenario_class(numbers.name), blob)
     if message is None:
         raise DataError(

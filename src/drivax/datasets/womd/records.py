@@ -78,11 +78,7 @@ def recognise(path: Path, name: str) -> bool:
 
 
 def _first(path: Path) -> bytes:
-    """Payload of the first readable record.
-
-    Raises:
-        DataError: There is none; the first damage.
-    """
+    """Payload of the first readable record."""
     damage = DataError("the file is empty", file=path, cure="download it again")
     for number, record in read_records(path):
         if isinstance(record, bytes):
@@ -92,11 +88,7 @@ def _first(path: Path) -> bytes:
 
 
 def first_recording(path: Path, name: str, decode: Decode) -> Recording:
-    """The first readable record of a file, decoded: what ``describe`` looks at.
-
-    Raises:
-        DataError: It is damaged, or of another form.
-    """
+    """The first readable record of a file, decoded: what ``describe`` looks at."""
     payload = _first(path)
     try:
         return decode(payload)

@@ -45,11 +45,7 @@ class WomdScenario:
         return womd.recognise(path, self.name)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by kinds of features, length, lane graph, lights.
-
-        Raises:
-            DataError: It is damaged or of another form.
-        """
+        """What the first record shows: version by kinds of features, length, lane graph, lights."""
         recording = womd.first_recording(path, self.name, decode)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         linked = any(lane.successors or lane.predecessors for lane in lanes)
@@ -80,9 +76,6 @@ def decode(payload: bytes) -> Recording:
     Positions stay in the proto's map frame, metres, float64. Headings are wrapped (the files hold up to 10 rad),
     invalid states are zeros (the files keep a z there), speed limits are m/s and None where the file says 0.
     Links to lanes that the file does not hold are kept.
-
-    Raises:
-        DataError: The payload is no Scenario, or contradicts itself.
     """
     message = parse(scenario_class(), payload)
     if message is None or not message.scenario_id:

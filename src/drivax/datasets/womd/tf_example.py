@@ -38,11 +38,7 @@ def agent_kind(code: int) -> AgentKind:
 
 
 def features_of(payload: bytes) -> Features:
-    """The features in a serialised tf.Example.
-
-    Raises:
-        DataError: The payload is none.
-    """
+    """The features in a serialised tf.Example."""
     message = parse(example_class(), payload)
     if message is None or not message.features.feature:
         raise DataError("the payload is not a tf.Example", cure=SKIP)
@@ -62,11 +58,7 @@ class Features:
         return kind is not None and len(getattr(value, kind).value) > 0
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
-        """A numeric feature, checked against and brought into a shape.
-
-        Raises:
-            DataError: It is missing, no numbers, or has the wrong length.
-        """
+        """A numeric feature, checked against and brought into a shape."""
         value = self._values.get(name)
         kind = value.WhichOneof("kind") if value is not None else None
         if kind not in ("float_list", "int64_list"):
@@ -82,11 +74,7 @@ class Features:
         return values.reshape(shape)
 
     def integers(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
-        """A feature that must be stored as whole numbers: ids of lanes would be rounded by floats.
-
-        Raises:
-            DataError: As ``numbers``, or it is stored as floats.
-        """
+        """A feature that must be stored as whole numbers: ids of lanes would be rounded by floats."""
         values = self.numbers(name, shape)
         if values.dtype != np.int64:
             raise DataError(f"feature {name} holds floats, not integers", cure=SKIP)
@@ -136,9 +124,6 @@ def track_ids(features: Features, used: Array) -> Array:
     """Ids of the rows used, as int64.
 
     The file stores them as floats. WOMD's are far below 2**24, up to where that is exact.
-
-    Raises:
-        DataError: One is not a whole number, too large to be exact, negative, or given twice.
     """
     ids = features.numbers("state/id")[used]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
@@ -149,11 +134,7 @@ def track_ids(features: Features, used: Array) -> Array:
 
 
 def tracks(features: Features, used: Array, track_id: Array) -> Tracks:
-    """The tracks in the rows used; what is not valid (-1 in the file) is zero, headings are wrapped.
-
-    Raises:
-        DataError: A feature is missing, has the wrong length, or valid states are not finite.
-    """
+    """The tracks in the rows used; what is not valid (-1 in the file) is zero, headings are wrapped."""
     valid = features.over_time("valid", used) == 1
 
     def measured(*names: str) -> Array:
@@ -181,11 +162,7 @@ def timestamps(features: Features, used: Array, valid: Array) -> Array:
 
 
 def ego_row(features: Features, used: Array) -> int:
-    """The ego's row among the rows used.
-
-    Raises:
-        DataError: None or several are marked.
-    """
+    """The ego's row among the rows used."""
     ego = features.marked("state/is_sdc", used)
     if len(ego) != 1:
         raise DataError(f"state/is_sdc marks {len(ego)} rows, not 1", cure=SKIP)
@@ -193,11 +170,7 @@ def ego_row(features: Features, used: Array) -> int:
 
 
 def lights(features: Features) -> tuple[Light, ...]:
-    """Lights by lane: the slots are used by different lanes over time.
-
-    Raises:
-        DataError: A feature is missing, has the wrong length, or lane ids are stored as floats.
-    """
+    """Lights by lane: the slots are used by different lanes over time."""
     found = readings.Lights(sum(features.spans.values()))
     start = 0
     for span, steps in features.spans.items():
@@ -217,11 +190,7 @@ def lights(features: Features) -> tuple[Light, ...]:
 
 
 def map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
-    """Map features in order of first appearance, and whether the list of points is full, so probably cut off.
-
-    Raises:
-        DataError: A feature is missing, has the wrong length, or ids are stored as floats.
-    """
+    """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
     base = "roadgraph_samples/"
     if not features.has(base + "id"):
         return (), False

@@ -69,11 +69,7 @@ def shard_name(name: str, number: int, shards: int) -> str:
 
 
 def write_record(file: BinaryIO, payload: bytes) -> None:
-    """Append one record.
-
-    Raises:
-        UsageError: google-crc32c is not installed.
-    """
+    """Append one record."""
     try:
         import google_crc32c
     except ImportError as error:
@@ -109,10 +105,6 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
 
     Yields:
         (record number, payload or error). An empty file yields one error.
-
-    Raises:
-        DataError: The file cannot be opened.
-        UsageError: google-crc32c is not installed.
     """
     crc32c = _crc32c()
     path = Path(path)
