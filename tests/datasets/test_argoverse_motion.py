@@ -250,7 +250,7 @@ def test_missing_pyarrow_names_the_extra(sample, monkeypatch):
         return found(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", blocked)
-    with pytest.raises(UsageError, match=r"pip install 'drivax\[av2,maps\]'"):
+    with pytest.raises(UsageError, match=r"pip install 'drivax\[av2\]'"):
         list(READER.read(sample))
 
 

@@ -366,7 +366,7 @@ def test_plan_is_announced_before_the_work(thirty, tmp_path):
         thirty, tmp_path / "set", Conversion(limit=7), lambda *call: calls.append(call), None, plans.append
     )
     (plan,) = plans
-    assert plan.found.formats == {"womd-scenario": 3} and plan.written == 0
+    assert plan.data.formats == {"womd-scenario": 3} and plan.written == 0
     assert plan.estimate.scenarios == 7
     assert plan.estimate.size_bytes == 7 * record_dtype(CAPACITIES["default"]).itemsize
     assert plan.estimate.free_bytes > 0 and not plan.estimate.sampled

@@ -393,5 +393,5 @@ def test_feature_ids_are_distinct():
 def test_missing_packages_are_named_with_the_extra_that_brings_them(city, monkeypatch, name):
     nuplan_features._transformer.cache_clear()
     monkeypatch.setitem(sys.modules, name, None)  # makes its import fail
-    with pytest.raises(UsageError, match=f"need {name}; pip install 'drivax\\[maps\\]'"):
+    with pytest.raises(UsageError, match=f"{name} is not installed; pip install 'drivax\\[maps\\]'"):
         features_around(city, DRIVE)

@@ -158,12 +158,12 @@ class Plan:
     """What a conversion is about to do.
 
     Attributes:
-        found: The files.
+        data: The files.
         estimate: How large the set will be.
         written: How many scenarios an earlier, interrupted conversion has written already.
     """
 
-    found: Survey
+    data: Survey
     estimate: Estimate
     written: int
 
@@ -226,47 +226,47 @@ def convert(
     options = options or Conversion()
     options.check()
     begin = time.monotonic()
-    found = survey(src, options.format)
+    data = survey(src, options.format)
     capacity = CAPACITIES[options.capacity]
     with ScenarioWriter(
-        out, capacity, _source(found, options), options.shard_size, options.overwrite, options.shares,
-        _identity(found, options, audited=audit is not None),
+        out, capacity, _source(data, options), options.shard_size, options.overwrite, options.shares,
+        _identity(data, options, audited=audit is not None),
     ) as writer:  # fmt: skip
         written = len(writer)
-        sink = _Sink(writer, found, options, audit)
-        expected = estimate(found, Path(out), capacity, options.stride, options.limit)
+        sink = _Sink(writer, data, options, audit)
+        expected = estimate(data, Path(out), capacity, options.stride, options.limit)
         if announce is not None:
-            announce(Plan(found, expected, written))
+            announce(Plan(data, expected, written))
         if not options.filters:  # with them nobody knows how many will be left
             expected.check(Path(out), written)
-        done = _drain(found, options, sink, writer, progress)
+        done = _drain(data, options, sink, writer, progress)
         if not len(writer):
-            raise _nothing(found, sink)
+            raise _nothing(data, sink)
         writer.source |= sink.left_out()
     seconds = time.monotonic() - begin
     return Converted(
-        Path(out), len(writer), written, done, found.ignored, dict(found.formats), tuple(sink.skipped),
+        Path(out), len(writer), written, done, data.ignored, dict(data.formats), tuple(sink.skipped),
         sink.filtered, seconds,
     )  # fmt: skip
 
 
-def _source(found: Survey, options: Conversion) -> dict[str, Any]:
+def _source(data: Survey, options: Conversion) -> dict[str, Any]:
     """Where the set comes from, for its manifest."""
     return {
         "command": "convert",
         "format": options.format,
-        "folder": found.root.name,
-        "files": len(found.inputs),
-        "formats": dict(sorted(found.formats.items())),
+        "folder": data.root.name,
+        "files": len(data.inputs),
+        "formats": dict(sorted(data.formats.items())),
         **{name: getattr(options, name) for name in ("limit", "filters", "routes", "stride", "split")},
     }
 
 
-def _identity(found: Survey, options: Conversion, audited: bool) -> dict[str, Any]:
+def _identity(data: Survey, options: Conversion, audited: bool) -> dict[str, Any]:
     """All that the bytes of the set depend on; only a conversion with the same may continue another."""
     digest = hashlib.sha256()
-    for one in found.inputs:
-        digest.update(f"{found.relative(one.path)}\t{one.path.stat().st_size}\t{one.format}\n".encode())
+    for entry in data.inputs:
+        digest.update(f"{data.relative(entry.path)}\t{entry.path.stat().st_size}\t{entry.format}\n".encode())
     names = ("format", "capacity", "limit", "filters", "routes", "stride", "split", "shard_size")
     return {
         "drivax": metadata.version("drivax"),
@@ -284,10 +284,10 @@ class _Sink:
     """
 
     def __init__(
-        self, writer: ScenarioWriter, found: Survey, options: Conversion, audit: Audit | None
+        self, writer: ScenarioWriter, data: Survey, options: Conversion, audit: Audit | None
     ) -> None:
         self._writer = writer
-        self._found = found
+        self._data = data
         self._options = options
         self._audit = audit
         self._selection = Selection.parse(options.filters)
@@ -300,7 +300,7 @@ class _Sink:
         for note in writer.notes:
             self.place = tuple(note["place"])
             self.filtered = note["filtered"]
-            self.skipped += [_bad_record(found, row) for row in note["skipped"]]
+            self.skipped += [_bad_record(data, row) for row in note["skipped"]]
         self._noted = len(self.skipped)
         if options.strict and self.skipped:
             raise self.skipped[0].error()
@@ -331,7 +331,7 @@ class _Sink:
 
     def left_out(self) -> dict[str, Any]:
         """What is not in the set, for its manifest."""
-        rows = [_row(self._found, bad) for bad in self.skipped]
+        rows = [_row(self._data, bad) for bad in self.skipped]
         for row in rows:
             del row["cure"]
         return {"skipped": len(rows), "skipped_records": rows, "filtered": self.filtered}
@@ -369,7 +369,7 @@ class _Sink:
             if isinstance(item, Scenario):
                 key = bytes(item.record["dataset"][()]).decode(), item.id
                 if key in self._writer or key in seen:
-                    path = self._found.inputs[file].path
+                    path = self._data.inputs[file].path
                     item = BadRecord(
                         path, item.id, "the scenario is in the set already", "give each file once"
                     )
@@ -389,7 +389,7 @@ class _Sink:
 
     def _note(self, place: tuple[int, int]) -> dict[str, Any]:
         new, self._noted = self.skipped[self._noted :], len(self.skipped)
-        rows = [_row(self._found, bad) for bad in new]
+        rows = [_row(self._data, bad) for bad in new]
         return {"place": place, "filtered": self.filtered, "skipped": rows}
 
     def _skip(self, bad: BadRecord) -> None:
@@ -398,24 +398,24 @@ class _Sink:
         self.skipped.append(bad)
 
 
-def _row(found: Survey, bad: BadRecord) -> dict[str, Any]:
+def _row(data: Survey, bad: BadRecord) -> dict[str, Any]:
     """A bad record as JSON values."""
-    return {"file": found.relative(bad.file), "record": bad.record, "problem": bad.problem, "cure": bad.cure}
+    return {"file": data.relative(bad.file), "record": bad.record, "problem": bad.problem, "cure": bad.cure}
 
 
-def _bad_record(found: Survey, row: dict[str, Any]) -> BadRecord:
-    file = found.root / row["file"] if found.root.is_dir() else found.root.with_name(row["file"])
+def _bad_record(data: Survey, row: dict[str, Any]) -> BadRecord:
+    file = data.root / row["file"] if data.root.is_dir() else data.root.with_name(row["file"])
     return BadRecord(file, row["record"], row["problem"], row["cure"])
 
 
 def _drain(
-    found: Survey, options: Conversion, sink: _Sink, writer: ScenarioWriter, progress: Progress | None
+    data: Survey, options: Conversion, sink: _Sink, writer: ScenarioWriter, progress: Progress | None
 ) -> int:
     """Moves results into the sink until they or the limit end; returns the number of files read."""
     report = progress or (lambda done, total, scenarios: None)
     first, skip = sink.place
-    total = len(found.inputs)
-    with closing(_results(found, options, first, writer.folder)) as results:
+    total = len(data.inputs)
+    with closing(_results(data, options, first, writer.folder)) as results:
         for number, items in enumerate(results, start=first):
             for place, item in islice(enumerate(items, start=1), skip, None):
                 sink.take(item, (number, place))
@@ -429,11 +429,11 @@ def _drain(
 
 
 def _results(
-    found: Survey, options: Conversion, first: int, folder: Path
+    data: Survey, options: Conversion, first: int, folder: Path
 ) -> Generator[Iterator[Scenario | BadRecord], None, None]:
     """Scenarios and bad records of every file from number ``first`` on."""
     tasks = [
-        (one.path, replace(options, format=one.format or options.format)) for one in found.inputs[first:]
+        (entry.path, replace(options, format=entry.format or options.format)) for entry in data.inputs[first:]
     ]
     if options.workers == 1 or len(tasks) <= 1:
         yield from (convert_file(*task) for task in tasks)
@@ -441,12 +441,12 @@ def _results(
     yield from converted_ahead(tasks, convert_file, CAPACITIES[options.capacity], options.workers, folder)
 
 
-def _nothing(found: Survey, sink: _Sink) -> DataError:
+def _nothing(data: Survey, sink: _Sink) -> DataError:
     if sink.filtered:
         problem = f"none of the {sink.filtered} scenarios satisfies the filters"
-        return DataError(problem, file=found.root, cure="use wider filters")
+        return DataError(problem, file=data.root, cure="use wider filters")
     if not sink.skipped:
-        return DataError("holds no recording", file=found.root, cure="look at it with drivax doctor")
+        return DataError("holds no recording", file=data.root, cure="look at it with drivax doctor")
     first = sink.skipped[0]
     if len(sink.skipped) == 1:
         return first.error()

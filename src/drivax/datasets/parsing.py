@@ -1,7 +1,8 @@
-"""What readers share: lights by lane, checks, time bases, places and spacing of what was measured, JSON files."""
+"""Parsing that readers share: imports of extras, checks, time bases, lights by lane, city names, JSON files."""
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from drivax.errors import DataError
+from drivax.errors import DataError, missing_package
 from drivax.scenario.arrays import differentiate as differentiate
 from drivax.scenario.recording import STRIDE, Light, MapFeature
 from drivax.scenario.schema import POLYGON_KINDS, STEPS, LightState, RoadKind
@@ -53,6 +54,14 @@ _UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
 _LAST_STATE = int(max(LightState))
 
 
+def import_extra(package: str) -> Any:
+    """Return a package that an extra installs."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise missing_package(error) or error from error
+
+
 class Lights:
     """Collects light states by lane: slots and list positions move between steps, lanes do not.
 
@@ -63,14 +72,14 @@ class Lights:
     def __init__(self, steps: int) -> None:
         self._steps = steps
         # Lists of plain numbers: a scenario has a thousand observations, and arrays are slow one by one.
-        self._found: dict[int, tuple[tuple[float, ...], list[int]]] = {}
+        self._lights: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
         """Note one observation. Of several for one lane and step the first that is not UNKNOWN counts."""
-        found = self._found.get(lane)
-        if found is None:
-            found = self._found[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
-        states = found[1]
+        light = self._lights.get(lane)
+        if light is None:
+            light = self._lights[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
+        states = light[1]
         if states[step] <= _UNKNOWN:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
@@ -78,7 +87,7 @@ class Lights:
         """The lights in order of first observation."""
         return tuple(
             Light(lane, np.array(point, np.float64), np.array(states, np.int8))
-            for lane, (point, states) in self._found.items()
+            for lane, (point, states) in self._lights.items()
         )
 
 
@@ -138,7 +147,7 @@ def windows_of(steps: int) -> int:
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
-def counted(**counts: int) -> dict[str, int]:
+def nonzero(**counts: int) -> dict[str, int]:
     """Counts by name for ``Recording.lost``; only what is not zero."""
     return {name: int(count) for name, count in counts.items() if count}
 

@@ -159,19 +159,19 @@ def _varint(payload: bytes, at: int) -> tuple[int, int]:
 
 def _is_frame(payload: bytes) -> bool:
     """Whether it is a ``Frame`` of WOMD perception: context with a name (1), timestamp (2), images or lasers."""
-    found = dict(fields(payload))
-    context = found.get(1)
-    if not isinstance(context, bytes) or not isinstance(found.get(2), int):
+    message = dict(fields(payload))
+    context = message.get(1)
+    if not isinstance(context, bytes) or not isinstance(message.get(2), int):
         return False
     name = dict(fields(context)).get(1)
-    return isinstance(name, bytes) and name.isascii() and bool({3, 4, 5} & found.keys())
+    return isinstance(name, bytes) and name.isascii() and bool({3, 4, 5} & message.keys())
 
 
 def _is_end_to_end(payload: bytes) -> bool:
     """Whether it is an ``E2EDFrame``: a ``Frame`` (1) with past or future states of ego (2, 3)."""
-    found = dict(fields(payload))
-    frame = found.get(1)
-    states = (found.get(2), found.get(3))
+    message = dict(fields(payload))
+    frame = message.get(1)
+    states = (message.get(2), message.get(3))
     if not isinstance(frame, bytes) or not any(isinstance(state, bytes) for state in states):
         return False
     inner = dict(fields(frame))
@@ -182,8 +182,8 @@ def _is_example(payload: bytes) -> bool:
     """Whether it is a ``tf.Example``: features (1) with entries (1) that have a key (1) and a value (2)."""
     features = dict(fields(payload)).get(1)
     entry = dict(fields(features)).get(1) if isinstance(features, bytes) else None
-    found = dict(fields(entry)) if isinstance(entry, bytes) else {}
-    return isinstance(found.get(1), bytes) and isinstance(found.get(2), bytes)
+    message = dict(fields(entry)) if isinstance(entry, bytes) else {}
+    return isinstance(message.get(1), bytes) and isinstance(message.get(2), bytes)
 
 
 _RECORDS: tuple[tuple[Callable[[bytes], bool], str, str], ...] = (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.datasets import parsing as readings
+from drivax.datasets import parsing
 from drivax.datasets.argoverse.tables import FARTHEST_M
 from drivax.datasets.road_edges import Area, road_edges
 from drivax.errors import DataError
@@ -60,7 +60,7 @@ def read_map(path: Path) -> ArgoverseMap:
     Lanes keep their ids, their links (some lead outside the local map) and all neighbours, oncoming ones included.
     """
     try:
-        return _decode(readings.load_json(path))
+        return _decode(parsing.load_json(path))
     except DataError as error:
         raise DataError(error.problem, file=path, record=error.record, cure=error.cure or _AGAIN) from error
 
@@ -81,7 +81,7 @@ def _decode(content: Any) -> ArgoverseMap:
     free += len(edges)
     drawn = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
     rest = [MapFeature(free + number, kind, points) for number, (kind, points) in enumerate(drawn)]
-    lost = readings.counted(lanes_without_length=len(segments) - len(lanes))
+    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes))
     return ArgoverseMap((*lanes, *edges, *rest), lost)
 
 
@@ -156,7 +156,7 @@ def _points(record: Any, name: str) -> Float[Array, "point 3"]:
     try:
         rows = [(point["x"], point["y"], point["z"]) for point in record[name]]
         points = np.array(rows, np.float64).reshape(-1, 3)
-        readings.check_within(FARTHEST_M, points)
+        parsing.check_within(FARTHEST_M, points)
     except (TypeError, KeyError, ValueError, OverflowError, IndexError) as error:
         raise DataError(f"{name} is no list of points", record=_name(record), cure=_AGAIN) from error
     return points

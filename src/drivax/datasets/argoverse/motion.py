@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int
 
-from drivax.datasets import parsing as readings
+from drivax.datasets import parsing
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
 from drivax.datasets.argoverse.tables import (
     CENTRE_AHEAD_M,
@@ -148,7 +148,7 @@ def decode(path: Path) -> Recording:
         to_predict=tuple(row for row, word in enumerate(names.words) if word == focal),
         of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
         tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
-        lost=local_map.lost | readings.counted(repeated_rows=table.rows - int(tracks.valid.sum())),
+        lost=local_map.lost | parsing.nonzero(repeated_rows=table.rows - int(tracks.valid.sum())),
         flags=Flag.DEFAULT_SIZES,
     )
 
@@ -173,12 +173,12 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     states = np.zeros((len(names.words), int(step.max()) + 1, len(columns)))
     valid = np.zeros(states.shape[:2], bool)
     states[row, step], valid[row, step] = table.stacked(columns), True
-    readings.check_within(FARTHEST_M, states[..., :3])
-    readings.check_within(FASTEST_MPS, states[..., 3:])
+    parsing.check_within(FARTHEST_M, states[..., :3])
+    parsing.check_within(FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
     there = valid[ego]
-    xy[ego, there] = readings.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
+    xy[ego, there] = parsing.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,
@@ -216,5 +216,5 @@ def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1
     between = (end - start) / intervals if intervals > 0 else DT_S
-    readings.check_within(1e12, np.array([start, between]))
+    parsing.check_within(1e12, np.array([start, between]))
     return start + between * np.arange(steps)

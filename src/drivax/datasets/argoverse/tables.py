@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 
 DATASET = "av2"
 #: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
@@ -74,12 +75,7 @@ def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
         path: The file.
         columns: Name and kind of the columns: any number, whole numbers, or text. Other columns are not read.
     """
-    try:
-        import pyarrow as pa
-    except ImportError as error:
-        raise UsageError(
-            "reading Argoverse 2 needs pyarrow", cure="pip install 'drivax[av2,maps]'"
-        ) from error
+    pa = import_extra("pyarrow")
     try:
         table = _load(path, list(columns))
         if table.num_rows == 0:
@@ -121,8 +117,8 @@ def _load(path: Path, columns: Sequence[str]) -> Any:
     return table
 
 
-def _check(names: Sequence[str], wanted: Sequence[str], rows: int) -> None:
-    for name in wanted:
+def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
+    for name in columns:
         if names.count(name) != 1:
             raise DataError(f"has no column {name}", cure="this is another kind of table, or a damaged one")
     if not 0 <= rows <= MOST_ROWS:

@@ -117,8 +117,8 @@ def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     others, those with most valid steps first. The ego stands in front of them all because V-Max takes row 0 for it.
     """
     now = tracks.valid[:, CURRENT_STEP]
-    wanted = [row for row in recording.to_predict if now[row] and row != recording.ego]
-    first = sorted(wanted, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
+    predicted = [row for row in recording.to_predict if now[row] and row != recording.ego]
+    first = sorted(predicted, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
     at = tracks.xy[:, CURRENT_STEP]
     away = np.hypot(*(at - at[recording.ego]).T)
     rank = np.where(now, away, 1e9 - tracks.valid.sum(axis=1))

@@ -132,7 +132,7 @@ def pieces(line: TimeLine) -> list[Piece]:
     Of sweeps at 20 Hz every second is taken, counted from the last gap. What remains too short for a window after
     the last scene is left out: it is the future of the windows before.
     """
-    found: list[Piece] = []
+    recordings: list[Piece] = []
     counts: dict[Any, int] = {}
     step = _every(line.time_us)
     ends = np.flatnonzero(np.diff(line.time_us) > _GAP_US) + 1
@@ -146,8 +146,8 @@ def pieces(line: TimeLine) -> list[Piece]:
             number = counts[scene] = counts.get(scene, 0) + 1
             name = _hexadecimal(scene) + (f".{number}" if number > 1 else "")
             own = int(sweeps[begin]), int(sweeps[end - 1]) + step
-            found.append(Piece(name, scene, sweeps[part], own))
-    return found
+            recordings.append(Piece(name, scene, sweeps[part], own))
+    return recordings
 
 
 def _every(time_us: Int64[np.ndarray, " sweep"]) -> int:
@@ -166,11 +166,11 @@ def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[in
     """Steps of each scene, first and one past the last; long ones in parts."""
     scenes = [line.scenes[sweep] for sweep in sweeps]
     begins = [step for step in range(len(scenes)) if step == 0 or scenes[step] != scenes[step - 1]]
-    found = []
+    ranges = []
     for begin, end in zip(begins, (*begins[1:], len(scenes)), strict=True):
         starts = range(begin, end, _LONGEST_PIECE)
-        found += [(start, min(start + _LONGEST_PIECE, end)) for start in starts]
-    return found
+        ranges += [(start, min(start + _LONGEST_PIECE, end)) for start in starts]
+    return ranges
 
 
 def _hexadecimal(token: Any) -> str:
@@ -184,11 +184,11 @@ def timestamps(line: TimeLine, piece: Piece) -> Float64[np.ndarray, " step"]:
 
 def _rows(database: Database, query: str, tokens: Sequence[Any]) -> list[tuple[Any, ...]]:
     """Rows of a query that ends in ``IN``, for any number of tokens."""
-    found = []
+    result = []
     for start in range(0, len(tokens), _TOKENS_AT_ONCE):
         part = tokens[start : start + _TOKENS_AT_ONCE]
-        found += database.rows(f"{query} ({', '.join('?' * len(part))})", part)
-    return found
+        result += database.rows(f"{query} ({', '.join('?' * len(part))})", part)
+    return result
 
 
 def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np.ndarray, "row column"]:
@@ -228,7 +228,7 @@ def tracks(database: Database, line: TimeLine, piece: Piece, known: Agents) -> t
     if owners:
         at = np.array([(rows[owner], step) for step, owner in owners]).T
         table[at[0], at[1]], valid[at[0], at[1]] = boxes, True
-    found = Tracks(
+    states = Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
         heading=table[..., 3].copy(),
@@ -238,7 +238,7 @@ def tracks(database: Database, line: TimeLine, piece: Piece, known: Agents) -> t
         kind=np.array([AgentKind.VEHICLE, *(known.kinds[token] for token in tokens)], np.int8),
         track_id=np.array([EGO_TRACK_ID, *(known.numbers[token] for token in tokens)], np.int64),
     )
-    return found, left_out
+    return states, left_out
 
 
 def _ego(database: Database, line: TimeLine, piece: Piece) -> Float64[np.ndarray, "step 9"]:
@@ -286,8 +286,8 @@ def _observed(
     query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
     rows = _rows(database, query, list(steps))
     # A damaged index leads to rows of other sweeps.
-    found = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
-    return sorted(found, key=lambda row: row[0])
+    kept = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
+    return sorted(kept, key=lambda row: row[0])
 
 
 def _boxes(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivax.datasets import parsing as readings
+from drivax.datasets import parsing
 from drivax.datasets.nuplan.sqlite import Database, Layer, open_database, read_layer
 from drivax.errors import DataError
 
@@ -54,7 +54,7 @@ def find_map(log: Path, name: str) -> Path:
     above it, then where the environment variable ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
     """
     listing = _listing(log)
-    known = readings.load_json(listing)
+    known = parsing.load_json(listing)
     entry = known.get(name) if isinstance(known, dict) else None
     version = entry.get("version") if isinstance(entry, dict) else None
     if (
@@ -76,8 +76,8 @@ def _listing(log: Path) -> Path:
         roots.append(Path(os.environ["NUPLAN_MAPS_ROOT"]))
     for root in roots:
         for pattern in (_LISTING, f"{_UNPACKED}/{_LISTING}"):
-            if found := sorted(root.glob(pattern)):
-                return found[-1]
+            if listings := sorted(root.glob(pattern)):
+                return listings[-1]
     raise DataError(
         "no nuPlan maps beside it (maps/nuplan-maps-v1.0.json)",
         file=log,
@@ -260,10 +260,10 @@ def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
 
     Groups of lanes and of connectors share the list; an id that both have means the lanes, as in the devkit.
     """
-    found: dict[int, None] = {}
+    lane_ids: dict[int, None] = {}
     unknown = 0
     for number in ids:
         lanes = city.roadblocks.get(("lane", number)) or city.roadblocks.get(("connector", number))
         unknown += lanes is None
-        found.update(dict.fromkeys(lanes or ()))
-    return tuple(found), unknown
+        lane_ids.update(dict.fromkeys(lanes or ()))
+    return tuple(lane_ids), unknown

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivax.datasets import parsing as readings
+from drivax.datasets import parsing
 from drivax.datasets.elevation import flatten
 from drivax.datasets.nuplan import log as nuplan_log
 from drivax.datasets.nuplan.log import Agents, Piece, TimeLine
@@ -48,9 +48,9 @@ class NuPlan:
         """What the log holds, and whether its map is there."""
         with open_database(path) as database:
             log = _open_log(database, path)
-            found = nuplan_log.pieces(log.line)
+            pieces = nuplan_log.pieces(log.line)
         times = log.line.time_us
-        scenes = len({piece.scene for piece in found})
+        scenes = len({piece.scene for piece in pieces})
         notes = [
             f"map {log.map_name}",
             f"{(times[-1] - times[0]) * 1e-6:.0f} s of driving in {scenes} scenes",
@@ -61,16 +61,16 @@ class NuPlan:
         except DataError as error:
             missing = (f"maps/{log.map_name}/<version>/map.gpkg",)
             notes.append(str(error))
-        return Description("nuPlan", "SQLite log", None, len(found), tuple(notes), missing)
+        return Description("nuPlan", "SQLite log", None, len(pieces), tuple(notes), missing)
 
     def count(self, path: Path) -> int:
         """Number of windows of 91 steps at the usual stride; 0 where the log cannot be read."""
         try:
             with open_database(path) as database:
-                found = nuplan_log.pieces(nuplan_log.time_line(database))
+                pieces = nuplan_log.pieces(nuplan_log.time_line(database))
         except DataError:
             return 0
-        return sum(max(len(piece.sweeps) - STEPS, 0) // STRIDE + 1 for piece in found)
+        return sum(max(len(piece.sweeps) - STEPS, 0) // STRIDE + 1 for piece in pieces)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """One recording per scene in order of time, and in their place the scenes that cannot be read."""
@@ -145,7 +145,7 @@ def _lights(
         The lights, and how many connectors with a light the whole map does not have.
     """
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
-    lights = readings.Lights(len(piece.sweeps))
+    lights = parsing.Lights(len(piece.sweeps))
     unknown = set()
     for step, connector, state in nuplan_log.light_states(log.database, log.line, piece):
         good = isinstance(connector, int) and 0 <= connector < 2**32

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 
 Array = np.ndarray[Any, Any]
 
@@ -69,10 +70,10 @@ class Database:
 
     def require(self, table: str, *columns: str) -> None:
         """Check that a table has columns."""
-        found = self.columns(table)
-        if not found:
+        present = self.columns(table)
+        if not present:
             raise DataError(f"has no table {table}", file=self.path, cure=_CURE)
-        if missing := [name for name in columns if name not in found]:
+        if missing := [name for name in columns if name not in present]:
             raise DataError(f"its table {table} has no column {missing[0]}", file=self.path, cure=_CURE)
 
 
@@ -131,17 +132,17 @@ class Layer:
 
 def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> Layer | None:
     """The rows of a layer without their geometries; None where the GeoPackage has no such layer."""
-    found = database.columns(name)
+    present = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
     described = database.rows(
         "SELECT column_name, srs_id FROM gpkg_geometry_columns WHERE table_name = ?", (name,)
     )
-    if not found or not described:
+    if not present or not described:
         return None
     geometry, epsg = described[0]
-    if geometry not in found or not str(geometry).isidentifier():
+    if geometry not in present or not str(geometry).isidentifier():
         raise DataError(f"layer {name} has no geometry column", file=database.path, cure=_CURE)
-    kept = [column for column in columns if column in found]
+    kept = [column for column in columns if column in present]
     listed = ", ".join(["rowid", f"substr({geometry}, 1, {_HEAD_BYTES})", *(f'"{c}"' for c in kept)])
     rows = database.rows(f"SELECT {listed} FROM {name} ORDER BY rowid")
     fid = np.array([row[0] for row in rows], np.int64)
@@ -184,19 +185,16 @@ def _measure_bounds(database: Database, layer: Layer) -> None:
 
 def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]) -> Array:
     """Geometries of some rows as an array of shapely objects; None where one cannot be read."""
-    try:
-        import shapely
-    except ImportError as error:
-        raise UsageError("GeoPackages need shapely", cure="pip install 'drivax[maps]'") from error
+    shapely = import_extra("shapely")
     if not len(rows):
         return np.zeros(0, dtype=object)
-    found: dict[int, bytes | None] = {}
+    blob_by_fid: dict[int, bytes | None] = {}
     for start in range(0, len(rows), _ROWS_AT_ONCE):
-        wanted = [int(fid) for fid in layer.fid[rows[start : start + _ROWS_AT_ONCE]]]
-        marks = ", ".join("?" * len(wanted))
+        fids = [int(fid) for fid in layer.fid[rows[start : start + _ROWS_AT_ONCE]]]
+        marks = ", ".join("?" * len(fids))
         query = f"SELECT rowid, {layer.geometry} FROM {layer.name} WHERE rowid IN ({marks})"
-        found.update((fid, _wkb(blob)) for fid, blob in database.rows(query, wanted))
-    blobs = np.array([None, *(found.get(int(fid)) for fid in layer.fid[rows])], dtype=object)[1:]
+        blob_by_fid.update((fid, _wkb(blob)) for fid, blob in database.rows(query, fids))
+    blobs = np.array([None, *(blob_by_fid.get(int(fid)) for fid in layer.fid[rows])], dtype=object)[1:]
     with np.errstate(invalid="ignore"):  # coordinates that are NaN
         try:
             return np.asarray(shapely.from_wkb(blobs, on_invalid="ignore"))

@@ -135,9 +135,9 @@ class _Layers:
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
         """Nodes by token; those that do not exist are left out and counted."""
-        found = [self._nodes[token] for token in tokens if token in self._nodes]
-        self._count("nodes", len(tokens) - len(found))
-        return np.column_stack((np.array(found, np.float64).reshape(-1, 2), np.zeros(len(found))))
+        nodes = [self._nodes[token] for token in tokens if token in self._nodes]
+        self._count("nodes", len(tokens) - len(nodes))
+        return np.column_stack((np.array(nodes, np.float64).reshape(-1, 2), np.zeros(len(nodes))))
 
     def _count(self, name: str, number: int) -> None:
         if number:

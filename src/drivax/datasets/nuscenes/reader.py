@@ -105,8 +105,10 @@ class NuScenes:
 def _maps(path: Path) -> Path:
     """The folder of city maps: where the devkit wants it, or where people unpack the pack, which brings a folder."""
     root = path.parent.parent
-    wanted = root / "maps" / "expansion"
-    return next((f for f in (wanted, root / "maps", root / "expansion") if any(f.glob("*.json"))), wanted)
+    expansion = root / "maps" / "expansion"
+    return next(
+        (f for f in (expansion, root / "maps", root / "expansion") if any(f.glob("*.json"))), expansion
+    )
 
 
 def recording(scene: Scene, map_file: Path, version: str) -> Recording:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import parsing as readings
+from drivax.datasets import parsing
 from drivax.datasets.scenarionet.values import (  # fmt: skip
     MOST_NUMBERS,
     SKIP,
@@ -53,8 +53,8 @@ def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
     turned = []
     for points, closed in zip(lines, ring, strict=True):
         anticlockwise = closed and _area(points) > 0
-        wanted = closed and next(depth) % 2 == 0
-        turned.append(points if closed and anticlockwise == wanted else points[::-1].copy())
+        exterior = closed and next(depth) % 2 == 0
+        turned.append(points if closed and anticlockwise == exterior else points[::-1].copy())
     return turned
 
 
@@ -205,7 +205,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
         features=tuple(_with_edges(features, outline, dataset)),
         names=reading.names,
         flat=flat,
-        lost=readings.counted(**reading.lost),
+        lost=parsing.nonzero(**reading.lost),
     )
 
 
@@ -267,7 +267,7 @@ def _lane(lane: MapFeature, body: Mapping[Any, Any], reading: _Reading) -> MapFe
 
 def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
     """The speed limit in m/s; 0 in the file means unknown."""
-    given = ((body.get("speed_limit_mph"), readings.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
+    given = ((body.get("speed_limit_mph"), parsing.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
     for value, unit in given:
         limit = number(value)
         if limit is not None and limit > 0:
@@ -296,14 +296,14 @@ def _width(body: Mapping[Any, Any]) -> float | None:
 
 def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
     """Numbers of linked features. Links come as numbers, texts, or neighbours with a ``feature_id``."""
-    found = []
+    links = []
     for item in items(value):
         link = reading.names.get(item.get("feature_id") if isinstance(item, dict) else item)
         if link is None:
             reading.lost["dangling_links"] += 1
         else:
-            found.append(link)
-    return tuple(found)
+            links.append(link)
+    return tuple(links)
 
 
 def _check_length(features: Sequence[MapFeature]) -> None:
@@ -324,8 +324,8 @@ def third_column_is_heading(lanes: Sequence[Array]) -> bool:
         moved = step.any(axis=1)
         direction = np.arctan2(step[moved, 1], step[moved, 0])
         differences.append(np.abs(wrap(points[:-1, 2][moved] - direction)))
-    found = np.concatenate(differences) if differences else np.zeros(0)
-    return len(found) > 0 and float(np.median(found)) < _YAW_RAD
+    difference = np.concatenate(differences) if differences else np.zeros(0)
+    return len(difference) > 0 and float(np.median(difference)) < _YAW_RAD
 
 
 def _is_outline(name: str, feature: MapFeature) -> bool:

@@ -30,11 +30,11 @@ def text(value: Any) -> str | None:
     if isinstance(value, bool) or not isinstance(value, str | int):
         return None
     try:
-        found = str(value)
-        found.encode()
+        written = str(value)
+        written.encode()
     except ValueError:  # a lone surrogate, or an integer of thousands of digits
         return None
-    return found
+    return written
 
 
 def whole(value: Any) -> int | None:

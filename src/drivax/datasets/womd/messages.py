@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
@@ -117,18 +118,16 @@ def parse(message_class: Any, payload: bytes) -> Any | None:
 
 @cache
 def _class(package: str, name: str) -> Any:
-    found = _pool(package).FindMessageTypeByName(f"{package}.{name}")
+    descriptor = _pool(package).FindMessageTypeByName(f"{package}.{name}")
     from google.protobuf import message_factory
 
-    return message_factory.GetMessageClass(found)
+    return message_factory.GetMessageClass(descriptor)
 
 
 @cache
 def _pool(package: str) -> Any:
-    try:
-        from google.protobuf import descriptor_pb2, descriptor_pool
-    except ImportError as error:
-        raise UsageError("reading WOMD needs protobuf", cure="pip install 'drivax[womd]'") from error
+    descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2")
+    descriptor_pool = import_extra("google.protobuf.descriptor_pool")
     file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto2")
     for message_name, fields in _PACKAGES[package].items():
         _declare(file.message_type.add(name=message_name), fields, package)
@@ -182,7 +181,7 @@ class Numbers:
 @cache
 def _layouts(numbers: Numbers) -> tuple[tuple[np.dtype[Any], tuple[int, ...]], ...]:
     """Packed record types of every form in both orders, with its columns."""
-    found = []
+    layouts = []
     for form in numbers.forms:
         for order in (form, form[::-1]):
             parts = []
@@ -190,8 +189,8 @@ def _layouts(numbers: Numbers) -> tuple[tuple[np.dtype[Any], tuple[int, ...]], .
                 _, number, kind = numbers.fields[column]
                 parts += [(f"tag{column}", "u1"), (str(column), _WIRE[kind][1])]
                 assert number << 3 | _WIRE[kind][0] < 128, "a tag of one byte"
-            found.append((np.dtype(parts), order))
-    return tuple(found)
+            layouts.append((np.dtype(parts), order))
+    return tuple(layouts)
 
 
 def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:

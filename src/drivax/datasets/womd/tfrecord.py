@@ -15,7 +15,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 
 _Array = np.ndarray[Any, Any]
 
@@ -70,16 +71,11 @@ def shard_name(name: str, number: int, shards: int) -> str:
 
 def write_record(file: BinaryIO, payload: bytes) -> None:
     """Append one record."""
-    try:
-        import google_crc32c
-    except ImportError as error:
-        raise UsageError(
-            "writing TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'"
-        ) from error
+    crc32c = import_extra("google_crc32c").value
     length = struct.pack("<Q", len(payload))
     for part in (length, payload):
         file.write(part)
-        file.write(struct.pack("<I", masked(google_crc32c.value(part))))
+        file.write(struct.pack("<I", masked(crc32c(part))))
 
 
 _HEADER_BYTES, _FOOTER_BYTES = 12, 4
@@ -219,10 +215,4 @@ def _bad_length(header: bytes, start: int) -> DataError:
 
 
 def _crc32c() -> Callable[[bytes], int]:
-    try:
-        import google_crc32c
-    except ImportError as error:
-        raise UsageError(
-            "reading TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'"
-        ) from error
-    return google_crc32c.value
+    return import_extra("google_crc32c").value
