@@ -261,7 +261,7 @@ def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
     assert leftovers(tmp_path) == ["src"]
 
 
-# --- What is left out, and what is written beside the scenarios.
+# --- What is left out, and what is written next to the scenarios.
 
 
 def numbered(scenarios):
@@ -385,7 +385,7 @@ def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
     assert estimate(found, tmp_path / "set", CAPACITIES["default"], 40, 10).scenarios == 10
 
 
-def test_a_disk_that_is_too_small_is_told_before_the_start(thirty, tmp_path, monkeypatch):
+def test_too_small_disk_is_reported_before_the_start(thirty, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000_000))
     with pytest.raises(
         DataError, match=r"set: the disk has 5\.0 MB left, the set needs about 1\d MB; make room"
@@ -551,7 +551,7 @@ def test_two_conversions_to_one_set_at_once_are_refused(thirty, tmp_path):
     assert len(ScenarioSet.open(tmp_path / "set")) == 27
 
 
-def test_a_worker_that_dies_is_told_in_one_line(thirty, tmp_path, program):
+def test_dead_worker_is_reported_in_one_line(thirty, tmp_path, program):
     process = program(thirty, tmp_path / "set", workers=2)
     while not list(tmp_path.glob(".set.partial/spool-*/*")):
         time.sleep(0.01)
@@ -662,7 +662,7 @@ def test_inspect_tables_fit_a_hundred_columns(folder, tmp_path, capsys):
         assert words in out
 
 
-def test_inspect_notices_damage_unless_told_not_to_look(folder, tmp_path, capsys):
+def test_inspect_reports_damage_unless_the_check_is_off(folder, tmp_path, capsys):
     convert(folder, tmp_path / "set")
     shard = tmp_path / "set" / "shard-00000.npy"
     data = bytearray(shard.read_bytes())

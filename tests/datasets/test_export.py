@@ -67,7 +67,7 @@ def test_everything_again_has_the_same_data(stored, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("text", "expected_ids"),
     [
         ("d\nb\n", [("one", "b"), ("two", "d")]),  # in the order of the set
         ("a\n", [("one", "a"), ("two", "a")]),
@@ -75,10 +75,10 @@ def test_everything_again_has_the_same_data(stored, tmp_path):
         ("a\ntwo\ta\n", [("one", "a"), ("two", "a")]),
     ],
 )
-def test_ids(stored, tmp_path, text, wanted):
+def test_ids(stored, tmp_path, text, expected_ids):
     (tmp_path / "ids.txt").write_text(text)
     export(stored, tmp_path / "part", Export(ids=tmp_path / "ids.txt"))
-    assert ids(tmp_path / "part") == wanted
+    assert ids(tmp_path / "part") == expected_ids
 
 
 @pytest.mark.parametrize(

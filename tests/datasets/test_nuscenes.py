@@ -44,7 +44,7 @@ def test_is_a_reader(tmp_path):
     assert (about.version, about.recordings, about.missing) == ("v1.0-mini", 1, ())
 
 
-def test_what_is_missing_is_told(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     path = sample.write(tmp_path)
     path.with_name("ego_pose.json").unlink()
     (tmp_path / "maps" / "expansion" / f"{sample.CITY}.json").unlink()

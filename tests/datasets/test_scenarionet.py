@@ -103,7 +103,7 @@ def test_12_units_of_speed_limits(tree):
 
 
 @pytest.mark.parametrize("dataset", ["nuscenes", "nuplan", "av2"])
-def test_limits_that_nobody_measured_are_unknown(tree, dataset):
+def test_invented_limits_are_unknown(tree, dataset):
     tree["metadata"]["dataset"] = dataset
     recording = decode(tree)
     assert all(f.limit_mps is None for f in recording.features)

@@ -1,6 +1,6 @@
 """Public data set -> scenario set: files are read and assembled in worker processes, written by one.
 
-The result does not depend on the number of workers, nor on how often the conversion was killed and begun again: files
+The result does not depend on the number of workers, nor on how often the conversion was killed and restarted: files
 are taken in the order of their paths, records in file order, and a closed shard of the set is never touched again.
 Nothing here imports JAX, so that workers start in a fraction of a second; an audit that needs it is handed in.
 """
@@ -41,14 +41,14 @@ class Conversion:
     Attributes:
         format: Name of a format, or ``auto``: each file by its content.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
-        limit: Stop when the set holds so many scenarios; None: all.
+        limit: Stop when the set holds this many scenarios; None: all.
         filters: Keep only scenarios that satisfy all of them (``scenario.select.selection``).
         routes: How routes are found (``scenario.build.assemble.assemble``).
         stride: Steps between the starts of two windows of a long recording.
         split: Percentages of recordings for train/validation/test, as ``80/10/10``; None: no split files.
         workers: Processes; with 1 everything happens in this one.
         strict: Fail at the first record that cannot be read instead of skipping it.
-        overwrite: Replace an existing scenario set, and start anew where another conversion was begun.
+        overwrite: Replace an existing scenario set, and discard an unfinished conversion with other options.
         shard_size: Scenarios per shard of the set, the unit of resume.
     """
 
@@ -218,7 +218,7 @@ def convert(
         announce: Called once before the work begins.
 
     Raises:
-        UsageError: Options that cannot be meant, ``out`` exists, is being written, or was begun with other options, or
+        UsageError: Options that cannot be meant, ``out`` exists, is being written, or was started with other options, or
             a package that the format needs is missing.
         DataError: ``src`` holds nothing that can be converted, the disk is too small, or with ``strict`` a record
             cannot be read.
@@ -237,7 +237,7 @@ def convert(
         expected = estimate(data, Path(out), capacity, options.stride, options.limit)
         if announce is not None:
             announce(Plan(data, expected, written))
-        if not options.filters:  # with them nobody knows how many will be left
+        if not options.filters:  # with filters the size is unknown
             expected.check(Path(out), written)
         done = _drain(data, options, sink, writer, progress)
         if not len(writer):
@@ -339,7 +339,7 @@ class _Sink:
     def _batch_size(self) -> int:
         if self._audit is None:
             return 1
-        if self._options.filters:  # nobody knows how many of them will be kept
+        if self._options.filters:  # the number of kept scenarios is unknown
             return _BATCH
         left = _BATCH if self._options.limit is None else self._options.limit - len(self._writer)
         return min(_BATCH, self._writer.room, left)

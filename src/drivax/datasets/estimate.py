@@ -13,7 +13,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import STEPS, Capacity, record_dtype
 
-#: So many files of a format are counted; where there are more, they stand for the others by their size.
+#: Files of a format that are counted; where there are more, the sample is scaled by file size.
 _SAMPLE = 48
 
 

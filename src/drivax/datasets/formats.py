@@ -1,6 +1,6 @@
 """Which formats drivax reads, and which of them a file is.
 
-A format is told by content, not by name: public data sets use the same names for different things.
+Formats are detected by content: public data sets use the same file names for different things.
 """
 
 from __future__ import annotations

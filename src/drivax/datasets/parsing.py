@@ -143,7 +143,7 @@ def load_json(path: Path) -> Any:
 
 
 def windows_of(steps: int) -> int:
-    """How many scenarios a recording of so many steps becomes (``scenario.recording.windows``)."""
+    """Number of scenarios that a recording of ``steps`` steps becomes (``scenario.recording.windows``)."""
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 

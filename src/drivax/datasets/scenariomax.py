@@ -42,7 +42,7 @@ class ScenarioMax(womd.TfRecordReader):
             notes.append("the list of map points is full, the map is cut off")
         if "paths" in recording.lost:
             notes.append(
-                "path_samples are not used (they were ranked by the log's future): routes are made anew"
+                "path_samples are not used (they were ranked by the log's future): routes are computed again"
             )
         return Description(
             dataset="ScenarioMax",

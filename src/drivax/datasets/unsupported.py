@@ -1,6 +1,6 @@
 """Data that drivax does not read, and what to use instead: the wrong flavours of public data sets, archives, sets.
 
-Told by a few bytes and by the names of files, with the standard library alone.
+Detection reads a few bytes and file names, with the standard library alone.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _MAGIC = (
         0,
         b"ARROW1",
         "a feather file that is no table of annotations of Argoverse 2",
-        "give the folder of the log (annotations.feather beside city_SE3_egovehicle.feather and map/)",
+        "give the folder of the log (annotations.feather next to city_SE3_egovehicle.feather and map/)",
     ),
     (
         0,
         b"SQLite format 3",
         "a SQLite file without nuPlan's tables (a map, perhaps)",
-        "give the logs of nuPlan (splits/*/*.db), with maps/ beside",
+        "give the logs of nuPlan (splits/*/*.db), with maps/ next to them",
     ),
 )
 _NEEDED = 262 + 64
@@ -85,7 +85,7 @@ def _json(path: Path) -> DataError:
         head = file.read(1 << 16)
     if b'"objects"' in head or b'"roads"' in head:
         return DataError(
-            "looks like a GPUDrive scene but has no metadata, so nobody knows which object is the ego",
+            "looks like a GPUDrive scene but has no metadata, so the ego is unknown",
             file=path,
             cure="convert the scenes again with a GPUDrive that writes metadata",
         )
@@ -254,7 +254,7 @@ _FOLDERS: _Folders = (
     (
         lambda folder, names: _inside(folder, "*.gpkg") and not _inside(folder, "*.db"),
         "maps of nuPlan without logs",
-        "put the logs (splits/*/*.db) beside maps/ and name the folder of both",
+        "put the logs (splits/*/*.db) next to maps/ and name the folder of both",
     ),
     (
         lambda folder, names: _inside(folder, "sample_annotation.json", "ego_pose.json"),

@@ -1,4 +1,4 @@
-"""Argoverse 2 maps: lane segments, drivable areas and crossings of one log, as JSON beside it."""
+"""Argoverse 2 maps: lane segments, drivable areas and crossings of one log, as JSON next to it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivax.scenario.schema import RoadKind
 
 Array = np.ndarray[Any, Any]
 
-#: Name of a map beside a log.
+#: Name of a map next to a log.
 MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
 #: A local map spans some hundred metres; a point this far from the others is damaged.
@@ -90,7 +90,7 @@ def _lane(segment: Any) -> MapFeature | None:
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
     if min(arc_lengths(left).max(initial=0.0), arc_lengths(right).max(initial=0.0)) < 1e-3:
         return None
-    left, right = _beside(left, right)
+    left, right = _resample_boundaries(left, right)
     return MapFeature(
         feature_id=_id(segment.get("id")),
         kind=_LANES.get(str(segment.get("lane_type")), RoadKind.LANE_UNDEFINED),
@@ -104,7 +104,7 @@ def _lane(segment: Any) -> MapFeature | None:
     )
 
 
-def _beside(
+def _resample_boundaries(
     left: Float[Array, "left 3"], right: Float[Array, "right 3"]
 ) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
     """Both boundaries at the same fractions of their lengths, so that points of the same row face each other."""
@@ -136,7 +136,7 @@ def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "cent
 
 
 def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]]:
-    """Painted boundaries, each once: lanes beside each other both name the line between them."""
+    """Painted boundaries, each once: adjacent lanes both name the line between them."""
     lines: dict[bytes, tuple[RoadKind, Array]] = {}
     for segment in segments:
         for side in ("left", "right"):

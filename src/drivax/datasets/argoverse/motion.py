@@ -1,4 +1,4 @@
-"""Reader of Argoverse 2 motion forecasting: one parquet file per scenario, its map as JSON beside it."""
+"""Reader of Argoverse 2 motion forecasting: one parquet file per scenario, its map as JSON next to it."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class ArgoverseMotion:
         """Tracks, steps, city and split of one scenario."""
         table = read_table(path, _COLUMNS)
         steps = 1 + int(table.numbers["timestep"].max())
-        beside = _map_path(path)
+        map_path = _map_path(path)
         return Description(
             dataset="Argoverse 2 Motion Forecasting",
             flavour=f"one scenario of {steps} steps in {table.texts['city'].text(0)}",
@@ -100,7 +100,7 @@ class ArgoverseMotion:
                 f"{len(table.texts['track_id'].words)} tracks",
                 "box sizes are those of the class; there are no speed limits, lights or stop signs",
             ),
-            missing=() if beside.is_file() else (beside.name,),
+            missing=() if map_path.is_file() else (map_path.name,),
         )
 
     def count(self, path: Path) -> int:
@@ -121,7 +121,7 @@ def _map_path(path: Path) -> Path:
 
 
 def decode(path: Path) -> Recording:
-    """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` beside it.
+    """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
 
     The city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
     those of the map; sizes those of the class; velocities as given, smoothed by the source.

@@ -134,7 +134,7 @@ def decode(path: Path) -> Recording:
     map_path = _map_path(path)
     if map_path is None:
         raise DataError(
-            f"has no map/{MAP_PATTERN} beside it", file=path, cure="download the folder map of the log"
+            f"has no map/{MAP_PATTERN} next to it", file=path, cure="download the folder map of the log"
         )
     local_map = read_map(map_path)
     log_id = path.resolve().parent.name

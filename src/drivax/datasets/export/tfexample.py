@@ -34,7 +34,7 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: At most so many tracks to predict come before all others.
+#: Tracks to predict that come before all others.
 _FIRST = 8
 #: Just under 1 m, so that rounding never makes a gap of more: readers cut polylines there.
 _SPACING_M = 0.998
@@ -53,7 +53,7 @@ _ON_ROUTE_M, _ON_ROUTE_SHARE = 1.5, 0.95
 
 @dataclass(frozen=True)
 class Paths:
-    """Form of ``path_samples``: so many paths of so many points, so far apart."""
+    """Number, points and spacing of ``path_samples``."""
 
     count: int
     points: int

@@ -36,7 +36,7 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 _NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
-#: Folder in the archive of the maps, which users are told to rename to ``maps``.
+#: Folder in the archive of the maps, which the documentation renames to ``maps``.
 _UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
@@ -50,7 +50,7 @@ def feature_id(layer: str, fid: int) -> int:
 def find_map(log: Path, name: str) -> Path:
     """The GeoPackage of a named map.
 
-    Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, beside the log or beside any folder
+    Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, next to the log or next to any folder
     above it, then where the environment variable ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
     """
     listing = _listing(log)
@@ -79,9 +79,9 @@ def _listing(log: Path) -> Path:
             if listings := sorted(root.glob(pattern)):
                 return listings[-1]
     raise DataError(
-        "no nuPlan maps beside it (maps/nuplan-maps-v1.0.json)",
+        "no nuPlan maps next to it (maps/nuplan-maps-v1.0.json)",
         file=log,
-        cure="put the folder maps beside or above it, or set NUPLAN_MAPS_ROOT",
+        cure="put the folder maps next to or above it, or set NUPLAN_MAPS_ROOT",
     )
 
 
@@ -220,8 +220,8 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
             places.setdefault((block, slot), number)
             slots[number] = block, slot
     for number, (block, slot) in slots.items():
-        beside = {"left": places.get((block, slot - 1)), "right": places.get((block, slot + 1))}
-        lanes[number] = replace(lanes[number], **beside)
+        neighbours = {"left": places.get((block, slot - 1)), "right": places.get((block, slot + 1))}
+        lanes[number] = replace(lanes[number], **neighbours)
     return lanes
 
 

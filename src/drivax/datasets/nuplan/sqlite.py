@@ -1,4 +1,4 @@
-"""SQLite files that nobody vouches for, read-only and bounded, and the layers of GeoPackages among them.
+"""Untrusted SQLite files, opened read-only with bounded queries, and the layers of GeoPackages.
 
 A GeoPackage is a SQLite file whose geometries are BLOBs: a header of 8 bytes, an optional envelope, then WKB (OGC
 12-128r19, clause 2.1.3). So sqlite3 and shapely read it; no GDAL is needed.
@@ -79,7 +79,7 @@ class Database:
 
 @contextlib.contextmanager
 def open_database(path: Path) -> Iterator[Database]:
-    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written beside it."""
+    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written next to it."""
     try:
         with path.open("rb") as file:
             head = file.read(len(SQLITE_MAGIC))

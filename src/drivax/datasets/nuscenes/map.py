@@ -57,8 +57,8 @@ SPACING_M = 0.5
 #: No lane is longer.
 _LONGEST_M = 5_000.0
 _TURNS = {"L": 1.0, "S": 0.0, "R": -1.0}
-#: Lanes beside each other: spacing of their centres, angle between them.
-_BESIDE_M, _PARALLEL_RAD = (2.2, 5.5), np.deg2rad(20.0)
+#: Adjacent lanes: spacing of their centres, angle between them.
+_NEIGHBOUR_M, _PARALLEL_RAD = (2.2, 5.5), np.deg2rad(20.0)
 _WIDTHS_M = (2.0, 6.0)
 
 
@@ -177,7 +177,7 @@ class _Layers:
                     interpolating=connects,
                 )
             )
-        return beside(lanes)
+        return with_neighbours(lanes)
 
     def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
         """Area of the lane's polygon over the length of its centre line; None where that is no lane's width."""
@@ -285,8 +285,8 @@ def marking(name: str) -> RoadKind | None:
     return RoadKind.LINE_SOLID_DOUBLE_WHITE if double else RoadKind.LINE_SOLID_SINGLE_WHITE
 
 
-def beside(lanes: Sequence[MapFeature]) -> list[MapFeature]:
-    """Lanes with their neighbours, which the map does not name: lanes that run parallel 2.2 to 5.5 m beside.
+def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
+    """Lanes with their neighbours, which the map does not name: lanes that run parallel at 2.2 to 5.5 m.
 
     Looked up at the middle of each lane; lane connectors have none.
     """
@@ -303,12 +303,12 @@ def beside(lanes: Sequence[MapFeature]) -> list[MapFeature]:
     for i in rows:
         middle = len(lanes[i].points) // 2
         at, course = lanes[i].points[middle, :2], _headings(lanes[i].points[:, :2])[middle]
-        near = np.array(tree.query_ball_point(at, _BESIDE_M[1] + 0.5), dtype=np.int64)
+        near = np.array(tree.query_ball_point(at, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
         near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
         offset = points[near] - at
         ahead = offset @ np.array([np.cos(course), np.sin(course)])
         left = offset @ np.array([-np.sin(course), np.cos(course)])
-        good = (np.abs(ahead) < 1.0) & (np.abs(left) >= _BESIDE_M[0]) & (np.abs(left) <= _BESIDE_M[1])
+        good = (np.abs(ahead) < 1.0) & (np.abs(left) >= _NEIGHBOUR_M[0]) & (np.abs(left) <= _NEIGHBOUR_M[1])
         sides = {
             side: tuple(int(lane) for lane in owner[near[good & (sign * left > 0)]][:1])
             for side, sign in (("left_neighbours", 1), ("right_neighbours", -1))

@@ -53,7 +53,7 @@ class NuScenes:
     )
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is ``scene.json`` with the other tables beside it."""
+        """Whether it is ``scene.json`` with the other tables next to it."""
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:

@@ -28,7 +28,7 @@ from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKind
 
 #: Lane points within this distance say on which side of an edge one drives, metres.
-BESIDE_M = 8.0
+NEIGHBOUR_M = 8.0
 #: Places along a ring that are looked up in the other rings; rings may touch in some.
 _PROBES = 5
 _MOST_COMPARISONS = 100_000_000
@@ -82,7 +82,7 @@ def inside(points: Array, ring: Array) -> Array:
 
 
 def drivable_on_left(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
-    """Edges with most of the lanes beside them on their left; unchanged where no lane is near.
+    """Edges with most of the lanes next to them on their left; unchanged where no lane is near.
 
     Args:
         edges: Points of road edges, metres.
@@ -95,8 +95,8 @@ def drivable_on_left(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Arr
 
 
 def _votes_left(edge: Array, centres: Array) -> int:
-    """Lane points beside an edge that are on its left, less those on its right."""
-    low, high = edge.min(axis=0) - BESIDE_M, edge.max(axis=0) + BESIDE_M
+    """Lane points next to an edge that are on its left, less those on its right."""
+    low, high = edge.min(axis=0) - NEIGHBOUR_M, edge.max(axis=0) + NEIGHBOUR_M
     near = centres[np.all((centres >= low) & (centres <= high), axis=1)]
     block = max(_BLOCK // len(edge), 1)
     return sum(_votes(edge, near[first : first + block]) for first in range(0, len(near), block))
@@ -108,11 +108,11 @@ def _votes(edge: Array, points: Array) -> int:
     rows = np.arange(len(points))
     nearest = distance.argmin(axis=1)
     place = nearest + along[rows, nearest]
-    # What is nearest to an end lies before or behind the edge, not beside it.
-    beside = (distance[rows, nearest] <= BESIDE_M) & (place > 0) & (place < len(a))
+    # What is nearest to an end lies before or behind the edge, not next to it.
+    adjacent = (distance[rows, nearest] <= NEIGHBOUR_M) & (place > 0) & (place < len(a))
     step, offset = (b - a)[nearest], points - a[nearest]
     side = np.sign(step[:, 0] * offset[:, 1] - step[:, 1] * offset[:, 0])
-    return int(side[beside].sum())
+    return int(side[adjacent].sum())
 
 
 Array = np.ndarray[Any, Any]
@@ -120,7 +120,7 @@ Array = np.ndarray[Any, Any]
 _MPS_PER_KMH = 1 / 3.6
 #: A limit above this is a placeholder (MetaDrive's is 1000 km/h).
 _FASTEST_MPS = 45.0
-#: Data sets whose converters write limits that nobody measured: 100 km/h on every connector, 85 mph everywhere.
+#: Data sets whose converters write invented limits: 100 km/h on every connector, 85 mph everywhere.
 _MADE_UP_LIMITS = ("nuscenes", "lyft", "nuplan", "av2")
 #: Data sets whose files have road edges with the drivable side on the left.
 _ORIENTED = ("womd",)

@@ -362,7 +362,7 @@ _CALLED: dict[str, Callable[..., Any]] = {
 
 
 def _content(content: Any) -> bytes:
-    """The bytes of a bytes-like value, never so many new ones."""
+    """The bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
     if isinstance(content, str):
         return _encoded(content)
     if not isinstance(content, bytes | bytearray):

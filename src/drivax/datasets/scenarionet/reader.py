@@ -263,7 +263,7 @@ def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
 def _lights(
     table: Mapping[Any, Any], steps: int, dataset: str, roads: RoadMap, lost: Counter[str]
 ) -> tuple[Light, ...]:
-    """Lights by lane. None in the file is a step at which nobody saw the light."""
+    """Lights by lane. None in the file is a step without an observation."""
     if len(table) * steps > _MOST_STATES:
         raise DataError(f"{len(table)} lights of {steps} steps", cure=SKIP)
     starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}

@@ -42,7 +42,7 @@ class WomdExample(womd.TfRecordReader):
                 "the list of map points is full, the map is cut off; the Scenario protos hold all of it"
             )
         if "paths" in recording.lost:
-            notes.append("path_samples are not used: routes are made anew")
+            notes.append("path_samples are not used: routes are computed again")
         newer = bool(recording.features) and tf_example.is_coarse(recording.features)
         return Description(
             dataset=womd.FULL_NAME,
