@@ -11,12 +11,12 @@ from drivax.studies.longtail_page import mean_q_curve, write_page
 from drivax.studies.longtail_results import METRICS
 
 RATE = {metric: {"mean": 0.1234, "low": 0.1, "high": 0.15} for metric in METRICS}
-CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group": "lot", "metric": "collision",
+CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group": "control", "metric": "collision",
     "rows": "ordinary"}  # fmt: skip
 RESULTS = {
     "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True, "share": 0.05},
     "conditions": [
-        {"agent": name, "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": name == "baseline"}
+        {"arm": name, "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": name == "baseline"}
         for name in ("baseline", "heuristic")
     ],
     "detectable": dict.fromkeys(METRICS, 0.031),
