@@ -91,7 +91,7 @@ def open_study(config: LongtailConfig, sets: Sets, out: Path) -> None:
         rest = [name for name in config.arms if ARMS[name].method != "oracle"]
         if len(rest) < len(config.arms) and not event_kinds(data[0]).any():
             raise UsageError(
-                "has no labelled events, which the oracle and its lot learn from",
+                "has no labelled events, which the oracle and its control need",
                 file=sets.train,
                 cure=f"pass --arms [{','.join(rest)}]",
             )

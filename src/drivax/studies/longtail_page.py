@@ -186,7 +186,7 @@ def mean_q_curve(results: Mapping[str, Any]) -> Cells:
 def _conditions(results: Mapping[str, Any]) -> str:
     found = ", ".join(f"{_SHORT[name]} {value:.3f}" for name, value in results["detectable"].items())
     return _table(*conditions(results), "dense") + (
-        "<p>The smallest difference in ordinary traffic that so many seeds and scenarios find with a probability of "
+        "<p>The smallest difference in ordinary traffic that these seeds and scenarios find with a probability of "
         "80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
         f"{escape(found)}. A score that stands still is that of this budget and these learning rates. Baseline and bc "
         "had to be good enough before the others learned; the others are shown next to them.</p>"

@@ -230,7 +230,7 @@ def needed(found: Crossed, together: int) -> str:
 
 
 def level(together: int) -> float:
-    """Confidence at which the first of so many claims is tested (Holm)."""
+    """Confidence at which the first of ``together`` claims is tested (Holm)."""
     return 1.0 - _LEVEL / together
 
 
@@ -260,8 +260,8 @@ def detectable(
         if _several(np.concatenate([baseline[name], other[name]]), labels, weights):
             two = crossed_difference(baseline[name], other[name], labels, weights)
             (seeds, _), (both, _) = two.seeds, two.both
-            alike = replace(two, seeds=(seeds, seeds), both=(both, both))
-            found[name] = alike.detectable(confidence=level(together))
+            equal = replace(two, seeds=(seeds, seeds), both=(both, both))
+            found[name] = equal.detectable(confidence=level(together))
     return found
 
 
@@ -282,7 +282,7 @@ def counts(rows: str, rare: Rows, share: float | None) -> Counts:
 
 
 def _several(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> bool:
-    """Whether more than one recording counts in which everybody's value is defined."""
+    """Whether more than one recording counts in which all values are defined."""
     return np.unique(labels[(weights > 0.0) & ~np.isnan(values).any(axis=0)]).size > 1
 
 
