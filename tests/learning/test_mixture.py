@@ -81,7 +81,7 @@ def earns(config, table, weights):
     return float(run(made))
 
 
-def test_the_mixture_is_one(mixture):
+def test_demonstrations_are_a_mixture(mixture):
     _, found, weights = mixture
     assert found[:GOOD].min() > -500 and found[GOOD:].max() < -1400
     assert weights[:GOOD].sum() / weights.sum() > 0.95 and GOOD / EPISODES == 0.05
