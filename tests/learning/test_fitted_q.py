@@ -61,7 +61,7 @@ def test_fitted_q_estimates_returns(table):
 
 
 def test_learner_logs_fitted_q(table):
-    """A clone of pushes to the right, all features of which lie close together: told apart by normalising alone.
+    """A clone of pushes to the right, all features of which lie close together, and only normalisation separates them.
 
     Pushing right pays as much as the number of the step then, so that a critic that sees no steps cannot know it.
     """

@@ -28,7 +28,7 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.sinks import read_rows
-from recorded import Table, Told, arms
+from recorded import Logged, Table, arms
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 COUNT, ACTIONS = 16, 3
@@ -58,7 +58,7 @@ def improved(part):
 
 def begun(config):
     """A learner with what it trains, and targets that differ from what they follow."""
-    learner = config.build(Told(), arms([0.0], [0.0]), 1)
+    learner = config.build(Logged(), arms([0.0], [0.0]), 1)
     state = jax.jit(learner.init)((), jax.random.key(0))
     target = jax.tree.map(lambda leaf: leaf + 0.1, state.target)
     return learner, {"policy": state.parameters, **state.rest}, target
@@ -264,8 +264,8 @@ def test_every_loss_reaches_its_own_parameters_only(config, part, improved):
 
 def learned(config, data, iterations=20, weights=None):
     """A learner and its state after n iterations, and what the last one logged."""
-    learner = config.build(Told(), data, iterations)
-    made = training_data(config, Told(), data, weights)
+    learner = config.build(Logged(), data, iterations)
+    made = training_data(config, Logged(), data, weights)
 
     @jax.jit
     def run(made):
@@ -384,8 +384,8 @@ RESUMED = {
 def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     """Stopped in the middle, with an odd number of updates behind it, and restored from disk."""
     config, weights = RESUMED[name], np.random.default_rng(0).uniform(size=(500, 2))
-    learner = config.build(Told(), bandit, 4)
-    data = training_data(config, Told(), bandit, weights)
+    learner = config.build(Logged(), bandit, 4)
+    data = training_data(config, Logged(), bandit, weights)
     iterate, states = jax.jit(learner.iterate), [jax.jit(learner.init)(data, jax.random.key(5))]
     for _ in range(4):
         states.append(iterate(data, states[-1])[0])
@@ -393,7 +393,7 @@ def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     checkpoints.save(1, states[1])
     # Restored into shapes alone, and for the environment's bare data, as a fresh process does.
     state = checkpoints.restore(jax.eval_shape(learner.init, bandit, jax.random.key(0)))
-    again = training_data(config, Told(), bandit, weights)
+    again = training_data(config, Logged(), bandit, weights)
     for _ in range(3):
         state = iterate(again, state)[0]
     one, other = ([_plain(leaf) for leaf in jax.tree.leaves(part)] for part in (state, states[-1]))
@@ -451,7 +451,7 @@ def test_held_out_values_are_logged_without_ranking(data, tmp_path):
 def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
     """Adam's step under a constant gradient is its rate, whatever moves how often."""
     config = replace(kind, updates=10, last_rate=0.25, falling=falling, policy_rate=1e-3, gradient_norm=1e6)
-    learner = config.build(Told(), arms([0.0], [0.0]), 4)
+    learner = config.build(Logged(), arms([0.0], [0.0]), 4)
     adam = learner.adam(config.policy_rate, every)
     weights = jnp.zeros(1)
 
