@@ -142,7 +142,7 @@ def reasons(comparison: Comparison) -> list[str]:
         )
     if decision.because == "seeds":
         sentences.append("Seeds differ so much that more scenarios do not help: more seeds are needed.")
-    if decision.because == "alike":
+    if decision.because == "equal":
         same = "the same for A and B in each" if comparison.plan.split == "paired" else "the same in all"
         sentences = [f"{_label(primary).text} is {same} of {primary.difference.n:,} scenarios."]
     sentences += _power_sentences(comparison)
