@@ -35,8 +35,7 @@ from drivax.evaluation.episode_table import EpisodeTable, interval_of
 from drivax.evaluation.rollout import drive, judging
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.tables import paired_differences
-from drivax.learning.policies import load_policy, pack_policy
-from drivax.learning.policy_traffic import find_traffic, policy_traffic
+from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import with_driver
@@ -183,7 +182,7 @@ def packed(args: argparse.Namespace) -> None:
         "ego": _means(found["ego"]["drivers"]["aggressive"]),
         "others": _means(found["others"]["aggressive"]),
     }
-    folder = pack_policy(
+    folder = export_policy(
         args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measured}, overwrite=True
     )
     print(f"wrote {folder.path}")

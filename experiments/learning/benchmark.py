@@ -24,14 +24,13 @@ from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import SHARES, EpisodeTable, interval_of
 from drivax.evaluation.runner import evaluate
-from drivax.learning.policies import load_policy
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.planner import Planner
 from drivax.planners.simple import RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.intervals import Interval, bootstrap_mean, paired_bootstrap
-from drivax.stats.seeds import agents_interval, difference_interval
+from drivax.stats.seeds import difference_interval, seeds_interval
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
@@ -162,7 +161,7 @@ def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval
     if against is None:
         if len(own) == 1:
             return interval_of(metric, own[0], segments)
-        return agents_interval(own, segments, share=metric in SHARES)
+        return seeds_interval(own, segments, share=metric in SHARES)
     other = against.values[metric].astype(np.float64)
     if len(own) == len(other) == 1:
         return paired_bootstrap(own[0], other[0], segments, seed=0)
@@ -174,7 +173,7 @@ def change(driven: Driven, metric: str, before: Driven) -> Interval:
     apart = driven.values[metric].astype(np.float64) - before.values[metric]
     if len(apart) == 1:
         return bootstrap_mean(apart[0], driven.segments, seed=0)
-    return agents_interval(apart, driven.segments)
+    return seeds_interval(apart, driven.segments)
 
 
 def judged() -> dict[str, Any]:

@@ -27,7 +27,7 @@ import numpy as np
 from drivax import settings
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policies import pack_policy
+from drivax.learning.policies import export_policy
 from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
@@ -70,7 +70,7 @@ def trained(args: argparse.Namespace, overrides: list[str]) -> None:
         shutil.rmtree(kept, ignore_errors=True)
     bank = ScenarioBank.from_scenarios([data[0]])
     for folder in seed_folders(out):
-        pack_policy(folder, kept / folder.name, bank, overwrite=True)
+        export_policy(folder, kept / folder.name, bank, overwrite=True)
     (kept / TRAINING).write_text(json.dumps(about | {"seeds": len(learned()[name])}, indent=1) + "\n")
 
 
@@ -78,7 +78,7 @@ def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
     """Seconds that one agent took."""
     began = time.perf_counter()
     splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
-    train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], say=print)
+    train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
     return round(time.perf_counter() - began)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate, lanes
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet

@@ -27,10 +27,11 @@ from drivax import settings
 from drivax.curation.ensemble import EnsembleConfig, train_ensemble
 from drivax.learning.algorithm import training_data
 from drivax.learning.config import TrainConfig
-from drivax.learning.program import Agents, Program
-from drivax.learning.sampler import draw, sampler
+from drivax.learning.experience import draw, sampler
+from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
 
@@ -61,7 +62,7 @@ def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any],
     weights = np.ones((len(bank), bank.steps))
     made = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
     prepared = time.perf_counter() - began
-    program = Program(Agents(learner, (0,)), made, 1)
+    program = Program(Seeds(learner, (0,)), made, 1)
     state = [program.first_state()]
     trained = state[0].parameters, getattr(state[0], "rest", ())
     size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))

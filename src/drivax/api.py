@@ -12,8 +12,7 @@ from drivax.evaluation import runner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.run_evaluation import with_metrics
-from drivax.learning.policies import load_policy
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted

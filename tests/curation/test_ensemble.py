@@ -27,7 +27,7 @@ from drivax.curation.scores import read_scores
 from drivax.errors import UsageError
 from drivax.learning.algorithms.behaviour_cloning import BcConfig
 from drivax.learning.driving import Driving
-from drivax.learning.sampler import draw
+from drivax.learning.experience import draw
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Grid, Mixture, SquashedGaussian
 from drivax.networks.entity import EntityConfig

@@ -143,7 +143,7 @@ def test_red_lights_count_only_where_lights_are_known():
     assert [finding["clean"] for finding in found] == [False, True, True]
 
 
-def test_lights_that_nobody_observed_are_not_seen():
+def test_unobserved_lights_are_not_seen():
     recording = straight_road([car(0, 0, 0, 0)], light=GREEN)
     unseen = Light(1, np.array([20.0, 0.0, 0.0]), np.full(91, LightState.UNOBSERVED, np.int8))
     (finding,) = audited(replace(recording, lights=(*recording.lights, unseen)))

@@ -132,9 +132,9 @@ def test_recordings_of_several_scenarios_take_more_of_them():
     assert 3 < seen.design_effect <= 4.5 and seen.needed > 3 * 787
 
 
-def test_planners_that_are_alike():
+def test_equal_planners_give_no_difference():
     found = compare(PLAN, [table("one")], [table("two")])
-    assert (found.decision.recommendation, found.decision.because) == ("no difference", "alike")
+    assert (found.decision.recommendation, found.decision.because) == ("no difference", "equal")
     assert found.primary.evidence.p == 1.0 and found.sensitivity is None
 
 
@@ -212,7 +212,7 @@ def test_seeds_that_differ_decide_nothing_however_many_scenarios():
     assert found.primary.a.low < found.primary.a.mean < found.primary.a.high
 
 
-def test_seeds_that_agree_are_told_apart_or_said_to_be_alike():
+def test_seeds_that_agree_give_a_winner_or_no_difference():
     others = seeds_of(0.0, 0.0, 0.0, folder="runs/other", first=9)
     assert compare(PLAN, seeds_of(0.3, 0.3, 0.3), others).decision.recommendation == "A"
     plan = dataclasses.replace(PLAN, smallest_difference=0.5)
@@ -221,7 +221,7 @@ def test_seeds_that_agree_are_told_apart_or_said_to_be_alike():
     assert found.sensitivity.needed == N
 
 
-def test_seeds_that_differ_alike_everywhere_ask_for_seeds():
+def test_seeds_that_differ_equally_everywhere_need_more_seeds():
     rows = [np.ones(N), np.zeros(N)]
     seeds = [table(f"seed-{n}", vmax_score=row) for n, row in enumerate(rows)]
     found = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
@@ -230,7 +230,7 @@ def test_seeds_that_differ_alike_everywhere_ask_for_seeds():
     same = compare(
         PLAN, [table(f"seed-{n}", vmax_score=rows[0]) for n in range(2)], [table("two", vmax_score=rows[0])]
     )
-    assert (same.decision.recommendation, same.decision.because) == ("no difference", "alike")
+    assert (same.decision.recommendation, same.decision.because) == ("no difference", "equal")
 
 
 def test_seeds_on_one_recording_tell_nothing():
@@ -256,8 +256,8 @@ def test_everything_is_plain_json():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"about": {"data": {"hash": "other"}}}, "different scenario sets"),
-        ({"about": {"traffic": "idm"}}, "different traffic (log and idm)"),
+        ({"about": {"data": {"hash": "other"}}}, "differ in scenario set"),
+        ({"about": {"traffic": "idm"}}, "differ in traffic (log and idm)"),
         ({"rows": range(N, 2 * N)}, "no scenario in common"),
         ({"vmax_score": np.full(N, np.nan)}, "in no common scenario"),
         ({"vmax_score": np.full(N, np.nan), "vmax_score_partial": np.ones(N)}, "every vmax_score is partial"),

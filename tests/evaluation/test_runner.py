@@ -180,7 +180,7 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
     assert same.n == COUNT and same.mean <= 0
     assert same == paired_difference(crashed, whole, "success")
     elsewhere = dict(whole.keys) | {"dataset": ("other",) * COUNT}
-    with pytest.raises(UsageError, match="different scenarios"):
+    with pytest.raises(UsageError, match="scenarios of the evaluations differ"):
         paired_differences(crashed, replace(whole, keys=elsewhere), "success")
 
 
@@ -227,7 +227,7 @@ def test_a_planner_of_another_action_space_is_refused(data):
         evaluate(Expert(), data.bank, data.names, task=Task(actions=PUBLISHED))
 
 
-def test_a_function_that_nobody_made_a_planner_of_is_refused(data):
+def test_plain_function_is_refused_as_planner(data):
     with pytest.raises(UsageError, match=r"'plain' takes \(situation, observation\).*@drivax.python_planner"):
         drivax.evaluate(plain, data)
 
@@ -258,7 +258,7 @@ def named(recording, name):
     return assemble(replace(recording, scenario_id=name), SMALL)
 
 
-def test_logs_in_which_nobody_could_be_judged_are_named_with_the_filter_that_leaves_them_out():
+def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
     late = straight_road([car(steps=range(5, 91)), car(30)])
     gap = straight_road([car(steps=[*range(40), *range(50, 91)])])
     logs = [named(straight_road([car()]), "good"), named(late, "late"), named(gap, "gap")]

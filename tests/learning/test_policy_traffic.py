@@ -11,8 +11,7 @@ from drivax import settings
 from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policy_traffic import policy_traffic
-from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.learning.policies import policy_traffic
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.traffic.agent_paths import AgentPaths
 from drivax.simulator.traffic.bank_data import data_of, prepare_bank
@@ -39,7 +38,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_planner_is_judged_among_vehicles_that_a_policy_drives(tmp_path):
+def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     data = ScenarioSet.open(tmp_path / "set")
     run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold")

@@ -19,9 +19,9 @@ from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, sampling_weights
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.learning.devices import widen_pool
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
+from drivax.learning.program import widen_pool
 from drivax.scenario.store import ScenarioSet
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         resume=args.resume,
         overwrite=args.overwrite,
         seeds=args.seeds,
-        say=lambda line: print(line, file=sys.stderr),
+        log=lambda line: print(line, file=sys.stderr),
     )
     print(f"wrote {folder.path}")
     return 0

@@ -22,10 +22,9 @@ from drivax.curation.logged import Progress, map_batches
 from drivax.curation.rarity import KernelRarity, rarity_steps
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
-from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, updated
+from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.driving import Driving
-from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
-from drivax.learning.sampler import draw, sampler
+from drivax.learning.experience import Experience, ExperienceConfig, draw, expert_actions, recorded, sampler
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
@@ -310,7 +309,7 @@ def fit(
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
         indices = draw(experience.critic, key, (cloning.batch,))
-        observation, action, _ = moments(environment, experience, indices)
+        observation, action, _ = expert_actions(environment, experience, indices)
 
         def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
             others = fold[indices[0]] != member[0]
@@ -319,11 +318,11 @@ def fit(
             batch = jax.tree.map(lambda leaf: leaf[order], observation)
 
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
-                return cloning.of_moments(
+                return cloning.imitation_loss(
                     learner.distribution(parameters, batch), action[order], others[order]
                 )
 
-            return updated(member[1], learner.optimiser, loss)[0]
+            return imitation_update(member[1], learner.optimiser, loss)[0]
 
         size = config.folds if together else None
         return jax.lax.map(update_member, (jnp.arange(config.folds), trained), batch_size=size), None

@@ -85,9 +85,9 @@ def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
                 cure=f"name one of them, as {side[0].folder}",
             )
     for table in tables[1:]:
-        if found := mismatch(tables[0], table):
+        if problem := mismatch(tables[0], table):
             names = [run.folder or run.name for run in (tables[0], table)]
-            raise UsageError(f"{names[0]} and {names[1]} {found[0]}", cure=found[1])
+            raise UsageError(f"{names[0]} and {names[1]} {problem[0]}", cure=problem[1])
 
 
 def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) -> None:

@@ -1,4 +1,4 @@
-"""Traffic in which a planner drives some of the others: a trained policy against which another one is judged."""
+"""Traffic in which a planner drives some of the others: a trained policy against which another one is evaluated."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Driven:
     """State of the K agents that the planner drives.
 
     Attributes:
-        begin: Step at which the episode began; until then everyone moved as logged.
-        contexts: A context each; slots beyond the moving agents are nobody's.
+        begin: Step at which the episode began; until then all agents moved as logged.
+        contexts: A context each; slots beyond the moving agents are empty.
         base: State of the traffic around them.
     """
 
@@ -59,7 +59,7 @@ class PlannerTraffic:
     """The vehicles nearest to ego are driven by the planner of :func:`with_driver`, all others move by ``base``.
 
     Driven are vehicles that the log has when the episode begins and that travel more than 2 m in the rest of it. They
-    see ego, each other and everyone else, drive by the task's dynamics to the end of the episode, and have no route, as
+    see all agents, drive by the task's dynamics to the end of the episode, and have no route, as
     agents other than ego have none: a policy that is to drive them well is trained to follow lanes.
 
     Attributes:
@@ -84,7 +84,7 @@ class PlannerTraffic:
         return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Driven:
-        """Everyone where the log has them at ``step``.
+        """All agents where the log has them at ``step``.
 
         Raises:
             UsageError: The bank has no driver.
@@ -95,7 +95,7 @@ class PlannerTraffic:
         return Driven(jnp.asarray(step, jnp.int32), contexts, self.base.start(bank, index, step))
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Driven:
-        """One step of 0.1 s: everyone looks at the present frame, then all move."""
+        """One step of 0.1 s: every agent looks at the present frame, then all move."""
         now = context.traffic
 
         def frames(back: int) -> Frame:
@@ -135,7 +135,7 @@ class PlannerTraffic:
         return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
 
     def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:
-        """Slots of the vehicles that are driven, the nearest to ego first, filled up with nobody's."""
+        """Slots of the vehicles that are driven, the nearest to ego first, padded with empty slots."""
         rows = bank.agents[index]
         here = rows[step]
         moved = ((rows[..., AgentColumn.XY] - here[:, AgentColumn.XY]) ** 2).sum(axis=-1)

@@ -26,9 +26,8 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import write_text
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
-from drivax.learning.folders import hashes
-from drivax.learning.loop import train, usable_steps
-from drivax.learning.validation import rank
+from drivax.learning.loop import hashes, train, usable_steps
+from drivax.learning.training_log import rank
 from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.longtail_drives import (

@@ -305,7 +305,7 @@ def rates(
 
 def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict[str, float | int | None]:
     """Mean, interval within what all of these metrics lie in, and how many scenarios it is of."""
-    found = agents_interval(values, labels, weights, share=True).as_dict()
+    found = seeds_interval(values, labels, weights, share=True).as_dict()
     return {"scenarios" if name == "n" else name: value for name, value in found.items()}
 
 

@@ -41,7 +41,7 @@ _KEY_M = 1.0
 _BACKWARDS_M = 1.5
 #: Lateral acceleration in curves and braking towards them, m/s2.
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
-#: Half the stretch over which a curvature is measured: at least so many metres, and so many seconds at peak speed.
+#: Half the stretch over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
 _CURVE_M, _CURVE_S = 2.5, 0.25
 Numbers = np.ndarray[Any, Any]
 _Tables = tuple[Numbers, ...]
@@ -111,7 +111,7 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     1.5 m/s2 of braking towards a curve.
 
     Args:
-        bank: The scenarios; one that has such paths already is returned as it is.
+        bank: The scenarios; one that has such paths already is returned unchanged.
         kinds: Classes of agents (``scenario.schema.AgentKind``) that may react.
     """
     known = find_data(bank, AgentPaths)

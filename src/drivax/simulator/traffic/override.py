@@ -1,4 +1,4 @@
-"""Agents that do what they are told (``override``): given trajectories, or given actions."""
+"""Agents that follow given motions (``override``): given trajectories, or given actions."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class OverrideMotions(TrafficData):
 
 @dataclass(frozen=True)
 class OverrideTraffic:
-    """The agents of :class:`OverrideMotions` do what they are told, everyone else behaves as in ``base``.
+    """The agents of :class:`OverrideMotions` follow given motions, every other agent behaves as in ``base``.
 
     In reactive traffic the others see and avoid them.
     """
@@ -96,7 +96,7 @@ def with_override(
 
     Args:
         bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for nobody.
+        slots: Moving agents of each scenario, -1 for none.
         motion: x, y (m), heading (rad), speed (m/s) at every step of the log.
         valid: Whether they are there; always by default.
     """
@@ -134,13 +134,13 @@ def motions_of_actions(
 
     Args:
         bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for nobody.
+        slots: Moving agents of each scenario, -1 for none.
         actions: One per step from ``begin`` on; after the last one it is repeated.
         move: The dynamics under the action space, such as ``Task().motion``.
         begin: Step of the log at which they take over, at most 15 steps of whose past are kept.
     """
     steps = bank.steps - 1 - begin
-    wanted = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
+    desired = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
 
     def drive(index: Array, slot: Array, acts: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
         at = jnp.maximum(slot, 0)
@@ -151,7 +151,7 @@ def motions_of_actions(
             after = move(motion, action, size)
             return after, after
 
-        driven = jax.lax.scan(one, past[-1], acts[wanted])[1]
+        driven = jax.lax.scan(one, past[-1], acts[desired])[1]
         before = jnp.concatenate([jnp.repeat(past[:1], max(begin + 1 - len(past), 0), 0), past])[-begin - 1 :]
         return jnp.concatenate([before, driven])
 

@@ -72,7 +72,7 @@ def test_weights_are_repetitions():
 
 def test_invalid_arguments_are_refused():
     for measure in (roc_auc, precision_at_base_rate):
-        with pytest.raises(UsageError, match="nothing to find, or nothing else"):
+        with pytest.raises(UsageError, match="all true or all false"):
             measure(SCORES, np.zeros(150, bool))
     with pytest.raises(UsageError, match="two of either kind"):
         auc_interval(SCORES, np.arange(150) == 0)
@@ -106,8 +106,8 @@ def test_bootstrap_intervals_hold_the_measures_and_agree_with_delong():
     np.testing.assert_allclose(auc, auc_interval(SCORES, LABELS), atol=0.02)
 
 
-def test_interval_of_rank_correlation():
-    """Of normal variables Fisher's: tanh(atanh(r) +- 1.96 / sqrt(n - 3)), nearly; what is told thrice tells no more."""
+def test_the_interval_of_a_rank_correlation():
+    """Of normal variables Fisher's: tanh(atanh(r) +- 1.96 / sqrt(n - 3)), nearly; repeating each value adds nothing."""
     rng = np.random.default_rng(3)
     one, noise = rng.normal(size=(2, 400))
     other = 0.5 * one + noise

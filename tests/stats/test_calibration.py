@@ -23,12 +23,12 @@ CLUSTERS = np.repeat(np.arange(40), [1, 2, 3, 4] * 10)
 
 
 def scenes(rng):
-    """How hard scenarios are, alike within recordings, and skewed."""
+    """How hard scenarios are, similar within recordings, and skewed."""
     return rng.gamma(1.0, 1.0, 40)[CLUSTERS] + rng.gamma(1.0, 1.0, CLUSTERS.size)
 
 
 def noise(rng):
-    """What a planner makes of them, alike within recordings."""
+    """What a planner makes of them, similar within recordings."""
     return rng.normal(size=40)[CLUSTERS] + rng.normal(size=CLUSTERS.size)
 
 

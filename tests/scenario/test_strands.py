@@ -1,4 +1,4 @@
-"""Strands of lanes on hand-made maps: what goes on, what lies beside, and what merges where."""
+"""Strands of lanes on hand-made maps: continuation, neighbours, and merges where."""
 
 from __future__ import annotations
 

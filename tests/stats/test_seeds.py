@@ -9,7 +9,7 @@ from scipy import stats
 
 from drivax.errors import UsageError
 from drivax.stats.intervals import Interval, wilson
-from drivax.stats.seeds import Crossed, agents_interval, certain, crossed_difference, crossed_mean, log_ratio
+from drivax.stats.seeds import Crossed, certain, crossed_difference, crossed_mean, log_ratio, seeds_interval
 
 
 def drawn(rng, seeds, scenarios, *, agent=0.0, scenario=0.0, both=0.0, shift=0.0):
@@ -124,7 +124,7 @@ def test_it_finds_what_it_says_it_can():
 
 
 def test_as_many_as_are_said_to_be_needed_find_it():
-    """Seeds, or scenarios: drawn anew in that number they find a difference of this size in about 80 %."""
+    """Seeds, or scenarios: drawn again in that number they find a difference of this size in about 80 %."""
     rng = np.random.default_rng(5)
     effects = {"agent": 0.02, "both": 1.0}
 
@@ -205,23 +205,23 @@ def test_intervals_of_agents():
     rng = np.random.default_rng(0)
     values, clusters = (rng.random((3, 60)) < 0.3).astype(np.float64), np.arange(60) // 2
     values[0, 5] = np.nan
-    found, wanted = agents_interval(values, clusters), crossed_mean(values, clusters)
+    found, wanted = seeds_interval(values, clusters), crossed_mean(values, clusters)
     assert (found.mean, found.low, found.high) == pytest.approx((wanted.difference, *wanted.interval()))
     assert found.n == 59
     # A rate lies within 0 and 1, and is never certain.
     few = np.zeros((2, 20))
     few[0, 0] = 1.0
-    assert agents_interval(few).low < 0.0 == agents_interval(few, share=True).low
-    never = agents_interval(np.zeros((3, 60)), clusters, share=True)
+    assert seeds_interval(few).low < 0.0 == seeds_interval(few, share=True).low
+    never = seeds_interval(np.zeros((3, 60)), clusters, share=True)
     assert never == replace(wilson(0, 30), n=60)
     # Twenty of which ten weigh 19 times as much tell as much as (190 + 10)^2 / (10 * 19^2 + 10) alike.
-    heavy = agents_interval(np.zeros((3, 20)), weights=np.repeat([19.0, 1.0], 10), share=True)
+    heavy = seeds_interval(np.zeros((3, 20)), weights=np.repeat([19.0, 1.0], 10), share=True)
     assert heavy.high == pytest.approx(wilson(0, 200**2 / 3620).high)
     assert heavy.n == 20
     for count in (6, 1000):  # shares of which do not add up to 1 in floats
-        assert agents_interval(np.ones((3, count)), share=True) == replace(wilson(count, count), n=count)
-    assert agents_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)
-    assert agents_interval(np.full((2, 3), np.nan)).mean is None
+        assert seeds_interval(np.ones((3, count)), share=True) == replace(wilson(count, count), n=count)
+    assert seeds_interval(values[:, :2], clusters[:2]) == Interval(values[:, :2].mean(), None, None, 2)
+    assert seeds_interval(np.full((2, 3), np.nan)).mean is None
 
 
 def test_power_is_that_of_what_is_detectable():

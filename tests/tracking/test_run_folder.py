@@ -101,7 +101,7 @@ def test_what_is_no_run(tmp_path: Path):
 
 
 def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Against a repository made here: a clean commit, a run beside it, a new file, a change."""
+    """Against a repository made here: a clean commit, a run next to it, a new file, a change."""
 
     def git(*arguments: str) -> str:
         options = ["-c", "user.name=t", "-c", "user.email=t@t", "-c", "init.defaultBranch=main"]

@@ -20,7 +20,7 @@ from drivax.stats.significance import (
 
 
 def pairs_of(more, fewer, same=3):
-    """0/1 values with so many discordant pairs of either kind."""
+    """0/1 values with n discordant pairs of either kind."""
     a = [1] * more + [0] * fewer + [1] * same + [0] * same
     b = [0] * more + [1] * fewer + [1] * same + [0] * same
     return np.array(a, float), np.array(b, float)
