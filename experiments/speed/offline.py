@@ -31,7 +31,6 @@ from drivax.learning.experience import draw, sampler
 from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
 

@@ -15,7 +15,7 @@ from drivax.curation.arms import LONGTAIL, Claim
 from drivax.curation.scores import ScoreTable
 from drivax.curation.subset import top_rows
 from drivax.stats.ranking import correlation_interval, rank_correlation
-from drivax.stats.seeds import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
+from drivax.stats.seeds import Crossed, crossed_difference, crossed_mean, log_ratio, seeds_interval
 from drivax.stats.significance import holm
 
 #: Two rankings below this correlation (and above its negative) are called unrelated, above the other one related.
