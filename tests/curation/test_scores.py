@@ -94,7 +94,7 @@ def test_older_versions_are_refused(data, table, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def lively(tmp_path_factory):
-    """A drive that speeds up, brakes, swerves and is not seen for a second; somebody ahead, and an oncoming car."""
+    """A drive that speeds up, brakes, swerves and is not seen for a second; a car ahead, and an oncoming car."""
     t = (np.arange(91) - 10) * 0.1
     speed, swerve = 9.0 + 3.0 * np.sin(0.9 * t), 0.8 * np.sin(0.7 * t)
     along = np.cumsum(speed) * 0.1
