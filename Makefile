@@ -69,4 +69,4 @@ hooks: $(STAMP)
 
 clean:
 	rm -rf .cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist
-	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src tests experiments docs -name __pycache__ -type d -prune -exec rm -rf {} +

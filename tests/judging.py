@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.evaluation.rollout import judging
-from drivax.metrics.episode import episode_metrics, first_steps
+from drivax.metrics.episode import episode_metrics, event_steps
 from drivax.metrics.steps import step_metrics
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import logged_history
@@ -32,7 +32,7 @@ def _program():
 
         begin = simulator.reset(bank, row, START)
         state, series = jax.lax.scan(step, begin, motion)
-        return episode_metrics(bank, state), first_steps(state.episode), series
+        return episode_metrics(bank, state), event_steps(state.episode), series
 
     def log(bank, row):
         return jax.vmap(lambda t: logged_history(bank, row, t, 0)[-1])(jnp.arange(bank.steps))

@@ -16,27 +16,27 @@ from drivax.scenario.record import record, static
 @python_planner
 def slow_python(situation, observation):
     """Slows down to 5 m/s and aims at a point of the route; breaks where nobody else is there."""
-    if situation.scene.step == 15 and situation.surroundings.frame.valid.sum() == 1:
+    if situation.context.step == 15 and situation.surroundings.frame.valid.sum() == 1:
         raise LookupError("nobody\nto follow")
     ahead, left = 50.0 * observation["route"][1, :2]
     turn = 2.0 * left / (ahead**2 + left**2 + 1e-6)
-    return [(5.0 - situation.scene.history[-1, 3]) / 6.0, np.clip(turn / 0.3, -1.0, 1.0)]
+    return [(5.0 - situation.context.history[-1, 3]) / 6.0, np.clip(turn / 0.3, -1.0, 1.0)]
 
 
 @jax_planner
 def slow_jax(situation, observation):
     """The same in JAX; it cannot raise, so it gives no number."""
-    alone = (situation.scene.step == 15) & (situation.surroundings.frame.valid.sum() == 1)
+    alone = (situation.context.step == 15) & (situation.surroundings.frame.valid.sum() == 1)
     ahead, left = 50.0 * observation["route"][1, 0], 50.0 * observation["route"][1, 1]
     turn = 2.0 * left / (ahead**2 + left**2 + 1e-6)
-    speed = (5.0 - situation.scene.history[-1, 3]) / 6.0
+    speed = (5.0 - situation.context.history[-1, 3]) / 6.0
     return jnp.where(alone, jnp.inf, speed), jnp.clip(turn / 0.3, -1.0, 1.0)
 
 
 @python_planner
 def no_haste(situation, observation):
     """Keeps its speed, and raises where it begins faster than 12 m/s."""
-    if situation.scene.step == 10 and situation.facts.speed_mps > 12.0:
+    if situation.context.step == 10 and situation.facts.speed_mps > 12.0:
         raise ValueError("too fast")
     return 0.0, 0.0
 
@@ -64,7 +64,7 @@ class Fragile(Memoryless):
 
     def act(self, carry, bank, state, situation, observation, key):
         drawn = self.share * jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
-        broken = (bank.identity[state.scene.index] == self.breaks) & (state.scene.step >= self.step)
+        broken = (bank.identity[state.context.index] == self.breaks) & (state.context.step >= self.step)
         return jnp.where(broken, jnp.nan, drawn), carry
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from drivax.learning.collector import collect
+from drivax.learning.environment import collect
 from drivax.metrics.catalogue import Metric
 from drivax.metrics.steps import StepValue
 from drivax.networks.encoders import group_names
@@ -38,14 +38,14 @@ class Crowded:
         return near.sum().astype(jnp.float32) / 10.0
 
 
-def goal(bank, scene, frames):
+def goal(bank, context, frames):
     """The goal in the ego frame, in units of 50 m, at most 5 of them."""
-    return jnp.clip(View.of(scene).point(bank.goal[scene.index])[None] / 50.0, -5.0, 5.0)
+    return jnp.clip(View.of(context).point(bank.goal[context.index])[None] / 50.0, -5.0, 5.0)
 
 
-def walkers(bank, scene, frames):
+def walkers(bank, context, frames):
     """The three nearest pedestrians: place and velocity."""
-    now, view = frames(0), View.of(scene)
+    now, view = frames(0), View.of(context)
     place = view.point(now.box[:, :2])
     there = now.valid & (now.kind == 2) & (jnp.linalg.norm(place, axis=-1) < 60.0)
     distance = jnp.where(there, jnp.sum(place * place, axis=-1), jnp.inf)
@@ -55,7 +55,7 @@ def walkers(bank, scene, frames):
 
 
 def _gap(moment):
-    frame = moment.found.surroundings.frame
+    frame = moment.situation.surroundings.frame
     offset = frame.box[1:, :2] - frame.box[0, :2]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(offset * offset, axis=-1), 1e-6))
     return jnp.min(jnp.where(frame.valid[1:], distance, 1e3)), frame.valid[1:].any()
@@ -64,16 +64,16 @@ def _gap(moment):
 nearest_other = Metric(
     unit="m",
     better="high",
-    text="smallest distance between centres",
-    of=StepValue("nearest_other", "m", _gap, frozenset()),
+    definition="smallest distance between centres",
+    step_value=StepValue("nearest_other", "m", _gap, frozenset()),
     operator="min",
 )
 crashed = nearest_other
 lane_changes = Metric(
     unit="-",
     better="-",
-    text="lane changes",
-    of=StepValue(
+    definition="lane changes",
+    step_value=StepValue(
         "lane_changed",
         "-",
         lambda m: (m.facts.lane_changed.astype(jnp.float32), True),
@@ -177,7 +177,7 @@ class Reinforce:
 
         def loss(parameters):
             policy = nnx.merge(self.graph, parameters)
-            error = (rollout.choice - policy(rollout.observation).loc) / 0.3
+            error = (rollout.raw_action - policy(rollout.observation).loc) / 0.3
             log_prob = -0.5 * jnp.sum(error * error, axis=-1)
             return -jnp.mean(rollout.alive * (gains - gains.mean()) * log_prob)
 
@@ -216,12 +216,12 @@ class Drift:
     def start(self, bank, index, step):
         return bank.agents[index, step]
 
-    def advance(self, bank, scene, frame):
-        rows = scene.traffic
+    def advance(self, bank, context, frame):
+        rows = context.traffic
         return rows.at[:, :2].add(0.1 * rows[:, 5:7])
 
-    def agents(self, bank, scene, back):
-        rows = scene.traffic
+    def agents(self, bank, context, back):
+        rows = context.traffic
         return rows.at[:, :2].add(-0.1 * back * rows[:, 5:7])
 
 

@@ -1,10 +1,6 @@
 """Pages of results show what is stored, and nothing else."""
 
-import csv
-import importlib
-import io
 import json
-import tarfile
 import types
 
 import numpy as np
@@ -12,67 +8,62 @@ import pytest
 
 from drivax.stats.significance import holm
 from drivax.studies.longtail_plan import REFERENCES
+from experiment_scripts import load_script
 
 
 @pytest.fixture(scope="module")
-def script(repository):
-    """A script of ``benchmarks``, by its name."""
-
-    def load(name):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.syspath_prepend(repository / "benchmarks")
-            return importlib.import_module(name)
-
-    return load
+def script():
+    """A module of ``experiments``, by its name."""
+    return load_script
 
 
 @pytest.fixture(scope="module")
 def stored(repository):
     """A stored result, by its name."""
-    folder = repository / "benchmarks" / "results"
+    folder = repository / "experiments" / "results"
     return lambda name: json.loads((folder / f"{name}.json").read_text())
 
 
 def test_algorithm_pages_show_stored_results(script, stored):
-    tables = script("learning_tables")
+    tables = script("learning.tables")
     learning, training = stored("learning"), stored("training")
     pages = list(tables.pages())
     assert {page.stem for page in pages} >= {"learning", "bc", "ppo", "sac", "warm-start"}
     for page in pages:
         text = page.read_text()
         shown = tables.filled(page, learning, training) == text
-        assert shown, "run python benchmarks/learning.py table, and read what the pages say about it"
-        assert text.count("<!-- learning.py: end -->") * 2 == text.count("<!-- learning.py: ")
+        assert shown, "run python -m experiments.learning.presets table, and read what the pages say about it"
+        assert text.count("<!-- presets.py: end -->") * 2 == text.count("<!-- presets.py: ")
     for name in learning.get("curves", {}):
         assert tables.picture(name).is_file()
 
 
 def test_speed_page_shows_stored_measurements(script, stored):
-    simulator = script("simulator")
+    simulator = script("speed.simulator")
     table = simulator.table(stored("simulator"), stored("simulator_runs"))
     shown = f"{simulator.BEGIN}\n\n{table}\n\n{simulator.END}" in simulator.PAGE.read_text()
-    assert shown, "run python benchmarks/simulator.py --table, and read what the page says about it"
+    assert shown, "run python -m experiments.speed.simulator --table, and read what the page says about it"
 
 
 def test_speed_page_shows_evaluation_times(script, stored):
-    timing = script("evaluation")
+    timing = script("speed.evaluation")
     shown = (
         f"{timing.BEGIN}\n\n{timing.table(stored('evaluation'))}\n\n{timing.END}" in timing.PAGE.read_text()
     )
-    assert shown, "run python benchmarks/evaluation.py --table, and read what the page says about it"
+    assert shown, "run python -m experiments.speed.evaluation --table, and read what the page says about it"
 
 
 def test_real_files_page_shows_each_planner(script, stored):
-    real = script("real_files")
+    real = script("data.real_files")
     shown = f"{real.BEGIN}\n\n{real.tables(stored('real_files'))}\n\n{real.END}" in real.PAGE.read_text()
-    assert shown, "run python benchmarks/real_files.py --table, and read what the page says about it"
+    assert shown, "run python -m experiments.data.real_files --table, and read what the page says about it"
 
 
 def test_benchmark_page_shows_stored_results(script, stored):
-    benchmark = script("benchmark")
+    benchmark = script("learning.benchmark")
     text = benchmark.PAGE.read_text()
     shown = benchmark.filled(text, stored("benchmark")) == text
-    assert shown, "run python benchmarks/benchmark.py table, and read what the page says about it"
+    assert shown, "run python -m experiments.learning.benchmark table, and read what the page says about it"
     rows = stored("benchmark")["planners"]
     assert rows["expert"]["log"]["accuracy"]["mean"] == 1.0
 
@@ -83,14 +74,14 @@ def test_progress_until_failure(script):
     motion[:, :, 0] = np.arange(6)
     events = {"collision": np.array([13, -1, -1]), "offroad": np.array([14, -1, 10])}
     results = types.SimpleNamespace(events=events, motion=motion, start=10)
-    found = script("benchmark").until_failure(results)
+    found = script("learning.benchmark").until_failure(results)
     np.testing.assert_array_equal(found["steps_until_failure"], [3, 5, 0])
     np.testing.assert_array_equal(found["metres_until_failure"], [3, 5, 0])
 
 
 @pytest.mark.slow
 def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
-    benchmark = script("benchmark")
+    benchmark = script("learning.benchmark")
     monkeypatch.setattr(benchmark, "EPISODES", tmp_path)
     monkeypatch.setattr(benchmark, "POLICIES", tmp_path / "policies")
     few = {name: name for name in (*benchmark.COMPARED, "collision", "offroad")}
@@ -129,9 +120,9 @@ def test_evaluations_are_compared_in_pairs(script, tmp_path, monkeypatch):
 
 
 def test_curation_page_shows_stored_results(script, stored):
-    curation = script("curation")
+    curation = script("curation.methods")
     shown = curation.filled(curation.PAGE.read_text(), stored("curation")) == curation.PAGE.read_text()
-    assert shown, "run python benchmarks/curation.py table, and read what the page says about it"
+    assert shown, "run python -m experiments.curation.methods table, and read what the page says about it"
 
 
 def test_curation_and_planners_share_the_test_set(stored):
@@ -155,34 +146,27 @@ def test_members_disagree_where_they_err(stored):
 @pytest.fixture
 def found(script):
     """What the long-tail study found."""
-    longtail = script("longtail")
-    return json.loads((longtail.KEPT / longtail.RESULTS).read_text())
+    return json.loads(script("longtail").RESULT.read_text())
 
 
 def test_longtail_page_shows_stored_results(script, found):
     longtail = script("longtail")
     text = longtail.PAGE.read_text()
     assert longtail.filled(text, found) == text, (
-        "run python benchmarks/longtail.py table, and read what the page says about it"
+        "run python -m experiments.longtail table, and read what the page says about it"
     )
 
 
-def test_longtail_results_follow_from_episodes(script, found):
-    """Every agent's mean over the whole test, from what is kept of its episodes."""
-    longtail, about = script("longtail"), found["about"]
+def test_longtail_rates_follow_from_collision_counts(found):
+    """Mean over the whole test of every arm, from the number of its episodes with a collision by seed."""
+    about = found["about"]
+    assert list(found["collisions"]) == list(found["rates"])
     for name, rates in found["rates"].items():
-        files = sorted(longtail.KEPT.glob(f"{name}-?.tar.xz")) or [longtail.KEPT / f"{name}.tar.xz"]
-        assert len(files) == (1 if name in REFERENCES else about["seeds"])
-        means = []
-        for file in files:
-            with tarfile.open(file) as packed:
-                wanted = f"drives/{name}/seed-{file.stem[-5]}/" if len(files) > 1 else f"drives/{name}/"
-                rows = list(csv.DictReader(io.TextIOWrapper(packed.extractfile(wanted + "episodes.csv"))))
-            assert len(rows) == about["test"]
-            means.append(np.mean([float(row["collision"]) for row in rows]))
+        counts = found["collisions"][name]
+        assert len(counts) == (1 if name in REFERENCES else about["seeds"])
         rare = about["rare"] / about["test"]
         whole = rare * rates["rare"]["collision"]["mean"] + (1 - rare) * rates["common"]["collision"]["mean"]
-        np.testing.assert_allclose(np.mean(means), whole, atol=1e-9)
+        np.testing.assert_allclose(np.mean(counts) / about["test"], whole, atol=1e-9)
 
 
 def test_longtail_verdicts_hold_under_joint_adjustment(found):
@@ -193,11 +177,11 @@ def test_longtail_verdicts_hold_under_joint_adjustment(found):
 
 
 def test_offline_page_shows_stored_speed(script, stored):
-    offline = script("offline")
+    offline = script("speed.offline")
     shown = (
         f"{offline.BEGIN}\n\n{offline.table(stored('offline'))}\n\n{offline.END}" in offline.PAGE.read_text()
     )
-    assert shown, "run python benchmarks/offline.py --table, and read what the page says about it"
+    assert shown, "run python -m experiments.speed.offline --table, and read what the page says about it"
 
 
 def of(mean, half=0.01):
@@ -227,7 +211,7 @@ def learning():
 
 
 def test_learning_tables(script, learning):
-    tables = script("learning_tables")
+    tables = script("learning.tables")
     training = {
         "training": {"ppo": {"steps_per_second": 9000, "share": {"simulation": 0.25, "update": 0.75}}}
     }
@@ -258,7 +242,7 @@ def test_learning_tables(script, learning):
 
 def test_curves_show_every_seed(script, learning):
     curves = learning["curves"]["ppo"]
-    (axes,) = script("learning_tables").drawn("ppo", curves).axes
+    (axes,) = script("learning.tables").drawn("ppo", curves).axes
     assert axes.get_ylabel() == "validation success"
     for line, (seed, points) in zip(axes.lines, curves["success"].items(), strict=True):
         assert line.get_label() == seed

@@ -1,4 +1,4 @@
-"""What users call from Python: load a set, make a simulator, drive a planner, in one line each."""
+"""The Python interface: load a scenario set, make a simulator, evaluate a planner."""
 
 from __future__ import annotations
 
@@ -8,22 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from drivax.errors import UsageError
+from drivax.evaluation import runner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.run_evaluation import with_metrics
-from drivax.evaluation.runner import evaluate_scenarios
-from drivax.learning.policies import load_policy
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
-from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.bank.sizes import Sizes
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.schema import Scenario
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.starts import Start
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import run_and_step
@@ -32,13 +30,13 @@ from drivax.tracking.zoo import is_policy, zoo
 
 @dataclass(frozen=True)
 class Loaded:
-    """Scenarios in both forms: as they are stored, and on the device.
+    """Scenarios as they are stored and as a bank on the device.
 
     Attributes:
         scenarios: The stored scenarios.
         bank: The same, stacked on the device; an argument of everything that simulates.
         names: ``dataset``, ``scenario_id`` and ``segment`` of each.
-        sizes: Of banks in which they are evaluated: those of the whole set, so that a part of it is driven alike.
+        sizes: Bank sizes of the whole set, so that a subset gives the same results bit for bit.
     """
 
     scenarios: Sequence[Scenario]
@@ -57,62 +55,62 @@ def load(
     filters: Sequence[str] = (),
     scenarios: Sequence[str | Path] = (),
 ) -> Loaded:
-    """Scenarios of a set, or of your own making, ready to simulate.
+    """Load scenarios of a set, or scenarios of your own, ready to simulate.
 
     Args:
         data: Folder of a scenario set, or scenarios.
-        limit: Only the first so many of those that the others leave.
-        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.select.choice``).
-        scenarios: Only those of a set that are named by their ids, or in files with one id per line.
+        limit: Only the first ``limit`` of those that the other options leave.
+        filters: Conditions that scenarios of a set must meet, as ``type=turn_left`` (``scenario.select.selection``).
+        scenarios: Ids of scenarios of a set, or files with one id per line.
 
     Raises:
-        DataError: The set is damaged, a name is not in it, or nothing is left.
-        UsageError: A filter or the limit cannot be meant.
+        DataError: The set is damaged, an id is not in it, or no scenario is left.
+        UsageError: A filter or the limit is impossible.
     """
     if isinstance(data, str | Path):
         stored = ScenarioSet.open(data)
-        kept = [stored[row] for row in chosen(stored, filters, scenarios, limit)]
-        # Checksums are tested where a scenario is loaded; this only looks at what each record uses.
+        kept = [stored[row] for row in select_scenarios(stored, filters, scenarios, limit)]
+        # The scenarios that are loaded have been verified; of the others only the sizes are read.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:
-        raise UsageError("only a scenario set can be filtered", cure="leave out what is not wanted")
+        raise UsageError("only a scenario set can be filtered", cure="leave out filters= and scenarios=")
     else:
         kept, sizes = list(data[:limit]), Sizes.used(data)
     return Loaded(kept, ScenarioBank.from_scenarios(kept), scenario_names(kept), sizes)
 
 
 def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
-    """A simulator of a task (the default one otherwise).
+    """Make a simulator.
 
     Args:
-        task: Action space, observation, reward and ends.
-        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
-            ``zoo:NAME``), or a traffic. All but ``log`` may need their bank prepared:
-            ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
+        task: Action space, observation, reward and termination; the default task if None.
+        traffic: Traffic model: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
+            ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
+            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
     """
     return Simulator(task or Task(), _traffic(traffic))
 
 
-def _traffic(given: str | Traffic) -> Traffic:
-    return find_traffic(given) if isinstance(given, str) else given
+def _traffic(traffic: str | Traffic) -> Traffic:
+    return find_traffic(traffic) if isinstance(traffic, str) else traffic
 
 
 def evaluate(
     planner: str | Path | Planner | Callable[..., Any], data: str | Path | Loaded, *, task: Task | None = None,
     traffic: str | Traffic = "log", start: Start | None = None, sample: bool = False,
     metrics: Sequence[str] = (), **options: Any,
-) -> Results:  # fmt: skip
-    """Drives every scenario to the end of its log and measures it; writes nothing.
+) -> EpisodeTable:  # fmt: skip
+    """Evaluate a planner, given by name or as an object, on every scenario; writes nothing.
 
     Args:
-        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
-        data: Folder of a scenario set, or what :func:`load` returned (a part of a set, scenarios of your own).
-        task: Action space and observation of a planner of your own.
-        traffic: As of :func:`make_simulator`; it is prepared here.
-        start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
-        sample: Whether a policy, named by its folder, samples its actions rather than acting by the mode.
-        metrics: Metrics of your own as ``module:name``, beside all of ours.
-        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of ``evaluation.runner.evaluate_scenarios``.
+        planner: Name, run folder of a training (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
+        data: Folder of a scenario set, or scenarios from :func:`load`.
+        task: Action space and observation of a planner object.
+        traffic: As for :func:`make_simulator`; it is prepared here.
+        start: How episodes start: as logged by default, or ``simulator.starts.NoisyStart()``.
+        sample: Whether a policy given by name samples its actions instead of taking the mode.
+        metrics: User-defined metrics as ``module:name``, in addition to all built-in ones.
+        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :class:`drivax.evaluation.runner.Options`.
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
@@ -121,23 +119,27 @@ def evaluate(
         planner, task = find_planner(str(planner), loaded.bank, sample)
     elif sample:
         raise UsageError("only a policy by name can sample", cure="leave out sample=")
-    driver = as_planner(planner, getattr(planner, "__name__", "planner"))
-    task = with_metrics(task or Task(), tuple(metrics))
-    simulator = Simulator(task, _traffic(traffic), start or LogStart())
-    scenarios = data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data)
-    return evaluate_scenarios(simulator, driver, scenarios, sizes=loaded.sizes, **options)
+    return runner.evaluate(
+        as_planner(planner, getattr(planner, "__name__", "planner")),
+        data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data),
+        task=with_metrics(task or Task(), tuple(metrics)),
+        traffic=_traffic(traffic),
+        start=start,
+        sizes=loaded.sizes,
+        **options,
+    )
 
 
 def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
-    """The planner of a name, run folder or policy of the zoo, and the task that it was made for.
+    """Return the planner of a name, run folder or zoo policy, and its task.
 
     Raises:
-        UsageError: If there is no such planner, folder or policy.
+        UsageError: There is no such planner, folder or policy.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
         return make_planner(name), Task()
     folder, step = run_and_step(name)
     if not is_policy(folder):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
-        raise UsageError(f"there is no planner {name!r}", cure=f"use {', '.join(kinds)}")
+        raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
     return load_policy(folder, bank, step=step, samples=sample)

@@ -122,7 +122,7 @@ def test_tables_of_many_sets_fit_the_terminal(sets, inspect):
 def test_filters(sets, inspect):
     out = inspect(sets[0], "--filter", "place=boston|pittsburgh", "--filter", "audit.distance_m>0")
     assert cells(out, "scenarios") == "2 of 4 (recorded segments: 2, shards: 1)"
-    assert "1 do not know what 'place=boston|pittsburgh' asks for" in out
+    assert "1 lack what 'place=boston|pittsburgh' asks for" in out
     assert cells(out, "distance_m") == "mean 12, median 12, most 16 2"
     chosen = json.loads(inspect(sets[0], "--json", "--filter", "agents>=3"))
     assert [row["scenario_id"] for row in chosen["scenarios"]] == ["s2", "s3"]
@@ -204,7 +204,7 @@ def test_importance_of_features_to_a_trained_policy(sets, inspect):
         (["ONE", "--draw", "x.png"], "--draw needs --observations", 2),
         (["ONE", "--traffic", "idm"], "--traffic needs --observations", 2),
         (["ONE", "ONE", "--observations"], "one set", 2),
-        (["ONE", "--observations", "--planner", "nobody"], "there is no planner 'nobody'", 2),
+        (["ONE", "--observations", "--planner", "nobody"], "unknown planner 'nobody'", 2),
         (["ONE", "--json", "--html", "x.html"], "exclude", 2),
         (["gone"], "gone", 1),
     ],
@@ -216,7 +216,7 @@ def test_wrong_calls_get_one_line(words, said, status, sets, inspect):
 
 def test_samples_are_evenly_spread(sets, monkeypatch):
     from drivax.report import inspection
-    from drivax.scenario.select.filters import Selection
+    from drivax.scenario.select.selection import Selection
 
     one = Inspection.open(sets[0], Selection())
     assert [scenario.id for scenario in one.sample()] == ["s0", "s1", "s2", "s3"]

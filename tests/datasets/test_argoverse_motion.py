@@ -16,10 +16,10 @@ from datasets.samples.av2_motion import height, place
 from drivax.datasets.argoverse.motion import ArgoverseMotion, decode
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import project
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import Recording
+from drivax.geometry.vectors import wrap
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Recording, windows
 from drivax.scenario.schema import EDGE_KINDS, AgentKind, Flag
 
 READER = ArgoverseMotion()

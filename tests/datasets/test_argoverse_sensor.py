@@ -15,9 +15,9 @@ from datasets.samples import av2_motion, av2_sensor
 from datasets.samples.av2_sensor import FRAMES, LOG, TURN
 from drivax.datasets.argoverse.sensor import ArgoverseSensor, decode, rotate
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.geometry.angles import wrap
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import Recording
+from drivax.geometry.vectors import wrap
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Recording, windows
 from drivax.scenario.schema import AgentKind, Flag
 
 READER = ArgoverseSensor()

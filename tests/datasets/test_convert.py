@@ -202,7 +202,7 @@ def test_reading_and_assembling_never_import_jax(wire, write_records):
     path = write_records("x.tfrecord", wire.scenario(), wire.example())
     program = f"""
 import sys, pathlib
-import drivax.datasets.convert, drivax.scenario.assemble, drivax.scenario.store
+import drivax.datasets.convert, drivax.scenario.build.assemble, drivax.scenario.store
 assert "google.protobuf" not in sys.modules and "google_crc32c" not in sys.modules
 from drivax.datasets.convert import Conversion, convert_file
 kinds = [type(item).__name__ for item in convert_file(pathlib.Path({str(path)!r}), Conversion())]
@@ -532,7 +532,7 @@ def test_other_data_or_options_are_not_continued(thirty, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4), stop)
-    with pytest.raises(UsageError, match=r"other options \(stride\).*--overwrite to start anew"):
+    with pytest.raises(UsageError, match=r"other options \(stride\).*--overwrite to start again"):
         convert(thirty, tmp_path / "set", Conversion(shard_size=4, stride=20))
     (thirty / "2.tfrecord").unlink()
     with pytest.raises(UsageError, match=r"other options \(files\)"):

@@ -23,8 +23,8 @@ from drivax.datasets.nuplan.log import TimeLine, pieces, yaw_of
 from drivax.datasets.nuplan.map import feature_id
 from drivax.datasets.nuplan.reader import NuPlan
 from drivax.datasets.reader import BadRecord, Reader
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Recording, windows
 from drivax.scenario.schema import STEPS, AgentKind, Flag, LightState, RoadKind
 
 ORIGIN = np.array([sample.X0, sample.Y0])

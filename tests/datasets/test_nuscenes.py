@@ -17,7 +17,8 @@ from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M, EGO_SIZE_M, NuScenes
 from drivax.datasets.nuscenes.tables import kind_of, yaw
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError
-from drivax.scenario.build.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows
 from drivax.scenario.schema import AgentKind, Flag, RoadKind
 
 

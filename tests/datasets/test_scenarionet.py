@@ -20,8 +20,8 @@ from drivax.datasets.scenarionet.map import third_column_is_heading
 from drivax.datasets.scenarionet.reader import ScenarioNet, decode
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import MapFeature, Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import MapFeature, Recording, windows
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, AgentKind, Flag, LightState, RoadKind
 
 

@@ -16,8 +16,8 @@ from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.womd import messages
 from drivax.datasets.womd.scenario_reader import WomdScenario, decode
 from drivax.errors import DataError, UsageError
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.recording import MapFeature, Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import MapFeature, Recording, windows
 from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, RoadKind
 
 

@@ -73,15 +73,15 @@ def test_automatic_resets_change_no_episode(world):
     """Three environments drive six scenarios one after the other; each episode is what it is by itself."""
     simulator = Simulator(Task(metrics=METRICS))
 
-    def action(scene):
+    def action(context):
         # Anything that depends on scenario and step only; some of them end off the road.
-        phase = 1.7 * scene.index + 0.4 * scene.step
+        phase = 1.7 * context.index + 0.4 * context.step
         return 0.5 * jnp.stack([jnp.sin(phase), jnp.cos(1.3 * phase)])
 
     @jax.jit
     def alone(bank, states):
         def one(state):
-            after, transition = simulator.step(bank, state, action(state.scene))
+            after, transition = simulator.step(bank, state, action(state.context))
             return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
 
         return jax.vmap(one)(states)
@@ -89,7 +89,7 @@ def test_automatic_resets_change_no_episode(world):
     @jax.jit
     def or_begin(bank, states, over, following):
         def one(state, over, row):
-            taken = action(state.scene)
+            taken = action(state.context)
             after, transition = simulator.step_or_begin(
                 bank, state, taken, over, simulator.beginning(bank, row, LATE)
             )
@@ -111,9 +111,9 @@ def test_automatic_resets_change_no_episode(world):
         rows = np.where(over, rows + 3, rows) % COUNT
         states, over, metrics = or_begin(world, states, over, jnp.asarray(rows))
         for place in np.flatnonzero(over):
-            row = int(states.scene.index[place])
+            row = int(states.context.index[place])
             assert row == rows[place]
             found[row] = jax.tree.map(lambda leaf, at=place: np.asarray(leaf[at]), (states, metrics))
-    assert len({int(state.scene.step) for state, _ in expected.values()}) > 1, "some end early"
+    assert len({int(state.context.step) for state, _ in expected.values()}) > 1, "some end early"
     for row in range(COUNT):
         same_but_rounding(expected[row], found[row])

@@ -1,4 +1,4 @@
-"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays beside it.
+"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays next to it.
 
 Six generated logs do so in every quick run (``tests/simulator/test_simulator.py``).
 """
@@ -13,7 +13,8 @@ from drivax.evaluation.audit import audit, scenario_names
 from drivax.evaluation.runner import evaluate
 from drivax.planners.simple import Expert
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows
 from drivax.synthetic.world import generate_recording
 
 EXACT, DRIVEN = Expert(), Expert(replays=False)

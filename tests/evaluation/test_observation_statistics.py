@@ -33,10 +33,10 @@ from scenes import bank_of, car, straight_road
 STARE_M = 30.0
 
 
-def faulty(bank, scene, frames):
+def faulty(bank, context, frames):
     """A feature of one number that is not one at steps 20 and 50 of the first scenario."""
-    broken = (scene.index == 0) & ((scene.step == 20) | (scene.step == 50))
-    return jnp.where(broken, jnp.nan, scene.step / 100.0)[None]
+    broken = (context.index == 0) & ((context.step == 20) | (context.step == 50))
+    return jnp.where(broken, jnp.nan, context.step / 100.0)[None]
 
 
 @record
@@ -58,7 +58,7 @@ TASK = Task(
 
 @pytest.fixture(scope="module")
 def bank():
-    """One scenario in which ego at 9 m/s meets a standing car, two in which nobody is on its lane."""
+    """One scenario in which ego at 9 m/s meets a standing car, two in which no agent is on its lane."""
     standing = car(STARE_M, 0, 0, 0)
     scenes = [[car(0, 0, 0, 9), standing], *([car(0, 0, 0, 9), car(-20 - k, 3.7, 0, 5)] for k in range(2))]
     return bank_of(*(replace(straight_road(cars), scenario_id=f"s{k}") for k, cars in enumerate(scenes)))
@@ -77,7 +77,7 @@ def column(found, group, name):
 @pytest.mark.slow
 def test_episodes_are_looked_at_until_and_after_the_collision(bank):
     looks = look_at(Simulator(judging(TASK)), Shy(), bank, every=10)
-    assert looks.state.scene.step.tolist() == [[*range(10, 81, 10)]] * 3
+    assert looks.state.context.step.tolist() == [[*range(10, 81, 10)]] * 3
     # 30 m less a car's length at 9 m/s: they touch after 2.8 s, at step 38.
     assert looks.hit.tolist() == [[step > 38 for step in range(10, 81, 10)], [False] * 8, [False] * 8]
     assert looks.collides.tolist() == [True, False, False]
@@ -142,7 +142,7 @@ def test_a_planner_of_another_action_space_is_refused(bank):
 
 
 def test_columns_of_observations_made_by_hand():
-    """Two episodes of three looks at one row that is there or not; the second one hits somebody at its last look."""
+    """Two episodes of three looks at one row that is there or not; the second one hits an agent at its last look."""
     rows = np.arange(12.0).reshape(2, 3, 1, 2)
     mask = np.array([[[True], [True], [False]], [[True], [True], [True]]])
     rows[0, 1, 0, 1], rows[0, 2, 0, 1], rows[1, 0, 0, 1] = np.nan, np.inf, -np.inf
@@ -169,7 +169,7 @@ def test_correlation_is_scipys_point_biserial():
     collides = rng.random(40) < 0.4
     values = rng.normal(size=(40, 6, 3)) + 0.8 * collides[:, None, None]
     valid = rng.random(values.shape) < 0.6
-    valid[3] = False  # nobody is there in the whole episode
+    valid[3] = False  # no agent is there in the whole episode
     values[7, 2, 1] = np.nan
     means = [values[k][valid[k] & np.isfinite(values[k])].mean() for k in range(40) if k != 3]
     wanted = stats.pointbiserialr(np.delete(collides, 3), means).statistic

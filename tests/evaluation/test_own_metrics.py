@@ -9,10 +9,10 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
 from drivax.evaluation.runner import evaluate
-from drivax.metrics.selection import selected
+from drivax.metrics.selection import select_metrics
 from drivax.planners.catalogue import make_planner
-from drivax.report.html_tables import explanations, planner_table
-from drivax.report.loaded_runs import read_runs
+from drivax.report.pages.report import explanations
+from drivax.report.runs import read_runs
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.tasks.task import Task
@@ -21,7 +21,7 @@ from scenes import SMALL, bank_of, car, straight_road
 
 @pytest.mark.slow
 def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
-    """Row 0: a car stands 30 m ahead of a standing ego. Row 1: nobody else, so it is undefined."""
+    """Row 0: a car stands 30 m ahead of a standing ego. Row 1: no other agent, so it is undefined."""
     worlds = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         for world in worlds:
@@ -37,8 +37,8 @@ def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["metrics"]["nearest_other"]["mean"] == pytest.approx(30.0, abs=1e-4)
     runs, _ = read_runs([tmp_path / "run"])
-    table = planner_table(runs, ["nearest_other"])
-    assert "nearest other [m]" in table and "more is better" in table and "30.0" in table
+    table = planners_table(runs, ["nearest_other"]).html()
+    assert "nearest other [m]" in table and "Higher is better" in table and "30.0" in table
     assert "Smallest distance between centres." in explanations(["nearest_other"], runs)
 
 
@@ -50,8 +50,8 @@ def test_own_metrics_spoil_no_column():
 
 def test_what_is_no_metric_is_refused():
     for name, words in (
-        ("own_terms:hurry", "'own_terms:hurry' is no metric"),
+        ("own_terms:hurry", "'own_terms:hurry' is not a metric"),
         ("own_terms:nearest", "did you mean 'nearest_other'"),
     ):
         with pytest.raises(UsageError, match=words):
-            selected(("full", name))
+            select_metrics(("full", name))

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import EpisodeTable
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.tables import (
-    READINGS,
+    COLLISION_KINDS,
     collisions_table,
     differences_table,
     results_table,
@@ -37,39 +37,64 @@ def run(name, metrics, *, data="h1", path="sets/test", trained=None, traffic="lo
 
 
 def means(table):
-    return [[None if cell is None else cell.interval.mean for cell in row.cells] for row in table.rows]
+    return [
+        [None if cell.interval is None else cell.interval.mean for cell in numbers(table, row)]
+        for row in table.rows
+    ]
+
+
+def numbers(table, row):
+    return [cell for column, cell in zip(table.columns, row, strict=True) if not column.label]
+
+
+def heads(table):
+    return tuple(column.key for column in table.columns if not column.label)
+
+
+def labels(table):
+    return [
+        tuple(
+            cell.metric or cell.text for column, cell in zip(table.columns, row, strict=True) if column.label
+        )
+        for row in table.rows
+    ]
 
 
 def test_results_and_differences():
     ours = run("ours", {"success": [1] * 9 + [0] * 3, "progress_ratio": np.linspace(0.5, 1, N)})
     theirs = run("theirs", {"success": [1] * 6 + [0] * 6, "progress_ratio": np.linspace(0.4, 0.9, N)})
     table = results_table([theirs, ours], ["success", "progress_ratio"])
-    assert table.columns == ("theirs", "ours") and [row.labels for row in table.rows] == [
+    assert heads(table) == ("theirs", "ours") and labels(table) == [
         ("success",),
         ("progress_ratio",),
     ]
     assert means(table) == [[0.5, 0.75], [pytest.approx(0.65), pytest.approx(0.75)]]
-    assert table.rows[0].cells[1].interval.as_dict() == pytest.approx(wilson(9, N).as_dict())
+    assert numbers(table, table.rows[0])[1].interval.as_dict() == pytest.approx(wilson(9, N).as_dict())
     other_set = run("elsewhere", {"success": [0] * N}, data="h2")
     table = differences_table(ours, [theirs, other_set], ["success", "progress_ratio"])
-    assert table.columns == ("theirs",) and table.signed, "runs on other scenarios make no pairs"
-    assert means(table) == [[pytest.approx(0.25)], [pytest.approx(0.1)]]
-    low, high = table.rows[1].cells[0].interval.low, table.rows[1].cells[0].interval.high
+    assert heads(table) == ("theirs", "elsewhere")
+    assert means(table) == [[pytest.approx(0.25), None], [pytest.approx(0.1), None]]
+    assert numbers(table, table.rows[0])[1].text.startswith("no pairs:"), (
+        "runs on other scenarios make no pairs"
+    )
+    low, high = numbers(table, table.rows[1])[0].interval.low, numbers(table, table.rows[1])[0].interval.high
     assert low == pytest.approx(0.1) == high, "every pair differs by as much"
 
 
 def test_kinds_of_collision_are_shares_of_all_episodes():
     kinds = [1, 1, 3, 6, 0, 0, 0, 0, 0, 0, np.nan, np.nan]
     table = collisions_table([run("a", {"collision_type": kinds}), run("old", {"success": [1] * N})])
-    assert table.columns == ("a",), "a run that does not know kinds has no column"
+    assert heads(table) == ("a",), "a run that does not know kinds has no column"
     assert "share of the episodes in which they are known" in table.caption
     whole = collisions_table([run("a", {"collision_type": [*kinds[:10], 0, 2]})])
-    assert "share of all episodes" in whole.caption and {row.cells[0].interval.n for row in whole.rows} == {N}
-    assert set(READINGS) == set(CollisionType) - {CollisionType.NONE}
-    found = dict(zip((row.labels[0] for row in table.rows), means(table), strict=True))
+    assert "share of all episodes" in whole.caption and {
+        numbers(whole, row)[0].interval.n for row in whole.rows
+    } == {N}
+    assert set(COLLISION_KINDS) == set(CollisionType) - {CollisionType.NONE}
+    found = dict(zip((label for label, *_ in labels(table)), means(table), strict=True))
     assert found["rear end"] == [0.2] and found["side"] == [0.1] and found["standing object"] == [0.1]
     assert found["head-on"] == [0.0]
-    found = table.rows[0].cells[0].interval.as_dict()
+    found = numbers(table, table.rows[0])[0].interval.as_dict()
     assert found == pytest.approx(wilson(2, 10).as_dict()), "undefined episodes do not count"
 
 
@@ -79,11 +104,11 @@ def test_strata_in_the_order_of_their_words():
     table = strata_table(
         [run("a", {"success": success}), run("b", {"success": [0] * N})], tags, "difficulty", ["success"]
     )
-    assert [row.labels for row in table.rows] == [
+    assert labels(table) == [
         ("easy", "a"), ("easy", "b"), ("hard", "a"), ("hard", "b"), ("unknown", "a"), ("unknown", "b"),
     ]  # fmt: skip
     assert means(table) == [[1.0], [0.0], [pytest.approx(1 / 3)], [0.0], [1.0], [0.0]]
-    assert [row.cells[0].interval.n for row in table.rows] == [8, 8, 3, 3, 1, 1]
+    assert [numbers(table, row)[0].interval.n for row in table.rows] == [8, 8, 3, 3, 1, 1]
 
 
 def test_transfer_is_training_by_evaluation():
@@ -98,8 +123,8 @@ def test_transfer_is_training_by_evaluation():
         run("idm", {"success": [0] * N}, data="A", path="x/a"),
     ]
     table = transfer_table(runs, "success")
-    assert table.columns == ("a", "b")
-    assert [row.labels for row in table.rows] == [
+    assert heads(table) == ("a", "b")
+    assert labels(table) == [
         ("p", "a", "log"),
         ("q", "b, a", "log"),
         ("idm", "–", "log"),
@@ -109,10 +134,10 @@ def test_transfer_is_training_by_evaluation():
         runs[0],
         run("p (noisy)", {"success": [1] * N}, data="A", path="x/a", trained=[("x/a", "A")], planner="p"),
     ]
-    assert [row.labels[0] for row in transfer_table(twice, "success").rows] == ["p", "p (noisy)"]
+    assert [label for label, *_ in labels(transfer_table(twice, "success"))] == ["p", "p (noisy)"]
 
 
-def test_policies_of_one_name_are_told_apart(tmp_path):
+def test_policies_of_one_name_are_distinguished(tmp_path):
     """Every algorithm has a seed-0; what they are called on the command line differs."""
     runs = []
     for place, (planner, data) in enumerate(
@@ -125,12 +150,12 @@ def test_policies_of_one_name_are_told_apart(tmp_path):
         (tmp_path / str(place) / "config.yaml").write_text(f"planner: {planner}\n")
         runs.append(replace(one, folder=tmp_path / str(place)))
     table = transfer_table(runs, "success")
-    assert [row.labels[0] for row in table.rows] == ["bc/seed-0", "ppo/seed-0"]
+    assert [label for label, *_ in labels(table)] == ["bc/seed-0", "ppo/seed-0"]
     assert means(table) == [[0.0, 0.0], [1.0, None]]
-    assert [cell.run for cell in table.rows[0].cells] == ["seed-0 (0)", "seed-0 (2)"]
+    assert [cell.link["run"] for cell in numbers(table, table.rows[0])] == ["seed-0 (0)", "seed-0 (2)"]
 
 
-def test_sets_of_one_name_are_told_apart():
+def test_sets_of_one_name_are_distinguished():
     runs = [
         run("a", {}, data="0123456789", path="old/test"),
         run("b", {}, data="abcdefghij", path="new/test"),

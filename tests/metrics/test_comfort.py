@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from drivax.metrics.comfort import TAIL, WINDOW, filter_operator, judge_comfort, judge_trip, tail_operator
+from drivax.metrics.comfort import (
+    TAIL,
+    WINDOW,
+    check_comfort,
+    check_trip_comfort,
+    savgol_matrix,
+    savgol_tail_matrix,
+)
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2)])
@@ -14,11 +21,11 @@ def test_tail_operator_is_scipys_filter(window, order, derivative):
     signal = np.random.default_rng(0).normal(size=60)
     whole = savgol_filter(signal, window, order, deriv=derivative)
     for end in (40, 50):
-        tail = tail_operator(window, order, derivative) @ signal[end - WINDOW : end]
+        tail = savgol_tail_matrix(window, order, derivative) @ signal[end - WINDOW : end]
         cut = savgol_filter(signal[:end], window, order, deriv=derivative)
         np.testing.assert_allclose(tail, cut[-TAIL:], atol=1e-9)
         np.testing.assert_allclose(tail[0], whole[end - TAIL], atol=1e-9)
-    operator = filter_operator(41, window, order, derivative)
+    operator = savgol_matrix(41, window, order, derivative)
     whole = savgol_filter(signal[:41], window, order, deriv=derivative)
     np.testing.assert_allclose(operator @ signal[:41], whole, atol=1e-9)
 
@@ -34,7 +41,7 @@ def test_judgement_equals_limits_on_scipys_signals():
     t = np.arange(120) * 0.1
     speed = 8 + 2.0 * np.sin(0.9 * t) + 0.4 * np.sin(5.1 * t)
     heading = 0.5 * np.sin(0.8 * t) + 0.02 * rng.normal(size=t.size).cumsum()
-    judged = jax.vmap(judge_comfort)(jnp.asarray(histories(speed, heading)))
+    judged = jax.vmap(check_comfort)(jnp.asarray(histories(speed, heading)))
     a = np.diff(speed) / 0.1
     lateral = (speed[1:] + speed[:-1]) / 2 * np.diff(heading) / 0.1
     smooth = savgol_filter(a, 8, 2)
@@ -52,7 +59,7 @@ def test_judgement_equals_limits_on_scipys_signals():
     assert 0.2 < expected.mean() < 0.98
     np.testing.assert_array_equal(running, expected)
     motion = jnp.asarray(np.stack([0 * speed, 0 * speed, heading, speed], -1), jnp.float32)
-    whole = jax.jit(judge_trip)(motion)
+    whole = jax.jit(check_trip_comfort)(motion)
     np.testing.assert_array_equal(whole.comfortable, expected)
     magnitude = np.abs(savgol_filter(np.hypot(a, lateral), 15, 2, deriv=1, delta=0.1))
     np.testing.assert_allclose(whole.jerk_mps3, magnitude[7:], rtol=1e-3, atol=5e-3)
@@ -61,12 +68,12 @@ def test_judgement_equals_limits_on_scipys_signals():
 def test_lateral_acceleration_can_fail():
     # 10 m/s at 0.5 rad/s is 5 m/s2: over the limit of 4.89.
     heading = np.arange(16) * 0.05
-    judged = judge_comfort(jnp.asarray(histories(np.full(16, 10.0), heading)[0]))
+    judged = check_comfort(jnp.asarray(histories(np.full(16, 10.0), heading)[0]))
     assert not bool(judged.comfortable.any())
     np.testing.assert_allclose(judged.lateral_mps2, 5.0, rtol=1e-3)
 
 
 def test_a_heading_that_wraps_is_no_discomfort():
     heading = (np.linspace(np.pi - 0.1, np.pi + 0.1, 16) + np.pi) % (2 * np.pi) - np.pi
-    judged = judge_comfort(jnp.asarray(histories(np.full(16, 5.0), heading)[0]))
+    judged = check_comfort(jnp.asarray(histories(np.full(16, 5.0), heading)[0]))
     assert bool(judged.comfortable.all())

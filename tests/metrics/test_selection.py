@@ -15,8 +15,8 @@ from drivax.evaluation.rollout import judging
 from drivax.learning.config import TrainConfig
 from drivax.metrics import steps
 from drivax.metrics.catalogue import METRICS, SETS
-from drivax.metrics.episode import episode_add, episode_metrics, episode_start, first_steps
-from drivax.metrics.selection import catalogue, selected
+from drivax.metrics.episode import episode_add, episode_metrics, episode_start, event_steps
+from drivax.metrics.selection import metric_specs, select_metrics
 from drivax.metrics.steps import STEP_VALUES
 from drivax.simulator import situation
 from drivax.simulator.simulator import Simulator
@@ -28,7 +28,7 @@ BANK = bank_of(straight_road([car(speed=10.0), car(30.0), car(0, 3.7, 0, 9)], li
 
 
 #: Work that only some metrics need.
-COSTLY = ("time_to_collision", "judge_contacts", "judge_lights", "judge_comfort")
+COSTLY = ("time_to_collision", "classify_contacts", "check_lights", "check_comfort")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def traced():
             patch.setattr(module, name, heard)
 
         for name in COSTLY:
-            listen(steps if name == "judge_comfort" else situation, name)
+            listen(steps if name == "check_comfort" else situation, name)
         for wanted in ("none", "training", "full", ("at_fault_collision",)):
             called.clear()
             simulator = Simulator(Task(metrics=wanted))
@@ -77,28 +77,28 @@ def test_sets_are_of_the_catalogue():
     assert SETS["none"] == () and SETS["full"] == tuple(METRICS)
     assert set(SETS["training"]) < set(METRICS)
     for name, metric in METRICS.items():
-        assert set(metric.inputs) <= set(METRICS) and metric.text and metric.unit, name
-    assert {value.name for value in selected("full").values} == set(STEP_VALUES)
+        assert set(metric.inputs) <= set(METRICS) and metric.definition and metric.unit, name
+    assert {value.name for value in select_metrics("full").step_values()} == set(STEP_VALUES)
 
 
 def test_a_list_names_sets_and_metrics_and_brings_what_they_need():
-    wanted = selected(("training", "comfortable", "min_ttc", "min_ttc"))
+    wanted = select_metrics(("training", "comfortable", "min_ttc", "min_ttc"))
     assert wanted.names == (*SETS["training"], "comfortable", "min_ttc")
     assert "comfort" in dict(wanted.metrics) and "comfort" not in wanted.names
     order = [name for name, _ in wanted.metrics]
     for name, metric in wanted.metrics:
         assert all(order.index(needed) < order.index(name) for needed in metric.inputs)
-    assert selected(("min_ttc",)).reads == {"ttc_s", "ttc_defined"}
-    assert selected("none").reads == frozenset() and selected("full").reads == FACTS
-    assert list(catalogue(("min_ttc", "ade"))) == ["min_ttc", "ade"]
-    assert selected(("full", "own_terms:lane_changes")).reads == FACTS | {"lane_changed"}
+    assert select_metrics(("min_ttc",)).reads == {"ttc_s", "ttc_defined"}
+    assert select_metrics("none").reads == frozenset() and select_metrics("full").reads == FACTS
+    assert list(metric_specs(("min_ttc", "ade"))) == ["min_ttc", "ade"]
+    assert select_metrics(("full", "own_terms:lane_changes")).reads == FACTS | {"lane_changed"}
 
 
 def test_misspelt_names_get_one_line():
     for wanted in ("trainin", ("training", "min_tcc")):
         with pytest.raises(UsageError, match="did you mean"):
             Task(metrics=wanted)
-    with pytest.raises(UsageError, match=r"task.*: there is no metric 'ful'.*'full'"):
+    with pytest.raises(UsageError, match=r"task.*: unknown metric 'ful'.*'full'"):
         settings.load(TrainConfig, {"task": {"metrics": "ful"}})
 
 
@@ -116,9 +116,9 @@ def test_configuration_files_choose_a_set():
 
 
 def test_what_is_not_selected_is_not_computed(traced):
-    assert traced["none"].called == traced["training"].called == {"judge_lights"}
+    assert traced["none"].called == traced["training"].called == {"check_lights"}
     assert traced["full"].called == set(COSTLY)
-    assert traced[("at_fault_collision",)].called == {"judge_lights", "judge_contacts"}
+    assert traced[("at_fault_collision",)].called == {"check_lights", "classify_contacts"}
     assert traced["none"].operations < traced["training"].operations < 0.85 * traced["full"].operations
 
 
@@ -150,22 +150,22 @@ def random_situations(count=60):
     found = jax.tree.map(filled, shape)
     kinds = jnp.asarray(rng.choice([0, 0, 0, 2, 3], count), found.facts.collision_type.dtype)
     facts = replace(found.facts, collision_type=kinds, limit_mps=found.facts.limit_mps - 0.5)
-    return replace(found, facts=facts, scene=replace(found.scene, step=jnp.arange(11, 11 + count)))
+    return replace(found, facts=facts, context=replace(found.context, step=jnp.arange(11, 11 + count)))
 
 
 def episode(wanted, found, empty):
     """Metrics and first events of measured steps."""
-    last = 10 + found.scene.step.shape[0]
+    last = 10 + found.context.step.shape[0]
 
     @jax.jit
     def run(found):
         def one(episode, now):
-            return episode_add(episode, now, jnp.asarray(10), now.scene.step == last), None
+            return episode_add(episode, now, jnp.asarray(10), now.context.step == last), None
 
         summed = jax.lax.scan(one, episode_start(wanted), found)[0]
-        scene = jax.tree.map(lambda leaf: leaf[-1], found.scene)
-        state = replace(empty, scene=scene, episode=summed, start=jnp.asarray(10))
-        return episode_metrics(BANK, state), first_steps(summed)
+        context = jax.tree.map(lambda leaf: leaf[-1], found.context)
+        state = replace(empty, context=context, episode=summed, start=jnp.asarray(10))
+        return episode_metrics(BANK, state), event_steps(summed)
 
     return jax.tree.map(np.asarray, run(found))
 
@@ -200,7 +200,7 @@ def test_operators_and_that_a_selection_changes_no_value(traced):
         assert events[name] == 11 + np.argmax(getattr(facts, name)), name
     for wanted in ("training", LEAN):
         lean, lean_events = episode(wanted, found, empty)
-        assert set(lean) == set(selected(wanted).names)
+        assert set(lean) == set(select_metrics(wanted).names)
         for name, value in lean.items():
             np.testing.assert_allclose(value.value, full[name].value, rtol=1e-6, err_msg=name)
             assert value.defined == full[name].defined, name
@@ -230,7 +230,7 @@ def test_a_selection_changes_no_value_in_simulation():
 
 def test_evaluation_uses_the_full_set_whatever_the_task_learned_with():
     for metrics in ("none", ("training", "min_ttc")):
-        assert selected(judging(Task(metrics=metrics)).metrics).names == tuple(METRICS)
+        assert select_metrics(judging(Task(metrics=metrics)).metrics).names == tuple(METRICS)
 
 
 def test_no_metric_is_defined_before_the_first_step(traced):

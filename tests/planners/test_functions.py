@@ -33,7 +33,7 @@ def moments(bank):
 
     def moment(index, step):
         state = SIMULATOR.reset(bank, index, step)
-        return state, SIMULATOR.situation(bank, state), SIMULATOR.observe(bank, state.scene)
+        return state, SIMULATOR.situation(bank, state), SIMULATOR.observe(bank, state.context)
 
     steps = np.array(STEPS)
     return jax.jit(jax.vmap(jax.vmap(moment, (None, 0)), (0, None)))(np.arange(2), steps)

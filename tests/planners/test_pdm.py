@@ -310,7 +310,7 @@ def test_it_copes_with_an_obstacle_a_leader_a_person_and_a_red_light():
         straight_road([car(0, 0, 0, 10), PERSON(45, -6.0, np.pi / 2, 1.5)]),
         straight_road([car(0, 0, 0, 10)], light=RED),
     ]
-    scenarios = [assemble(scene, SMALL) for scene in scenes]
+    scenarios = [assemble(recording, SMALL) for recording in scenes]
     bank = ScenarioBank.from_scenarios(scenarios, trim=False)
     found = evaluate(
         PdmPlanner(), bank, scenario_names(scenarios), task=replace(TASK, metrics="full")

@@ -33,7 +33,7 @@ def simulator():
 def first_moment(simulator, bank):
     """What every planner is given at step 10."""
     state = simulator.reset(bank, 0, 10, 0)
-    return state, simulator.situation(bank, state), simulator.observe(bank, state.scene)
+    return state, simulator.situation(bank, state), simulator.observe(bank, state.context)
 
 
 @jax.jit
@@ -90,19 +90,19 @@ def test_idm_law_by_hand():
 
 def test_the_expert_knows_the_log_and_stays_where_it_ends(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 3.7, 0, 6, steps=range(60))]))
-    ego = simulator.scene(bank, 0, 88)
+    ego = simulator.context(bank, 0, 88)
     np.testing.assert_allclose(logged_motion(bank, ego, 1), [71.1, 0, 0, 9], atol=1e-3)
     np.testing.assert_allclose(logged_motion(bank, ego, 4), [73.8, 0, 0, 9], atol=1e-3)
-    gone = simulator.scene(bank, 0, 59, 1)
+    gone = simulator.context(bank, 0, 59, 1)
     np.testing.assert_allclose(logged_motion(bank, gone, 1), gone.history[-1])
-    steady = expert_action(bank, simulator.scene(bank, 0, 10), PHYSICAL)
+    steady = expert_action(bank, simulator.context(bank, 0, 10), PHYSICAL)
     np.testing.assert_allclose(steady, 0.0, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_a_network_acts_by_the_mode_or_by_a_sample(simulator):
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
-    spec = group_spec(jax.eval_shape(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)), bank))
+    spec = group_spec(jax.eval_shape(lambda b: simulator.observe(b, simulator.context(b, 0, 10)), bank))
     policy = Policy(NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(4,)), spec, nnx.Rngs(3))
     graph, weights = nnx.split(policy)
     mode, sample = (act(NetworkPlanner(weights, graph, samples=s), simulator, bank) for s in (False, True))

@@ -8,7 +8,8 @@ import pytest
 from drivax.datasets.womd.example_reader import WomdExample
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.assemble import assemble, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import AgentKind, Flag, Scenario
 
 FILES = {

@@ -12,7 +12,8 @@ from drivax.evaluation.audit import audit
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows, with_ego
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.task import Task
@@ -63,8 +64,8 @@ def test_vehicle_height_follows_its_road(driven):
 
     def one(state, _):
         action = jnp.zeros(2)
-        state, _ = simulator.replay(bank, state, logged_motion(bank, state.scene, 1), action)
-        return state, state.scene.z
+        state, _ = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
+        return state, state.context.z
 
     @jax.jit
     @jax.vmap

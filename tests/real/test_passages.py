@@ -12,7 +12,8 @@ from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.scenario.build.assemble import assemble, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import with_ego
 from drivax.scenario.schema import CAR_LANE_KINDS, AgentKind
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.rewards import RewardConfig
@@ -82,7 +83,7 @@ def crossings(recording, row):
 def changes(bank):
     def one(row):
         def step(state, _):
-            now = logged_motion(bank, state.scene, 1)
+            now = logged_motion(bank, state.context, 1)
             after, _ = SIMULATOR.replay(bank, state, now, jnp.zeros(2))
             return after, after.facts.lane_changed
 

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from drivax.datasets.reader import BadRecord
-from drivax.scenario.build.assemble import assemble, windows, with_ego
-from drivax.scenario.build.route_coverage import SHARE, candidate_coverage, lane_coverage
-from drivax.scenario.recording import Recording
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import Recording, windows, with_ego
 from drivax.scenario.schema import AgentKind, Flag
+from experiment_scripts import load_script
+
+routes = load_script("data.routes")
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ def test_some_candidate_covers_the_log_of_every_ego_that_moves(source, recording
         if scenario.tags["moves"] == "yes":
             moving += 1
             assert Flag.ROUTE in scenario.has
-            assert candidate_coverage(scenario) >= SHARE, scenario.id
+            assert routes.candidate_coverage(scenario) >= routes.SHARE, scenario.id
     assert moving == (0 if source.module == "womd_scenario" else len(recordings))  # WOMD's ego is parked
 
 
@@ -102,9 +104,9 @@ def test_some_candidate_covers_the_log_of_every_other_vehicle_on_lanes(source, r
             if scenario.tags["moves"] == "no" or Flag.ROUTE not in scenario.has:
                 continue
             routed += 1
-            if candidate_coverage(scenario) < SHARE:
+            if routes.candidate_coverage(scenario) < routes.SHARE:
                 uncovered.add(scenario.id)
-                assert lane_coverage(scenario) < SHARE, scenario.id
+                assert routes.lane_coverage(scenario) < routes.SHARE, scenario.id
     assert uncovered <= source.exceptions
     assert routed >= 4
 

@@ -1,143 +1,170 @@
+"""``drivax compare``: text, JSON, page, and exit status."""
+
 from __future__ import annotations
 
-import dataclasses
+import csv
+import json
+import re
 
-import numpy as np
+import jsonschema
 import pytest
 
-from drivax.evaluation.stored import comparable, mismatch
-from drivax.evaluation.tables import summarise
-from drivax.metrics.catalogue import METRICS
-from drivax.report.comparison import difference
-from drivax.report.episode_selection import choose, outcome
-from drivax.report.glossary import HEADLINE, headline, note, ordered
-from drivax.report.html_tables import bounds, number
-from drivax.report.loaded_runs import read_runs
-from drivax.stats.intervals import NOTHING, Interval, bootstrap_mean, rate
+from drivax import settings
+from drivax.cli import main
+from drivax.evaluation.plan import ComparisonPlan
 
-SEGMENTS = [f"hand/road-{number // 2}" for number in range(8)]
+from .test_report import Page
+
+PLAN = "primary: progress_ratio\nsecondary: [collision, offroad, red_light]\nminimum_scenarios: 4\nresamples: 200\n"
+MAYBE = {"type": ["number", "null"]}
+INTERVAL = {
+    "type": "object",
+    "required": ["mean", "low", "high", "n"],
+    "properties": {"mean": MAYBE, "n": {"type": "integer"}},
+}
+METRIC = {
+    "type": "object",
+    "required": [
+        "metric", "unit", "better", "a", "b", "difference", "effects", "evidence", "p_adjusted", "winner", "seeds",
+        "undefined_a", "undefined_b",
+    ],
+    "properties": {"a": INTERVAL, "b": INTERVAL, "difference": INTERVAL, "winner": {"enum": ["A", "B", None]}},
+}  # fmt: skip
+SCHEMA = {
+    "type": "object",
+    "required": [
+        "plan", "names", "folders", "traffic", "scenarios", "recordings", "strata", "primary", "secondary",
+        "sensitivity", "seeds", "decision",
+    ],
+    "properties": {
+        "primary": METRIC,
+        "secondary": {"type": "array", "items": METRIC},
+        "decision": {
+            "type": "object",
+            "required": ["recommendation", "because", "needed", "caveats"],
+            "properties": {"recommendation": {"enum": ["A", "B", "no difference", "not enough scenarios"]}},
+        },
+    },
+}  # fmt: skip
 
 
 @pytest.fixture
-def evaluations(runs):
-    return read_runs(runs)[0]
+def plan(tmp_path):
+    file = tmp_path / "plan.yaml"
+    file.write_text(PLAN)
+    return file
 
 
-def test_rates_get_wilson_with_clusters_and_the_rest_a_bootstrap(evaluations):
-    policy = evaluations[-1]
-    assert summarise(policy, "collision") == rate(policy.metrics["collision"], SEGMENTS)
-    progress = summarise(policy, "progress_ratio")
-    expected = bootstrap_mean(policy.metrics["progress_ratio"], SEGMENTS, seed=1)
-    assert (progress.mean, progress.n) == (expected.mean, expected.n)
-    assert (progress.low, progress.high) == pytest.approx((expected.low, expected.high), abs=0.01)
-    assert summarise(policy, "red_light").n == 5, "three of eight are undefined"
-    assert summarise(policy, "min_ttc") == NOTHING == summarise(policy, "not_there")
+def called(capsys, *arguments):
+    status = main(["compare", *map(str, arguments)])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
 
 
-def test_differences_are_paired_by_scenario(evaluations):
-    expert, constant, policy = evaluations
-    found = difference(policy, constant, "progress_ratio")
-    assert found.interval.mean == pytest.approx(0.1) and found.interval.n == 8 and found.verdict == "better"
-    assert difference(policy, expert, "collision").interval.mean == pytest.approx(2 / 8)
-    assert difference(policy, expert, "min_ttc").interval.n == 0
-    assert difference(policy, policy, "accuracy").verdict == "same"
-    assert difference(policy, expert, "red_light").verdict == "unclear"
+def test_text_has_conditions_tables_and_recommendation(runs, plan, capsys):
+    status, out, _ = called(capsys, runs[2], runs[1], "--config", plan)
+    lines = out.splitlines()
+    assert status == 0 and max(map(len, lines)) <= 100
+    assert lines[0].startswith("A  policy") and lines[1].startswith("B  constant")
+    assert "paired on 8 scenarios of 4 recordings, log traffic" in out
+    # The policy is better by 0.1 in every scenario: the rarest of the 2^4 sign patterns, twice.
+    row = next(line for line in lines if line.startswith("progress ↑"))
+    assert row.split()[:5] == ["progress", "↑", "0.825", "0.725", "+0.100"]
+    assert " 0.125 " in row and "red light ↓" in out
+    assert re.search(r"undefined for A in 3, for B in 3", out)
+    assert "recommendation: not enough scenarios" in lines
 
 
-def test_order_does_not_matter_and_repeats_are_averaged(evaluations):
-    expert, _, policy = evaluations
-    back = list(reversed(range(8)))
-    keys = {name: tuple(column[i] for i in [*back, 0]) for name, column in expert.keys.items()}
-    values = expert.metrics["progress_ratio"][[*back, 0]].copy()
-    values[-1] += 0.4  # scenario 0 a second time: its mean is 0.2 more
-    shuffled = dataclasses.replace(expert, keys=keys, metrics={"progress_ratio": values})
-    found = difference(policy, shuffled, "progress_ratio").interval
-    assert found.n == 8 and found.mean == pytest.approx(0.1 - 0.2 / 8)
+def test_json_equals_the_csv_files(runs, plan, capsys):
+    status, out, _ = called(capsys, runs[2], runs[1], "--config", plan, "--json")
+    found = json.loads(out)
+    jsonschema.validate(found, SCHEMA)
+    columns = []
+    for folder in (runs[2], runs[1]):
+        with (folder / "episodes.csv").open() as file:
+            columns.append([row["red_light"] for row in csv.DictReader(file)])
+    pairs = [float(a) - float(b) for a, b in zip(*columns, strict=True) if a and b]
+    red = found["secondary"][2]
+    assert status == 0 and red["metric"] == "red_light" and red["difference"]["n"] == len(pairs)
+    assert red["difference"]["mean"] == pytest.approx(sum(pairs) / len(pairs))
+    assert found["names"] == ["policy", "constant"] and found["plan"]["minimum_scenarios"] == 4
 
 
-def test_worse_is_said_where_less_is_better(evaluations):
-    expert, constant, _ = evaluations
-    found = difference(constant, expert, "offroad")
-    assert found.interval.mean == 0.5 and found.verdict in ("worse", "unclear")
-    values = {"offroad": np.ones(8)}
-    certain = difference(dataclasses.replace(constant, metrics=values), expert, "offroad")
-    assert certain.interval == Interval(1.0, 1.0, 1.0, 8) and certain.verdict == "worse"
+def test_page_is_self_contained(runs, plan, tmp_path, capsys):
+    page = tmp_path / "out" / "comparison.html"
+    status, out, _ = called(capsys, runs[2], runs[1], "--config", plan, "--html", page)
+    assert status == 0 and f"wrote {page}" in out
+    html = page.read_text()
+    parsed = Page(html)
+    assert not parsed.links and "url(" not in html and "@import" not in html and "default-src 'none'" in html
+    assert not re.search(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}/", html)
+    assert "Recommendation: not enough scenarios" in parsed.text
+    primary, secondary, _ = parsed.tables
+    assert len(primary) == 2 and len(secondary) == 4 and secondary[0][6] == "p (Holm)"
+    assert primary[1][0] == "progress ↑" and primary[1][3].startswith("+0.100|")
+    assert secondary[1][1].startswith("25.0 %|") and html.count("<svg") == html.count("</svg>") > 0
+    assert called(capsys, runs[2], runs[1], "--config", plan, "--html", page)[0] == 2
+    assert called(capsys, runs[2], runs[1], "--config", plan, "--html", page, "--overwrite")[0] == 0
 
 
-def test_only_the_same_scenarios_and_traffic_are_compared(evaluations):
-    expert, _, policy = evaluations
-    assert comparable(expert, policy)
-    other = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
-    moved = dataclasses.replace(expert, about={**expert.about, "data": {"hash": "0000", "path": "x"}})
-    assert not comparable(other, policy) and not comparable(moved, policy)
-    assert mismatch(other, policy) == (
-        "drove in different traffic (idm and log)", "evaluate both with the same --traffic",
-    )  # fmt: skip
-    (expert.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
-    expert, policy = (dataclasses.replace(run) for run in (expert, policy))
-    assert comparable(expert, policy), "of the policy's start nobody told anything"
-    (policy.folder / "config.yaml").write_text("noisy_start: true\nstart_step: 10\n")
-    expert, policy = (dataclasses.replace(run) for run in (expert, policy))
-    assert mismatch(expert, policy) == ("differ in start_step (40 and 10)", "evaluate both with the same")
-
-
-def test_outcomes_and_choice(evaluations):
-    policy = evaluations[-1]
-    assert [outcome(policy, row) for row in range(8)] == [
-        "success", "collision", "success", "off-road", "red light", "collision", "goal not reached", "success",
-    ]  # fmt: skip
-    chosen = choose(evaluations, 6)
-    # Each kind in turn, gravest first; 5 and 1 are collisions that the others drove equally well or ill.
-    assert [choice.outcome for choice in chosen] == [
-        "collision", "off-road", "red light", "goal not reached", "success", "success",
-    ]  # fmt: skip
-    assert chosen[4].scenario_id == "hand-07", "the success where another planner failed comes first"
-    assert all(choice.rows == (row, row, row) for choice in chosen for row in [int(choice.scenario_id[-2:])])
-    assert len(choose(evaluations, 100)) == 8 and choose(evaluations, 0) == []
-    assert sum(choice.outcome != "success" for choice in choose(evaluations, 8)) == 5
-
-
-def test_a_run_that_lacks_a_scenario_or_is_not_comparable_is_left_out(evaluations):
-    expert, constant, policy = evaluations
-    trajectories = dataclasses.replace(
-        constant.trajectories, rows={k: v for k, v in constant.trajectories.rows.items() if k[0] != "hand-01"}
+def test_save_writes_the_plan_and_config_runs_it(runs, tmp_path, capsys):
+    file = tmp_path / "plans" / "plan.yaml"
+    words = ("--primary", "accuracy", "--secondary", "collision", "--minimum-scenarios", "8", "--save", file)
+    status, out, _ = called(capsys, runs[0], runs[1], *words)
+    assert status == 0 and out == f"wrote {file}\n"
+    assert settings.load(ComparisonPlan, file) == ComparisonPlan(
+        a=runs[0], b=runs[1], primary="accuracy", secondary=("collision",), minimum_scenarios=8
     )
-    constant = dataclasses.replace(constant, trajectories=trajectories)
-    expert = dataclasses.replace(expert, about={**expert.about, "traffic": "idm"})
-    rows = {choice.scenario_id: choice.rows for choice in choose([expert, constant, policy], 8)}
-    assert rows["hand-01"] == (None, None, 1) and rows["hand-03"] == (None, 3, 3)
+    assert called(capsys, *words)[0] == 2, "nothing is overwritten"
+    status, out, _ = called(capsys, "--config", file)
+    assert status == 0 and "A  expert" in out and "accuracy ↑" in out
+    # A primary metric is no secondary one, though it is one of those by default.
+    usual = ComparisonPlan().secondary
+    file = tmp_path / "collision.yaml"
+    assert called(capsys, "--primary", usual[0], "--save", file)[0] == 0
+    assert settings.load(ComparisonPlan, file).secondary == usual[1:]
 
 
-def test_glossary():
-    assert set(HEADLINE) <= set(METRICS) and all(note(name).explanation for name in METRICS)
-    assert note("at_fault_collision").better == "down" and note("at_fault_collision").unit == "rate"
-    assert note("vmax_score").unit == "share" and note("max_jerk").label == "max jerk [m/s³]"
-    assert note("my_metric").label == "my metric" and note("my_metric").better == "none"
-    assert headline(["mine", "offroad", "success"]) == ["success", "offroad"]
-    assert ordered(["mine", "steps", "offroad", "yours", "success"]) == [
-        "success",
-        "offroad",
-        "mine",
-        "yours",
-    ]
+def test_random_and_stratified_splits_are_reported(runs, plan, capsys):
+    words = ("--primary", "accuracy", "--secondary", "progress_ratio", "--minimum-scenarios", "2")
+    status, out, _ = called(capsys, runs[0], runs[1], *words, "--split", "random")
+    assert status == 0 and "split at random: 4 scenarios of 2 recordings for A, 4 of 2 for B" in out
+    plan.write_text(PLAN + "split: stratified\nstrata: [dataset]\n")
+    status, out, _ = called(capsys, runs[0], runs[1], "--config", plan)
+    assert status == 0 and "split within 1 stratum" in out
+
+
+def test_seeds_of_one_folder_are_averaged(runs, plan, tmp_path, capsys):
+    seeds = tmp_path / "seeds"
+    for number, run in enumerate(runs[1:3]):
+        folder = seeds / f"seed-{number}"
+        folder.mkdir(parents=True)
+        about = json.loads((run / "run.json").read_text()) | {"planner": f"seed-{number}"}
+        (folder / "run.json").write_text(json.dumps(about))
+        (folder / "episodes.csv").write_text((run / "episodes.csv").read_text())
+    status, out, _ = called(capsys, seeds, runs[0], "--config", plan)
+    assert status == 0 and "A  seeds" in out
+    assert "A, seeds: 2 seeds: 0.725, 0.825; interquartile mean 0.775" in out
 
 
 @pytest.mark.parametrize(
-    ("value", "unit", "signed", "text"),
+    ("arguments", "status", "words"),
     [
-        (0.625, "rate", False, "62.5"), (-0.0417, "rate", True, "−4.2"), (0.0, "rate", True, "0.0"),
-        (-0.0001, "rate", True, "0.0"), (0.9, "share", False, "0.900"), (0.25, "share", True, "+0.250"),
-        (3.14159, "m", False, "3.14"), (31.4159, "m", False, "31.4"), (31415.9, "m", False, "31416"),
-        (None, "m", False, "–"),
+        (["A"], 2, "1 runs are named"),
+        ([], 2, "no runs are named"),
+        (["A", "MISSING"], 1, "run folder not found"),
+        (["A", "TRAINING"], 1, "not evaluation"),
+        (["A", "A"], 2, "the same run"),
+        (["A", "B", "--primary", "succes"], 2, "did you mean 'success'?"),
+        (["A", "B", "--config", "MISSING.yaml"], 2, "file not found"),
+        (["A", "B", "--html", "FOLDER"], 2, "name a file to write"),
+        (["--save", "FOLDER"], 2, "name a file to write"),
     ],
-)  # fmt: skip
-def test_numbers(value, unit, signed, text):
-    assert number(value, unit, signed) == text
-
-
-def test_bounds():
-    assert bounds(Interval(0.5, 0.25, 0.75, 4), "rate") == "25.0–75.0"
-    assert bounds(Interval(-0.5, -0.75, 0.25, 4), "rate", signed=True) == "−75.0 to +25.0"
-    assert bounds(Interval(-1.0, -2.0, 1.5, 4), "m") == "−2.00 to 1.50"
-    assert bounds(Interval(1.0, None, None, 1), "m") == "no interval"
-    assert bounds(Interval(1.0, 1.0, 1.0, 9), "m") == "all alike" and bounds(NOTHING, "m") == ""
+)
+def test_wrong_calls_print_one_line(arguments, status, words, runs, tmp_path, capsys):
+    places = {
+        "A": runs[0], "B": runs[1], "TRAINING": runs[3], "MISSING": tmp_path / "m", "FOLDER": tmp_path,
+        "MISSING.yaml": tmp_path / "m.yaml",
+    }  # fmt: skip
+    found, out, err = called(capsys, *(places.get(word, word) for word in arguments))
+    assert (found, out) == (status, "") and err.count("\n") == 1 and words in err

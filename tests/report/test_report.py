@@ -14,16 +14,16 @@ import pytest
 from browser import acted, browse, needs_browser
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
+from drivax.evaluation.tables import metric_label
 from drivax.metrics.catalogue import METRICS
-from drivax.report.glossary import note
-from drivax.report.loaded_runs import read_runs
 from drivax.report.pages.report import write_report
-from drivax.report.pictures.episode import ABSENT
 from drivax.report.pictures.palette import LIGHT
+from drivax.report.pictures.player_data import ABSENT
+from drivax.report.runs import read_runs
 from drivax.scenario.store import ScenarioWriter
 from drivax.stats.intervals import wilson
 
-from .conftest import SMALL, drive_off, make_scenario
+from .conftest import SMALL, make_scenario, offset_path
 
 VOID = {"meta", "input", "br", "wbr", "link", "img"}
 
@@ -81,7 +81,7 @@ def page(runs, tmp_path):
     return html, Page(html)
 
 
-def test_the_page_is_self_contained(page):
+def test_page_is_self_contained(page):
     html, parsed = page
     assert not parsed.links and "url(" not in html and "@import" not in html
     assert not re.search(
@@ -91,11 +91,11 @@ def test_the_page_is_self_contained(page):
     assert "fetch(" not in html and "XMLHttpRequest" not in html and "import(" not in html
 
 
-def test_tables_are_what_the_csv_files_say(page, runs):
+def test_tables_equal_the_csv_files(page, runs):
     """Means, intervals and n of every rate, recomputed with nothing but the csv module and Wilson's formula."""
     _, parsed = page
     header, *rows = parsed.tables[0]
-    labels = {note(name).label: name for name in METRICS}
+    labels = {metric_label(name).text: name for name in METRICS}
     columns = [labels[re.sub(r" [↑↓]$", "", cell.strip())] for cell in header[1:]]
     assert columns[0] == "success" and "red_light" in columns and len(rows) == 3
     for folder, row in zip(runs, rows, strict=False):
@@ -106,7 +106,7 @@ def test_tables_are_what_the_csv_files_say(page, runs):
             values = [float(e[name]) for e in episodes if e[name] != ""]
             mean, interval, n = cell.split("|")
             assert n == f"n {len(values)}"
-            if note(name).unit == "rate":
+            if metric_label(name).unit == "rate":
                 assert mean == f"{100 * sum(values) / len(values):.1f} %"
                 if sum(values) in (0, len(values)):  # nothing varies: clusters count once
                     clusters = len({e["segment"] for e in episodes if e[name] != ""})
@@ -116,22 +116,22 @@ def test_tables_are_what_the_csv_files_say(page, runs):
                 assert mean == f"{sum(values) / len(values):.3f}"
 
 
-def test_undefined_everywhere_is_an_empty_cell_with_its_n(page):
+def test_undefined_metric_is_an_empty_cell_with_n_0(page):
     _, parsed = page
     header, *rows = parsed.tables[1]
-    place = [re.sub(r" [↑↓]$", "", cell.strip()) for cell in header].index("least TTC [s]")
+    place = [re.sub(r" [↑↓]$", "", cell.strip()) for cell in header].index("minimum TTC [s]")
     assert all(row[place] == "–|n 0" for row in rows)
 
 
-def test_differences_are_what_the_csv_files_say(page, runs):
+def test_differences_equal_the_csv_files(page, runs):
     _, parsed = page
     header, *rows = parsed.tables[2]
-    assert header[1:] == ["against expert", "against constant"]
+    assert header[1:] == ["expert", "constant"]
     table = {}
     for folder in runs[:3]:
         with (folder / "episodes.csv").open() as file:
             table[folder.name] = {e["scenario_id"]: e for e in csv.DictReader(file)}
-    labels = {note(name).label: name for name in METRICS}
+    labels = {metric_label(name).text: name for name in METRICS}
     for row in rows:
         name = labels[re.sub(r" [↑↓]$", "", row[0].strip())]
         for other, cell in zip(("expert", "constant"), row[1:], strict=True):
@@ -141,21 +141,21 @@ def test_differences_are_what_the_csv_files_say(page, runs):
                 if mine[name] != "" and table[other][key][name] != ""
             ]
             mean = cell.split("|")[0].replace("−", "-").removesuffix(" points")
-            scale = 100 if note(name).unit == "rate" else 1
+            scale = 100 if metric_label(name).unit == "rate" else 1
             assert math.isclose(
                 float(mean), scale * sum(pairs) / len(pairs), abs_tol=0.051 if scale > 1 else 0.00051
             )
             assert cell.endswith(f"n {len(pairs)}")
 
 
-def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
+def test_player_data_parse_and_cannot_end_their_element(page):
     html, parsed = page
     data = [json.loads(text) for attrs, text in parsed.scripts if attrs.get("type") == "application/json"]
-    themes, signals, *episodes, listed = data
-    assert set(signals) == {"signals", "strokes"} and len(listed["runs"]) == 3
-    assert set(themes) == {"light", "dark"} and len(episodes) == 8
-    assert [d["planner"] for d in episodes[0]["drives"]] == ["expert", "constant", "policy"]
-    assert episodes[0]["title"].endswith(": collision") and episodes[0]["drives"][2]["events"] == {
+    style, *episodes, listed = data
+    assert {"signals", "strokes", "widths"} <= set(style) and len(listed["runs"]) == 3
+    assert set(style["themes"]) == {"light", "dark"} and len(episodes) == 8
+    assert [d["planner"] for d in episodes[0]["rollouts"]] == ["expert", "constant", "policy"]
+    assert episodes[0]["title"].endswith(": collision") and episodes[0]["rollouts"][2]["events"] == {
         "collision": 40
     }
     assert "<b>not markup</b>" not in html and "&lt;b&gt;not markup" in html
@@ -163,19 +163,19 @@ def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
     assert len(html.encode()) < 600_000
 
 
-def test_steps_before_the_planner_took_over_are_the_logs(page, scenarios):
-    """The stored path begins where the planner took over; the page shows the logged drive before."""
+def test_steps_before_the_takeover_are_the_log(page, scenarios):
+    """The stored path starts at the takeover; the page shows the log before."""
     _, parsed = page
     episode = next(json.loads(t) for a, t in parsed.scripts if a.get("class") == "episode")
-    from .test_episode import shorts
+    from .test_player_data import shorts
 
     assert episode["id"] == "hand-01"
-    pose = shorts(episode["drives"][2]["pose"], 91, 3)[:, :2] * episode["unit"] + episode["centre"]
+    pose = shorts(episode["rollouts"][2]["pose"], 91, 3)[:, :2] * episode["unit"] + episode["centre"]
     np.testing.assert_allclose(pose[:10], scenarios[1].agent_xy[:10, 0], atol=episode["unit"])
-    np.testing.assert_allclose(pose[10:], drive_off(scenarios[1], 3.0)[10:, :2], atol=episode["unit"])
+    np.testing.assert_allclose(pose[10:], offset_path(scenarios[1], 3.0)[10:, :2], atol=episode["unit"])
 
 
-def test_a_moved_set_is_named_and_can_be_given(runs, tmp_path, hand_set):
+def test_moved_set_is_an_error_unless_given(runs, tmp_path, hand_set):
     for folder in runs[:3]:
         about = json.loads((folder / "run.json").read_text())
         about["data"]["path"] = str(tmp_path / "gone")
@@ -187,10 +187,10 @@ def test_a_moved_set_is_named_and_can_be_given(runs, tmp_path, hand_set):
     assert write_report(runs, tmp_path / "tables.html", episodes=0).stat().st_size < 100_000
 
 
-def test_another_set_is_refused(runs, tmp_path):
+def test_other_set_is_refused(runs, tmp_path):
     with ScenarioWriter(tmp_path / "other", SMALL) as writer:
         writer.add(make_scenario(0))
-    with pytest.raises(DataError, match="is not the set that 'policy' was evaluated on"):
+    with pytest.raises(DataError, match="not the set that 'policy' was evaluated on"):
         write_report(runs, tmp_path / "report.html", data=tmp_path / "other")
     about = json.loads((runs[2] / "run.json").read_text())
     (runs[2] / "run.json").write_text(json.dumps(about | {"data": {"path": str(tmp_path / "other")}}))
@@ -201,13 +201,13 @@ def test_another_set_is_refused(runs, tmp_path):
         write_report(runs, tmp_path / "report.html")
 
 
-def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch):
+def test_failed_write_leaves_the_old_page(runs, tmp_path, monkeypatch):
     out = tmp_path / "out" / "report.html"
     write_report(runs, out)
     before = out.read_bytes()
     with pytest.raises(UsageError, match="--overwrite"):
         write_report(runs, out)
-    with pytest.raises(UsageError, match="name a file in it"):
+    with pytest.raises(UsageError, match="name a file to write"):
         write_report(runs, out.parent, overwrite=True)
     with pytest.raises(UsageError, match="-1 episodes"):
         write_report(runs, tmp_path / "new.html", episodes=-1)
@@ -215,7 +215,7 @@ def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch
     def fails(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("drivax.report.pages.page.os.fsync", fails)
+    monkeypatch.setattr("drivax.files.os.fsync", fails)
     with pytest.raises(OSError, match="disk full"):
         write_report(runs, out, overwrite=True)
     assert out.read_bytes() == before and [path.name for path in out.parent.iterdir()] == ["report.html"]
@@ -226,7 +226,7 @@ def test_equal_runs_give_equal_pages(runs, tmp_path):
     assert pages[0] == pages[1]
 
 
-def test_trainings_alone_and_one_planner_alone(runs, tmp_path):
+def test_report_of_trainings_or_one_planner_alone(runs, tmp_path):
     alone = Page(write_report([runs[-1]], tmp_path / "training.html").read_text())
     assert "Learning curves" in alone.text and "Results" not in alone.text
     single = Page(write_report([runs[2]], tmp_path / "single.html").read_text())
@@ -234,7 +234,7 @@ def test_trainings_alone_and_one_planner_alone(runs, tmp_path):
 
 
 def crash(folder, number, step, error):
-    """What a run says whose planner crashed in a scenario."""
+    """Write a crash of the planner into a run folder."""
     header, *rows = (folder / "episodes.csv").read_text().splitlines()
     rows = [f"{row},{int(place == number)}" for place, row in enumerate(rows)]
     (folder / "episodes.csv").write_text("\n".join([f"{header},crashed", *rows]) + "\n")
@@ -242,7 +242,7 @@ def crash(folder, number, step, error):
     (folder / "crashes.json").write_text(json.dumps([row]))
 
 
-def test_crashes_are_told_with_step_and_error(runs, tmp_path):
+def test_crashes_are_shown_with_step_and_error(runs, tmp_path):
     before = Page(write_report(runs, tmp_path / "before.html").read_text())
     assert not any("crashed" in cell for cell in before.tables[0][0]), "nobody crashed"
     crash(runs[2], 2, 55, "ValueError: too <fast>")
@@ -252,13 +252,13 @@ def test_crashes_are_told_with_step_and_error(runs, tmp_path):
     *_, episode, listed = [one for one in data if one.get("id", "hand-02") == "hand-02"]
     assert listed["runs"][2]["errors"] == {"0": [55, "ValueError: too <fast>"]}, "it is the gravest failure"
     assert (
-        episode["drives"][2]["events"] == {"crashed": 55} and episode["title"] == "hand-02: planner crashed"
+        episode["rollouts"][2]["events"] == {"crashed": 55} and episode["title"] == "hand-02: planner crashed"
     )
-    assert episode["drives"][0]["events"] == {}
+    assert episode["rollouts"][0]["events"] == {}
 
 
 @needs_browser
-def test_the_error_of_a_crash_is_the_title_of_its_cell(runs, tmp_path):
+def test_crash_error_is_the_title_of_its_cell(runs, tmp_path):
     crash(runs[2], 2, 55, "ValueError: too <fast>")
     act = """
       const cell = document.querySelector("#rows tr td");
@@ -272,7 +272,7 @@ def test_the_error_of_a_crash_is_the_title_of_its_cell(runs, tmp_path):
 
 
 def react(run):
-    """Stores where reactive traffic went: slot 1 stands still left of where ego began, nobody else is there."""
+    """Store reactive traffic: slot 1 stands still left of ego's start, no other agent is present."""
     with np.load(run / "trajectories.npz") as stored:
         arrays = dict(stored)
     others = np.full((*arrays["ego"].shape[:2], 2, 3), -32768, np.int16)
@@ -280,7 +280,7 @@ def react(run):
     np.savez(run / "trajectories.npz", **arrays, others=others)
 
 
-def test_others_are_shown_as_they_reacted_to_the_last_run(runs, tmp_path):
+def test_reactive_agents_are_those_of_the_last_run(runs, tmp_path):
     for run in runs[:3]:
         about = json.loads((run / "run.json").read_text())
         (run / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
@@ -296,19 +296,19 @@ def test_others_are_shown_as_they_reacted_to_the_last_run(runs, tmp_path):
     assert "Other agents are drawn" not in alone.text
 
 
-def test_other_traffic_is_said_and_not_compared(runs, tmp_path):
+def test_runs_in_other_traffic_are_not_compared(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
     with pytest.raises(DataError, match="lacks an array: others"):
         read_runs(runs)
     react(runs[0])
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
-    said = "expert and policy drove in different traffic (idm and log)."
+    said = "expert and policy differ in traffic (idm and log)."
     assert said in parsed.text and "constant and policy" not in parsed.text
-    assert all(row[1] == "no pairs: drove in different traffic (log and idm)" for row in parsed.tables[2][1:])
+    assert all(row[1] == "no pairs: differ in traffic (log and idm)" for row in parsed.tables[2][1:])
 
 
-def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
+def test_page_names_runs_with_other_starts_or_fewer_scenarios(runs, tmp_path):
     """A noisy run from another step makes no pairs; one of two of the eight scenarios makes two."""
     (runs[0] / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
     (runs[2] / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
@@ -320,11 +320,11 @@ def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
         "constant and policy have 2 of 2 and 8 scenarios in common." in page.text
     )
     assert all("no pairs" in row[1] and "no pairs" not in row[2] for row in page.tables[2][1:])
-    drives = [json.loads(t)["drives"] for a, t in page.scripts if a.get("class") == "episode"]
+    drives = [json.loads(t)["rollouts"] for a, t in page.scripts if a.get("class") == "episode"]
     assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 
-def test_the_command(runs, tmp_path, capsys):
+def test_report_command(runs, tmp_path, capsys):
     assert main(["report", *map(str, runs), "--out", str(tmp_path / "r.html"), "--episodes", "2"]) == 0
     assert "r.html" in capsys.readouterr().out
     assert main(["report", *map(str, runs[:3])]) == 0 and (runs[2] / "report.html").is_file()
@@ -336,8 +336,8 @@ def test_the_command(runs, tmp_path, capsys):
 
 
 @needs_browser
-def test_the_player_plays_in_a_browser(runs, tmp_path, scenarios):
-    """No errors, one canvas per planner, and what the page reads out at a step is what was stored."""
+def test_player_works_in_a_browser(runs, tmp_path, scenarios):
+    """No errors, one canvas per planner, and the displayed numbers of a step are the stored ones."""
     html = write_report(runs, tmp_path / "report.html")
     act = """
       const key = (name) => document.body.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));

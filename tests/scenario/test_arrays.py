@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.arrays import differentiate, recording_from_arrays, resample
-from drivax.scenario.build.assemble import assemble, windows
-from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind, Scenario
+from drivax.scenario.arrays import differentiate, recording_from_arrays, resample, scenario_from_arrays
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows
+from drivax.scenario.schema import AgentKind, Flag, LightState, RoadKind
 
 T = np.arange(91) * 0.1
 
@@ -33,7 +34,7 @@ def agents() -> dict[str, Any]:
 
 @pytest.fixture
 def roads() -> dict[str, Any]:
-    """Two lanes one after the other, one beside the first, inside a closed edge."""
+    """Two lanes one after the other, another next to the first, inside a closed edge."""
     return {
         "lanes": [
             {"points": [(-50, 0), (50, 0)], "successors": [1], "left": [2], "limit_mps": 13.9},
@@ -48,7 +49,7 @@ def roads() -> dict[str, Any]:
 
 def test_a_scenario(agents, roads):
     states = ["red"] * 40 + [None] * 11 + ["green"] * 40
-    scenario = Scenario.from_arrays("own-1", agents, roads, [{"lane": 1, "states": states}], route=[0, 1])
+    scenario = scenario_from_arrays("own-1", agents, roads, [{"lane": 1, "states": states}], route=[0, 1])
     assert (scenario.id, bytes(scenario.dataset[()]), int(scenario.current_step)) == ("own-1", b"own", 10)
     np.testing.assert_allclose(scenario.agent_xy[:, 0, 0], 10.0 * T - 10.0, atol=1e-5)
     np.testing.assert_allclose(scenario.agent_velocity[:, 0], [[10.0, 0.0]] * 91, atol=1e-4)
@@ -85,7 +86,7 @@ def test_what_is_not_valid_may_hold_anything(agents, roads):
     agents["heading"][1, 70:] = 1e9
     tracks = recording_from_arrays("a", agents, roads).tracks
     assert not tracks.xy[1, :30].any() and not tracks.heading[1, 60:].any()
-    Scenario.from_arrays("a", agents, roads)
+    scenario_from_arrays("a", agents, roads)
 
 
 def test_heights(agents, roads):
@@ -110,7 +111,7 @@ def test_given_velocity_size_and_id_are_kept(agents, roads):
 
 def test_no_sizes_are_those_of_the_class(agents, roads):
     del agents["size"], agents["kind"]
-    scenario = Scenario.from_arrays("a", agents, roads)
+    scenario = scenario_from_arrays("a", agents, roads)
     assert Flag.DEFAULT_SIZES in scenario.has
     assert scenario.agent_size[0].tolist() == pytest.approx([4.9, 2.0, 1.5])
 
@@ -119,7 +120,7 @@ def test_long_data_become_windows(agents, roads):
     long = {name: np.repeat(np.array(agents[name]), 2, axis=1) for name in ("xy", "heading", "valid")}
     long["xy"][0, :, 0] = np.arange(182)
     with pytest.raises(DataError, match=r"182 steps.*windows"):
-        Scenario.from_arrays("a", long, roads)
+        scenario_from_arrays("a", long, roads)
     cut = list(windows(recording_from_arrays("a", long, roads)))
     assert [w.scenario_id for w in cut] == ["a@0", "a@40", "a@80"] and {w.segment for w in cut} == {"a"}
     assert assemble(cut[1]).id == "a@40"
@@ -148,23 +149,23 @@ WRONG = {
 def test_errors_name_the_argument(case, agents, roads):
     WRONG[case](agents, roads)
     with pytest.raises(UsageError) as error:
-        Scenario.from_arrays("a", agents, roads)
+        scenario_from_arrays("a", agents, roads)
     assert case in error.value.problem and error.value.cure and "\n" not in str(error.value)
 
 
 def test_other_errors_name_their_argument(agents, roads):
     with pytest.raises(UsageError, match="ego is 2, there are 2 agents"):
-        Scenario.from_arrays("a", agents, roads, ego=2)
+        scenario_from_arrays("a", agents, roads, ego=2)
     with pytest.raises(UsageError, match="route names lane 7"):
-        Scenario.from_arrays("a", agents, roads, route=[7])
+        scenario_from_arrays("a", agents, roads, route=[7])
     with pytest.raises(UsageError, match=r'lights\[0\]\["states"\] has 3 entries, not 91'):
-        Scenario.from_arrays("a", agents, roads, [{"lane": 0, "states": ["red"] * 3}])
+        scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["red"] * 3}])
     with pytest.raises(UsageError, match=r"lights\[0\].*'blue'"):
-        Scenario.from_arrays("a", agents, roads, [{"lane": 0, "states": ["blue"] * 91}])
+        scenario_from_arrays("a", agents, roads, [{"lane": 0, "states": ["blue"] * 91}])
     with pytest.raises(UsageError, match=r"dt_s is 0.5.*resample\(agents, 0.5\)"):
-        Scenario.from_arrays("a", agents, roads, dt_s=0.5)
+        scenario_from_arrays("a", agents, roads, dt_s=0.5)
     with pytest.raises(DataError, match="ego is not valid at the current step"):
-        Scenario.from_arrays("a", agents, roads, ego=1)
+        scenario_from_arrays("a", agents, roads, ego=1)
 
 
 # --- Time bases and velocities.
@@ -213,7 +214,7 @@ def test_16_faster_data_keep_every_other_step():
 
 
 def test_velocities_are_differences_within_what_was_seen():
-    """By hand: one-sided at the ends, central inside, zero beside no neighbour and over gaps."""
+    """By hand: one-sided at the ends, central inside, zero without a neighbour and over gaps."""
     xy = np.zeros((1, 7, 2))
     xy[0, :, 0] = [0, 1, 4, 9, 50, 60, 80]
     valid = np.array([[True, True, True, False, True, False, False]])

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 
 
 def entry(number, dataset="one", **tags):
@@ -48,15 +48,15 @@ class Set:
     ],
 )
 def test_rows(options, rows):
-    assert chosen(Set(), **options) == rows
+    assert select_scenarios(Set(), **options) == rows
 
 
 def test_a_file_of_names_among_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "some.txt").write_text("log-2\r\n\n two\tlog-1\n")
     (tmp_path / "log-3").write_text("log-0\n")  # what is an id in the set is one
-    assert chosen(Set(), names=["some.txt", "log-3"]) == [2, 3, 4]
-    assert chosen(Set(), names=[Path("log-3")]) == [0]
+    assert select_scenarios(Set(), names=["some.txt", "log-3"]) == [2, 3, 4]
+    assert select_scenarios(Set(), names=[Path("log-3")]) == [0]
 
 
 @pytest.mark.parametrize(
@@ -79,5 +79,5 @@ def test_what_cannot_be_meant_gets_one_line(options, error, words, tmp_path, mon
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ids.txt").write_text("log-1\nlog-7\n")
     with pytest.raises(error) as raised:
-        chosen(Set(), **options)
+        select_scenarios(Set(), **options)
     assert words in str(raised.value)

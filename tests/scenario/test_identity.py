@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank, identities
 from drivax.scenario.build.assemble import assemble
 from scenes import SMALL, car, straight_road
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.scenario.bank.exhaustive import without_grid
 from drivax.scenario.bank.queries import (
     EDGE_CUTOFF_M,
     LANE_CUTOFF_M,
@@ -21,6 +20,7 @@ from drivax.scenario.bank.queries import (
 )
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.studies.bench import without_grid
 from drivax.synthetic.world import generate_recording
 from scenes import bank_of, car, line, straight_road
 

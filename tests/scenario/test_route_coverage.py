@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from drivax.scenario.build.assemble import assemble
-from drivax.scenario.build.route_coverage import candidate_coverage, coverage, lane_coverage
+from experiment_scripts import load_script
 
 from .recordings import driving, make_recording, make_tracks
+
+routes = load_script("data.routes")
 
 
 def test_coverage_is_the_share_of_steps_within_reach():
@@ -18,15 +20,15 @@ def test_coverage_is_the_share_of_steps_within_reach():
     scenario = replace(scenario, record=scenario.record.copy())
     scenario.record["route_xy"][0, :, 1] = 0.0
     scenario.record["route_xy"][2:] += 50.0
-    assert coverage(scenario)[0] == pytest.approx(71 / 91)
-    assert coverage(scenario, reach_m=1.7)[0] == 1.0
-    assert coverage(scenario)[-1] == 0.0  # an empty row
-    assert coverage(scenario)[1] == 1.0
-    assert candidate_coverage(scenario) == pytest.approx(71 / 91)  # the log's own route does not count
+    assert routes.coverage(scenario)[0] == pytest.approx(71 / 91)
+    assert routes.coverage(scenario, reach_m=1.7)[0] == 1.0
+    assert routes.coverage(scenario)[-1] == 0.0  # an empty row
+    assert routes.coverage(scenario)[1] == 1.0
+    assert routes.candidate_coverage(scenario) == pytest.approx(71 / 91)  # the log's own route does not count
 
 
 def test_a_route_that_is_the_log_is_no_candidate():
-    assert candidate_coverage(assemble(make_recording(()))) == 0.0
+    assert routes.candidate_coverage(assemble(make_recording(()))) == 0.0
 
 
 def test_lanes_cover_what_drives_near_them_the_same_way():
@@ -35,8 +37,8 @@ def test_lanes_cover_what_drives_near_them_the_same_way():
     beside[50:60, 1] = 1.75  # between the lanes
     beside[60:70, 1] = 3.0
     along = make_recording(tracks=make_tracks([beside], heading=np.zeros((1, 91))))
-    assert lane_coverage(assemble(along)) == pytest.approx(81 / 91)
-    assert lane_coverage(assemble(along), reach_m=1.8) == 1.0
+    assert routes.lane_coverage(assemble(along)) == pytest.approx(81 / 91)
+    assert routes.lane_coverage(assemble(along), reach_m=1.8) == 1.0
     back = make_recording(tracks=make_tracks([driving()], heading=np.full((1, 91), np.pi)))
-    assert lane_coverage(assemble(back)) == 0.0
-    assert lane_coverage(assemble(make_recording(()))) == 0.0
+    assert routes.lane_coverage(assemble(back)) == 0.0
+    assert routes.lane_coverage(assemble(make_recording(()))) == 0.0

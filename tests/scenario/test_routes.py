@@ -5,15 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import project
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.assemble import ego_log
-from drivax.scenario.build.lane_paths import trace
-from drivax.scenario.build.lane_search import LaneSearch
+from drivax.scenario.build.lane_paths import LaneSearch, trace
 from drivax.scenario.build.lanes import LaneSegments, lane_graph
-from drivax.scenario.build.route_published import LEAST_M, published_ways, score
-from drivax.scenario.build.route_start import join
-from drivax.scenario.build.routes import Intent, Route, RouteStyle, find_routes, log_progress
+from drivax.scenario.build.routes import (
+    LEAST_M,
+    Intent,
+    Route,
+    RouteStyle,
+    find_routes,
+    join,
+    log_progress,
+    published_paths,
+    score,
+)
 from drivax.scenario.build.segments import cut, road_lines
 from drivax.scenario.build.tracks import local_tracks
 from drivax.scenario.schema import RoadKind
@@ -349,27 +356,27 @@ def brute_force(search: LaneSearch) -> dict[tuple[int, ...], float]:
     """
     complete, ended = [], []
 
-    def grow(way, number):
-        if search.reach(way) >= LEAST_M:
-            complete.append((len(number), number, way))
+    def grow(lane_path, number):
+        if search.reach(lane_path) >= LEAST_M:
+            complete.append((len(number), number, lane_path))
             return
-        children = search.following(way)
-        if not any(child.changes == way.changes for child in children):
-            ended.append((len(number), number, way))
+        children = search.following(lane_path)
+        if not any(child.changes == lane_path.changes for child in children):
+            ended.append((len(number), number, lane_path))
         for i, child in enumerate(children):
             grow(child, (*number, i))
 
-    for i, way in enumerate(way for way in search.ways if way.lateral <= 2.5):
-        grow(way, (i,))
+    for i, lane_path in enumerate(lane_path for lane_path in search.starts if lane_path.lateral <= 2.5):
+        grow(lane_path, (i,))
     pool = [*sorted(complete, key=lambda item: item[:2]), *sorted(ended, key=lambda item: item[:2])][:10]
-    return {way.lanes: hand_score(search, way) for _, _, way in pool}
+    return {lane_path.lanes: hand_score(search, lane_path) for _, _, lane_path in pool}
 
 
-def hand_score(search: LaneSearch, way) -> float:
+def hand_score(search: LaneSearch, lane_path) -> float:
     graph = search.graph
     turns = length = total = 0.0
     changes = 0
-    for a, b in zip(way.lanes, (*way.lanes[1:], None), strict=True):
+    for a, b in zip(lane_path.lanes, (*lane_path.lanes[1:], None), strict=True):
         part = slice(graph.lines.start[a], graph.lines.start[a + 1])
         points = graph.lines.points[part, :2]
         steps = np.diff(points, axis=0)
@@ -380,12 +387,12 @@ def hand_score(search: LaneSearch, way) -> float:
             length += np.hypot(*steps.T).sum()
         else:
             changes += 1
-    length -= way.s
+    length -= lane_path.s
     return -0.3 * changes - 0.2 * turns + 0.1 * length - 0.1 * total / length
 
 
 def network(seed: int, layers: int, width: int):
-    """Layers of lanes, linked at random; some turn; straight neighbours run beside each other."""
+    """Layers of lanes, linked at random; some turn; straight neighbours run parallel."""
     rng = np.random.default_rng(seed)
     features, x = [], -30.0
     for layer in range(layers):
@@ -412,12 +419,12 @@ def network(seed: int, layers: int, width: int):
 @settings(max_examples=40)
 def test_published_ways_are_those_of_brute_force_enumeration(seed, layers, width):
     search = search_of(network(seed, layers, width), need=LEAST_M)
-    ways = published_ways(search)
+    lane_paths = published_paths(search)
     expected = brute_force(search)
-    assert {way.lanes for way in ways} == set(expected)
-    assert len(ways) == len(expected)
-    scores = [score(search, way) for way in ways]
-    assert scores == pytest.approx([expected[way.lanes] for way in ways])
+    assert {lane_path.lanes for lane_path in lane_paths} == set(expected)
+    assert len(lane_paths) == len(expected)
+    scores = [score(search, lane_path) for lane_path in lane_paths]
+    assert scores == pytest.approx([expected[lane_path.lanes] for lane_path in lane_paths])
     assert scores == sorted(scores, reverse=True)  # best first
 
 
@@ -440,16 +447,16 @@ def test_the_published_score_by_hand_best_first():
         lane(4, line((110, 10), (110, 400))),
     )
     search = search_of(features, need=LEAST_M)
-    straight, turning = sorted(published_ways(search), key=lambda way: len(way.lanes))
+    straight, turning = sorted(published_paths(search), key=lambda lane_path: len(lane_path.lanes))
     assert score(search, straight) == pytest.approx(0.1 * 300)
     length = 100 + 20 + 390
     assert score(search, turning) == pytest.approx(-0.2 + 0.1 * length - 0.1 * (np.pi / 2) / length)
-    assert published_ways(search)[0] == turning
+    assert published_paths(search)[0] == turning
     changed = search_of(two_pairs(), need=LEAST_M)
-    assert [round(score(changed, way), 6) for way in published_ways(changed)] == [40.0, 39.7]
+    assert [round(score(changed, lane_path), 6) for lane_path in published_paths(changed)] == [40.0, 39.7]
 
 
-def test_published_routes_begin_beside_the_first_pose_and_lead_to_the_goal():
+def test_published_routes_begin_at_the_first_pose_and_lead_to_the_goal():
     found, _, _ = routes_of(two_pairs(), driving(speed=10.0, y=0.4), style="published")
     assert found.on_lanes
     assert found.routes[0].xyz[0] == pytest.approx([-10.0, 0.0, 0.0])
@@ -470,4 +477,4 @@ def test_the_published_search_ends_on_dense_graphs():
         points = line((5.0 * column - 2, 1.0 * row), (5.0 * column + 3, 1.0 * row))
         onward = tuple(100 * (column + 1) + other for other in range(rows))
         features.append(lane(100 * column + row, points, successors=onward))
-    assert published_ways(search_of(tuple(features), need=LEAST_M)) == []
+    assert published_paths(search_of(tuple(features), need=LEAST_M)) == []

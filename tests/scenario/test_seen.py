@@ -1,4 +1,4 @@
-"""What ego's sensors would see: stored beside the truth, cut and restored with it."""
+"""What ego's sensors would see: stored next to the truth, cut and restored with it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import pytest
 
 from drivax.datasets.export.restore import restore
 from drivax.errors import DataError
-from drivax.scenario.build.assemble import assemble, windows, with_ego
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows, with_ego
 from scenario.recordings import driving, make_recording, make_tracks, straight_road
 
 
 @pytest.fixture
 def recording():
-    """Ego, a car beside it, and a parked one that appears at step 5."""
+    """Ego, a car next to it, and a parked one that appears at step 5."""
     valid = np.ones((3, 91), bool)
     valid[2, :5] = False
     parked = np.tile([30.0, 3.5], (91, 1))

@@ -5,9 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivax.geometry.polylines import point_to_segment
-from drivax.scenario.build.grid import Grid
+from drivax.scenario.build.grid import CUTOFF_M, DRIVABLE, SPLIT, Grid, cell_sides, packed
 from drivax.scenario.build.segments import cut, road_lines
-from drivax.scenario.build.sides import CUTOFF_M, DRIVABLE, SPLIT, cell_sides, packed
 from drivax.scenario.schema import CAPACITIES
 
 from .recordings import edge, line

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivax.errors import DataError, UsageError
-from drivax.files import begun
+from drivax.files import can_resume
 from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Flag, Scenario, SourceCounts, record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
@@ -150,12 +150,12 @@ def test_sets_are_reproducible_and_their_hash_follows_the_data(tmp_path: Path, s
     assert write("other", [1, 0, 2, 3, 4, 5, 6]).hash != same.hash
 
 
-def test_records_are_batches_in_the_order_asked_for(scenario_set: Path):
+def test_records_are_batches_in_the_order_of_the_indices(scenario_set: Path):
     opened = ScenarioSet.open(scenario_set)
-    wanted = [6, 0, 4, 4, -1, 2]
-    records = opened.records(wanted)
+    indices = [6, 0, 4, 4, -1, 2]
+    records = opened.records(indices)
     assert records.dtype == record_dtype(SMALL)
-    for record, index in zip(records, wanted, strict=True):
+    for record, index in zip(records, indices, strict=True):
         np.testing.assert_array_equal(record["agent_xy"], make_scenario(index % 7).record["agent_xy"])
         assert bytes(record["scenario_id"]).decode() == f"scenario-{index % 7}"
     assert opened.records([]).shape == (0,)
@@ -332,7 +332,7 @@ def test_another_layout(scenario_set: Path):
 
 
 def test_no_set(tmp_path: Path, scenario_set: Path):
-    with pytest.raises(DataError, match=r"nowhere: does not exist; name the folder"):
+    with pytest.raises(DataError, match=r"nowhere: folder not found; name the folder"):
         ScenarioSet.open(tmp_path / "nowhere")
     with pytest.raises(DataError, match="is not a scenario set"):
         ScenarioSet.open(scenario_set / "manifest.json")
@@ -441,15 +441,15 @@ def test_nothing_is_kept_without_a_closed_shard(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_was_begun_for_something_else_is_not_continued(tmp_path: Path):
+def test_unfinished_sets_of_another_identity_are_not_continued(tmp_path: Path):
     with pytest.raises(RuntimeError):
         continued(tmp_path / "set", stop=3)
     with pytest.raises(UsageError, match=r"other options \(limit\); .*--overwrite"):
         continued(tmp_path / "set", identity={**IDENTITY, "limit": 8})
-    assert begun(tmp_path / "set")
+    assert can_resume(tmp_path / "set")
     with pytest.raises(RuntimeError):
         continued(tmp_path / "set", stop=1, identity={**IDENTITY, "limit": 8}, overwrite=True)
-    assert not begun(tmp_path / "set")
+    assert not can_resume(tmp_path / "set")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,8 +12,8 @@ from drivax.geometry.boxes import corners, gap, overlap, time_to_overlap
 from drivax.simulator.contact import (
     CollisionType,
     Contact,
+    classify_contacts,
     first_contacts,
-    judge_contacts,
     nearest_gap,
     next_contacts,
     time_to_collision,
@@ -164,7 +164,7 @@ def test_ignored_agents_do_not_count_for_ttc():
 def test_fault_by_the_order_of_nuplan(other, ego_speed, other_speed, unlawful, fault, kind):
     world = frame([box(0, 0), other], [[ego_speed, 0], [other_speed, 0]])
     speeds = jnp.array([ego_speed, other_speed])
-    found, found_kind = judge_contacts(
+    found, found_kind = classify_contacts(
         world, jnp.array(0), jnp.array([False, True]), jnp.array(ego_speed), speeds, jnp.array(unlawful)
     )
     assert (bool(found[1]), CollisionType(int(found_kind))) == (fault, kind)
@@ -173,7 +173,7 @@ def test_fault_by_the_order_of_nuplan(other, ego_speed, other_speed, unlawful, f
 
 def test_a_pedestrian_who_walks_into_a_stopped_car_is_not_its_fault():
     world = frame([box(0, 0), box(2.5, 0, 0, 0.6, 0.6)], [[0, 0], [-1.5, 0]], [1, 2])
-    found, kind = judge_contacts(
+    found, kind = classify_contacts(
         world, jnp.array(0), jnp.array([False, True]), jnp.array(0.0), jnp.array([0.0, 1.5]), jnp.array(False)
     )
     assert not bool(found.any())

@@ -77,7 +77,7 @@ def test_another_slot_has_no_route_and_is_paid_for_none():
     def one(bank):
         state = simulator.reset(bank, 0, 10, 1)
         _, transition = simulator.step(bank, state, jnp.zeros(2))
-        return simulator.observe(bank, state.scene)["route_mask"], transition.reward
+        return simulator.observe(bank, state.context)["route_mask"], transition.reward
 
     mask, reward = one(bank)
     assert not np.asarray(mask).any() and float(reward) == 0.0

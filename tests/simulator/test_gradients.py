@@ -9,7 +9,7 @@ import pytest
 
 from drivax.evaluation.rollout import judging
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import DELTA_LOCAL, DIRECT_STATE, PHYSICAL, PUBLISHED, Physical
@@ -94,7 +94,7 @@ def together():
 
         def one(states, both):
             states, _ = simulator.step_together(bank, states, both)
-            return states, states.scene.history[:, -1]
+            return states, states.context.history[:, -1]
 
         return jax.lax.scan(one, pair, actions)[1]
 
@@ -131,12 +131,12 @@ def test_reactive_traffic_differentiates_with_respect_to_ego():
     """A car follows ego by IDM: where it is depends on what ego did before, by the finite difference."""
     simulator = Simulator(Task(metrics="none", ends=()), IdmTraffic())
     road = straight_road([car(0, 0, 0, 8), car(-14, 0, 0, 9), car(0, 3.7, 0, 0)])
-    bank = prepared(simulator.traffic, bank_of(road))
+    bank = prepare_bank(simulator.traffic, bank_of(road))
 
     def followers(bank, actions):
         def one(state, action):
             state, _ = simulator.step(bank, state, action)
-            return state, simulator.frame(bank, state.scene, alone(state.scene), 0).box[1, :2]
+            return state, simulator.frame(bank, state.context, alone(state.context), 0).box[1, :2]
 
         return jax.lax.scan(one, simulator.reset(bank, 0), actions)[1]
 
@@ -166,8 +166,8 @@ def test_rewards_facts_and_observations_have_finite_gradients(speed):
     def slope(actions):
         def one(state, action):
             state, transition = simulator.step(bank, state, action)
-            seen = simulator.observe(bank, state.scene)
-            leaves = jax.tree.leaves((state.facts, transition.reward, seen, state.scene.history))
+            seen = simulator.observe(bank, state.context)
+            leaves = jax.tree.leaves((state.facts, transition.reward, seen, state.context.history))
             return state, sum(leaf.sum() for leaf in leaves if leaf.dtype == jnp.float32)
 
         return jax.lax.scan(one, simulator.reset(bank, 0), actions)[1].sum()

@@ -94,8 +94,8 @@ def test_height_follows_the_map_and_not_the_log():
         def one(state, _):
             state, _ = SIMULATOR.step(bank, state, jnp.zeros(2))
             return state, (
-                state.scene.history[-1, 0],
-                state.scene.z,
+                state.context.history[-1, 0],
+                state.context.z,
                 state.facts.collision,
                 state.facts.offroad,
             )

@@ -193,7 +193,7 @@ def replayed(bank):
 
     def one(bank, row):
         def step(state, _):
-            now = logged_motion(bank, state.scene, 1)
+            now = logged_motion(bank, state.context, 1)
             after, done = SIMULATOR.replay(bank, state, now, jnp.zeros(2))
             return after, (after.facts, done.reward_terms)
 
@@ -208,7 +208,7 @@ def scored(bank, row):
 
     def one(at):
         state = SIMULATOR.reset(bank, row, at)
-        now = logged_motion(bank, state.scene, 1)
+        now = logged_motion(bank, state.context, 1)
         return SIMULATOR.replay(bank, state, now, jnp.zeros(2))[1].reward_terms
 
     return jax.lax.map(one, jnp.arange(10, 90))

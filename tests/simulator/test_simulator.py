@@ -69,8 +69,8 @@ def test_a_state_is_small(simulator, world):
     state = jax.eval_shape(lambda b: simulator.reset(b, 0), world)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
     facts = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.facts))
-    scene = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.scene))
-    assert size <= 4096 and facts <= 256 and scene <= 300
+    context = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state.context))
+    assert size <= 4096 and facts <= 256 and context <= 300
 
 
 def test_collision_with_a_stopped_car(simulator):
@@ -182,7 +182,7 @@ def test_step_or_begin_is_step_or_reset(single, world):
     action = jnp.array([0.2, 0.05])
     plain, _ = step(world, state, action)
     same, _ = either(world, state, action, jnp.asarray(False), another)
-    seen = simulator.now(world, state.scene)
+    seen = simulator.now(world, state.context)
     at_hand, _ = either(world, state, action, jnp.asarray(False), another, seen)
     fresh, transition = either(world, plain, action, jnp.asarray(True), another)
     for a, b in ((plain, same), (plain, at_hand), (reset(world, rows[3]), fresh)):

@@ -18,7 +18,7 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.dynamics import GRIP_MPS2, command_between
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
-from drivax.simulator.traffic.override import OverrideTraffic, with_given
+from drivax.simulator.traffic.override import OverrideTraffic, with_override
 from drivax.tasks.task import Task
 from scenes import LANE_M, SMALL, bank_of, car, straight_road
 
@@ -28,7 +28,7 @@ NOISY = Simulator(Task(), start=NoisyStart())
 @jax.jit
 def noisy(bank, step, keys):
     """Starts of one scenario, one per key."""
-    return jax.vmap(lambda key: NOISY.scene(bank, 0, step, 0, key))(keys)
+    return jax.vmap(lambda key: NOISY.context(bank, 0, step, 0, key))(keys)
 
 
 @jax.jit
@@ -102,8 +102,8 @@ def test_where_every_draw_fails_the_episode_begins_as_logged():
     beside = [car(x, 2.1, 0, 6) for x in (-6, 0, 6)]
     bank = bank_of(straight_road([car(0, 0, 0, 6), car(5.3, 0, 0, 6), *beside]))
     strong = Simulator(Task(), start=NoisyStart(strong=1.0))
-    logged = Simulator(Task()).scene(bank, 0, 10)
-    drawn = jax.jit(jax.vmap(lambda key: strong.scene(bank, 0, 10, 0, key)))(keys(16))
+    logged = Simulator(Task()).context(bank, 0, 10)
+    drawn = jax.jit(jax.vmap(lambda key: strong.context(bank, 0, 10, 0, key)))(keys(16))
     np.testing.assert_array_equal(drawn.history, np.broadcast_to(logged.history, drawn.history.shape))
     np.testing.assert_array_equal(drawn.route_m, np.full(16, logged.route_m))
 
@@ -113,7 +113,7 @@ def test_a_start_is_free_of_those_who_are_told_where_to_be():
     # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
     bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
     told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
-    given = with_given(bank, jnp.asarray([[1]]), told)
+    given = with_override(bank, jnp.asarray([[1]]), told)
     simulator = Simulator(Task(metrics=("collision",)), OverrideTraffic(), NoisyStart(tries=16))
     state = jax.jit(jax.vmap(lambda key: simulator.reset(given, 0, 10, 0, key)))(keys(256))
     # Who overlaps at the start is ignored.
@@ -125,7 +125,7 @@ def test_a_start_is_free_of_those_who_are_told_where_to_be():
 
 
 def test_fewer_steps_where_the_log_does_not_reach_back(open_road):
-    first = Simulator(Task()).scene(open_road, 0, 0)
+    first = Simulator(Task()).context(open_road, 0, 0)
     for step, driven in ((0, 0), (3, 3)):
         history = np.asarray(noisy(open_road, step, keys(64)).history)
         old = np.asarray(first.history)[driven:]
@@ -163,7 +163,7 @@ def test_an_episode_begins_at_any_step_as_logged():
     logged = jnp.stack(
         [row[:, 0], row[:, 1], jnp.arctan2(row[:, AgentColumn.SIN], row[:, AgentColumn.COS])], -1
     )
-    np.testing.assert_allclose(states.scene.history[:, -1, :3], logged, atol=1e-6)
+    np.testing.assert_allclose(states.context.history[:, -1, :3], logged, atol=1e-6)
     np.testing.assert_allclose(states.facts.log_divergence_m, 0.0, atol=1e-6)
     np.testing.assert_allclose(np.diff(states.facts.progress_m), 0.6, atol=1e-2)
     assert (np.asarray(states.start) == np.arange(90)).all()
@@ -184,10 +184,10 @@ def test_evaluation_begins_where_the_noise_leads_and_counts_from_there():
         for seed in (3, 4)
     )
     for found in (same, other):
-        motion = found.motion[0]
+        motion = found.trajectories.ego[0]
         assert len(motion) == 81 and motion[0, 3] > 2.0
         assert found.metrics["distance"][0] == pytest.approx(8.0 * motion[0, 3], rel=1e-3)
         assert 0.0 <= found.metrics["progress_ratio"][0] <= 1.0
-    assert same.motion[0, 0, 3] != other.motion[0, 0, 3]
-    with pytest.raises(UsageError, match="cannot begin elsewhere"):
+    assert same.trajectories.ego[0, 0, 3] != other.trajectories.ego[0, 0, 3]
+    with pytest.raises(UsageError, match="cannot start elsewhere"):
         evaluate(Expert(), data, start=NoisyStart())

@@ -10,6 +10,8 @@ import pytest
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.together import is_driven, slots_of
+from drivax.simulator.traffic.agent_paths import AgentPaths
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -47,7 +49,7 @@ def single(simulator, bank, actions):
         return after, (after, done)
 
     last, out = jax.lax.scan(one, simulator.reset(bank, 0), actions)
-    return out, simulator.observe(bank, last.scene)
+    return out, simulator.observe(bank, last.context)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +76,7 @@ def test_slots_are_those_of_the_mask_that_are_there(bank):
 def test_driven_agents_see_and_hit_each_other(bank, braking):
     slots, leader, ((states, _), seen) = braking
     assert slots.tolist() == [0, leader, 16]
-    x = np.asarray(states.scene.history)[:, :, -1, 0]
+    x = np.asarray(states.context.history)[:, :, -1, 0]
     # 10 m/s braked with 6 m/s2 stands after 8.33 m; ego drives on.
     assert x[-1, 1] - 40.0 == pytest.approx(25 / 3, abs=0.01)
     assert x[-1, 0] == pytest.approx(30.0, abs=1e-3)
@@ -105,14 +107,14 @@ def check_finite(states, done):
 def test_reactive_traffic_sees_every_driven_agent(bank, braking):
     slots, _, ((states, _), _) = braking
     behind = int(np.argmin(np.asarray(bank.agents[0, 10, :4, 0])))
-    row = int(np.flatnonzero(np.asarray(bank.paths.slot[0]) == behind)[0])
-    free = np.asarray(states.scene.traffic.speed)[:, :, -1, row]
+    row = int(np.flatnonzero(np.asarray(data_of(bank, AgentPaths).slot[0]) == behind)[0])
+    free = np.asarray(states.context.traffic.speed)[:, :, -1, row]
     # All states of the stack hold the same traffic.
     np.testing.assert_array_equal(free[:, 0], free[:, 1])
     # The last car follows ego: when ego brakes it does, too.
     brakes = jnp.zeros((30, 3, 2)).at[:, 0, 0].set(-0.7)
     (slowed, _), _ = together(REACTIVE, bank, slots, brakes)
-    assert np.asarray(slowed.scene.traffic.speed)[-1, 0, -1, row] < free[-1, 0] - 0.5
+    assert np.asarray(slowed.context.traffic.speed)[-1, 0, -1, row] < free[-1, 0] - 0.5
 
 
 @pytest.mark.slow
@@ -122,7 +124,7 @@ def test_a_stack_of_one_is_a_single_agent(bank):
     (states, done), seen = together(MEASURED, bank, slots, actions)
     check_finite(states, done)
     (wanted, wanted_done), observation = single(MEASURED, bank, actions[:, 0])
-    pairs = (states.scene.history[:, 0], wanted.scene.history), (done.reward[:, 0], wanted_done.reward)
+    pairs = (states.context.history[:, 0], wanted.context.history), (done.reward[:, 0], wanted_done.reward)
     for got, expected in (*pairs, *((seen[name][0], observation[name]) for name in observation)):
         np.testing.assert_allclose(np.asarray(got, np.float32), np.asarray(expected, np.float32), atol=1e-5)
 

@@ -1,6 +1,5 @@
 """The long-tail study: verdicts on results that are known, and the whole study on a few scenarios."""
 
-import importlib
 import json
 from dataclasses import asdict, replace
 from typing import get_args
@@ -10,10 +9,10 @@ import pytest
 
 from drivax import settings
 from drivax.cli import main
-from drivax.curation.arms import AGENTS, CURATED, weighted
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.arms import ARMS, CURATED, weighted
+from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import WeightConfig, draws_of
+from drivax.curation.weights import WeightConfig, draw_statistics
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
@@ -25,8 +24,8 @@ from drivax.studies.longtail_plan import LongtailConfig, Sets
 from drivax.studies.longtail_rankings import rankings
 from drivax.studies.longtail_results import (
     METRICS,
+    ClaimGroup,
     Condition,
-    Group,
     claims,
     cost_of_rule,
     detectable,
@@ -34,6 +33,7 @@ from drivax.studies.longtail_results import (
     needed,
     rates,
 )
+from experiment_scripts import load_script
 from scenes import SMALL, car, straight_road
 
 SEEDS, SCENARIOS = 5, 400
@@ -70,7 +70,7 @@ def verdicts(rates_of, seed=0, rare_rates=None, share=None):
     return {one.claim.words: one for one in found}
 
 
-EVEN = dict.fromkeys(AGENTS, 0.16)
+EVEN = dict.fromkeys(ARMS, 0.16)
 SIZE = "ensemble has 34% of the baseline's collisions or fewer"
 
 
@@ -105,7 +105,7 @@ def test_a_claimed_size_is_tested_against_that_size(rate, verdict):
 
 def test_rare_scenarios_count_as_in_ordinary_traffic():
     """Half of the test is rare: worse where it is common and better where it is rare is worse on the road."""
-    common, rare = dict.fromkeys(AGENTS, 0.02), dict.fromkeys(AGENTS, 0.40)
+    common, rare = dict.fromkeys(ARMS, 0.02), dict.fromkeys(ARMS, 0.40)
     worse = common | {"ensemble": 0.10}, rare | {"ensemble": 0.18}
     words = "ensemble collides less than the baseline"
     assert verdicts(worse[0], 0, worse[1])[words].verdict == "supported"
@@ -128,7 +128,7 @@ def test_p_values_are_adjusted_within_their_group():
     for group in {one.claim.group for one in found}:
         ps = [one.found.p for one in found if one.claim.group == group]
         assert [one.adjusted for one in found if one.claim.group == group] == holm(ps)
-    claimed = [(c.one, c.other, c.metric, c.rows, c.change) for c in claims(list(AGENTS))]
+    claimed = [(c.one, c.other, c.metric, c.rows, c.change) for c in claims(list(ARMS))]
     assert len(claimed) == len(set(claimed)) == 54
 
 
@@ -178,12 +178,12 @@ def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_s
         found[method] = ScoreTable(method, {}, "x", ids, np.ones(shape, bool), steps, steps.max(axis=1))
     usable = np.zeros(shape, bool)
     usable[:, 10:89] = rng.random((shape[0], 79)) < 0.95
-    pairs = {(c.one, c.other) for c in claims(list(AGENTS)) if AGENTS[c.other].by_lot}
+    pairs = {(c.one, c.other) for c in claims(list(ARMS)) if ARMS[c.other].permuted}
     assert {one for one, _ in pairs} == {*CURATED, "oracle"}
     for pair in pairs:
         own, lot = (
-            draws_of(
-                weighted(AGENTS[name], data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
+            draw_statistics(
+                weighted(ARMS[name], data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
                 usable,
             )
             for name in pair
@@ -191,19 +191,17 @@ def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_s
         assert lot.effective == pytest.approx(own.effective, rel=0.02), pair
         assert lot.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
     for name, share in (("oracle", 0.115), ("oracle_strong", 0.3)):
-        weights = weighted(AGENTS[name], data, found.__getitem__, WeightConfig(), usable).weights
+        weights = weighted(ARMS[name], data, found.__getitem__, WeightConfig(), usable).weights
         during = weights[found["oracle"].steps > 0].sum() / weights.sum()
         # And those that uniform draws find.
         assert during == pytest.approx(share + (1 - share) * (found["oracle"].steps > 0)[usable].mean())
-    assert len(CURATED) == 6 and {AGENTS[name].scale for name in CURATED} == {"step", "scenario"}
+    assert len(CURATED) == 6 and {ARMS[name].scale for name in CURATED} == {"step", "scenario"}
 
 
 def test_scores_of_another_method_are_refused(data):
-    table = curate("uniform", Wanted(data))
-    with pytest.raises(
-        UsageError, match="scores of 'uniform' for an agent that is curated by 'action_rarity'"
-    ):
-        weighted(AGENTS["action_rarity"], data, lambda _: table, WeightConfig())
+    table = curate("uniform", Request(data))
+    with pytest.raises(UsageError, match="scores of 'uniform' for an arm that is curated by 'action_rarity'"):
+        weighted(ARMS["action_rarity"], data, lambda _: table, WeightConfig())
 
 
 def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():
@@ -227,7 +225,7 @@ def test_seeds_do_not_make_up_for_each_other():
 
 
 def test_rankings_and_rates(data):
-    kinematic, labels = curate("kinematic", Wanted(data)), [f"r{row}" for row in range(len(data))]
+    kinematic, labels = curate("kinematic", Request(data)), [f"r{row}" for row in range(len(data))]
     (same,) = rankings({"kinematic": kinematic, "published": kinematic, "uniform": kinematic}, labels)
     assert (same["one"], same["other"], same["orthogonal"]) == ("kinematic", "published", "contradicted")
     np.testing.assert_allclose([same["rho"], *same["interval"], same["overlap"]], 1.0)
@@ -285,7 +283,7 @@ def here(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
+def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     out = tmp_path / "study"
     sets = ["--data", str(data.path), "--validation", str(data.path), "--test", str(data.path)]
     arguments = ["study", "longtail", *sets, "--out", str(out), *TINY]
@@ -309,8 +307,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     again = capsys.readouterr().err
     assert "trained" not in again and "driving" not in again
     # And so where only what was kept of it is.
-    monkeypatch.syspath_prepend(repository / "benchmarks")
-    script = importlib.import_module("longtail")
+    script = load_script("longtail")
     monkeypatch.setattr(script, "KEPT", tmp_path / "kept")
     script.keep(out)
     script.restore(tmp_path / "restored")
@@ -330,7 +327,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, repository, monkeypatch):
     again = json.loads((tmp_path / "restored" / "results.json").read_text())
     assert again == results
     arguments[arguments.index(str(tmp_path / "restored"))] = str(out)
-    blocks = [f"claims {group}" for group in get_args(Group)]
+    blocks = [f"claims {group}" for group in get_args(ClaimGroup)]
     blocks += ["conditions", "detectable", "draws", "rankings", "mean q", "mean q curve"]
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
     page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)

@@ -59,7 +59,7 @@ def bend(cars, **more):
 
 @pytest.fixture(scope="module")
 def seen():
-    """What is seen of one scene under every configuration of this file, in one program, at three places."""
+    """What is seen of one context under every configuration of this file, in one program, at three places."""
     cars = [car(0, 0, 0, 9), car(20, 0.5, np.pi / 2, 6, 5.0, 2.0), car(-12, 3.7, 0, 3)]
     bank = bank_of(bend(cars))
     configs = {"everything": EVERYTHING, "few": FEW, "cut": CUT, "uncut": UNCUT}
@@ -68,10 +68,12 @@ def seen():
         results = {}
         for name, config in configs.items():
             simulator = Simulator(Task(observation=config))
-            scene = simulator.scene(bank, 0, 10)
-            last = jnp.stack([x, y, heading, scene.history[-1, 3]])
-            scene = replace(scene, history=scene.history.at[-1].set(last), route_m=scene.route_m + route_m)
-            results[name] = simulator.observe(bank, scene)
+            context = simulator.context(bank, 0, 10)
+            last = jnp.stack([x, y, heading, context.history[-1, 3]])
+            context = replace(
+                context, history=context.history.at[-1].set(last), route_m=context.route_m + route_m
+            )
+            results[name] = simulator.observe(bank, context)
         return results
 
     # Where the log has ego; on the arc, 20 m behind its begin, 1 m left of the lane; and facing across the road.

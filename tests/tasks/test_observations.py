@@ -17,7 +17,7 @@ from scenes import RED, bank_of, car, moved, straight_road
 @partial(jax.jit, static_argnums=1)
 def _look(bank, config):
     simulator = Simulator(Task(observation=config))
-    return simulator.observe(bank, simulator.scene(bank, 0, 10))
+    return simulator.observe(bank, simulator.context(bank, 0, 10))
 
 
 def look(bank, preset="optimal"):
@@ -103,7 +103,7 @@ def test_groups_may_have_no_rows():
     bank = bank_of(straight_road([car(0, 0, 0, 9), car(20, 1, 0.3, 6)], light=RED))
     config = ObservationConfig(agents=0, steps=2, road=0, lights=0, route=0)
     simulator = Simulator(Task(observation=config))
-    seen = jax.jit(lambda b: simulator.observe(b, simulator.scene(b, 0, 10)))(bank)
+    seen = jax.jit(lambda b: simulator.observe(b, simulator.context(b, 0, 10)))(bank)
     shapes = {name: value.shape for name, value in seen.items()}
     assert shapes == {
         "ego": (2, 6), "ego_static": (4,), "agents": (0, 2, 12), "agents_mask": (0, 2), "lights": (0, 7),
@@ -118,8 +118,8 @@ def test_replayed_observation_equals_live_observation():
     step, observe = jax.jit(simulator.step), jax.jit(simulator.observe)
     for _ in range(5):
         state, transition = step(bank, state, jnp.array([0.1, 0.02]))
-        live = observe(bank, state.scene)
-        stored = jax.tree.map(np.asarray, transition.after.scene)
+        live = observe(bank, state.context)
+        stored = jax.tree.map(np.asarray, transition.after.context)
         again = observe(bank, jax.tree.map(jnp.asarray, stored))
         jax.tree.map(np.testing.assert_array_equal, dict(live), dict(again))
 

@@ -112,8 +112,8 @@ def seen(bank):
     }
 
     def look(bank, step):
-        scene = simulators["none"].scene(bank, 0, step)
-        return {name: one.observe(bank, scene) for name, one in simulators.items()} | {"scene": scene}
+        context = simulators["none"].context(bank, 0, step)
+        return {name: one.observe(bank, context) for name, one in simulators.items()} | {"context": context}
 
     return jax.device_get(jax.jit(jax.vmap(look, (None, 0)))(bank, jnp.arange(FIRST, 91)))
 
@@ -181,11 +181,11 @@ def test_past_steps_keep_their_perception(seen):
 
 def test_range_and_dropout_by_distance(bank, seen):
     """The share of steps at which something is seen is exp(-distance / 40 m); nothing is seen beyond the range."""
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["scene"])
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), seen["context"])
     distance = jnp.array([1.0, 15.0, 40.0, 90.0])
 
     def look(faults):
-        return jax.vmap(lambda step: lights_seen(faults, bank, replace(scene, step=step), distance))(
+        return jax.vmap(lambda step: lights_seen(faults, bank, replace(context, step=step), distance))(
             jnp.arange(4000)
         )
 
@@ -215,7 +215,7 @@ def test_unseen_lights_are_hidden_from_custom_groups():
     )
 
     def look(bank):
-        return [one.observe(bank, one.scene(bank, 0, FIRST)) for one in (near, far)]
+        return [one.observe(bank, one.context(bank, 0, FIRST)) for one in (near, far)]
 
     blind, sighted = jax.device_get(jax.jit(look)(bank))
     assert sighted["lights_mask"].any() and sighted["stop_line"][1:].tolist() == [1.0, 1.0]
@@ -226,10 +226,10 @@ def test_unseen_lights_are_hidden_from_custom_groups():
 
 @pytest.mark.slow
 def test_replayed_perception_equals_live_perception(bank, seen):
-    """A stored scene, observed alone and in another program, as it was seen in the batch."""
+    """A stored context, observed alone and in another program, as it was seen in the batch."""
     simulator = Simulator(Task(observation=replace(SMALL, perception=ALL)))
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["scene"])
-    for name, value in jax.jit(simulator.observe)(bank, scene).items():
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf[25]), seen["context"])
+    for name, value in jax.jit(simulator.observe)(bank, context).items():
         np.testing.assert_allclose(value, seen["all"][name][25], atol=1e-6, err_msg=name)
 
 
@@ -241,9 +241,9 @@ def test_disabled_features_cost_nothing(bank):
         simulator = Simulator(Task(observation=config))
 
         def look(bank):
-            scene = simulator.scene(bank, 0, 20)
+            context = simulator.context(bank, 0, 20)
             return observe(
-                config, bank, scene, lambda back: simulator.frame(bank, scene, _alone(scene), back)
+                config, bank, context, lambda back: simulator.frame(bank, context, _alone(context), back)
             )
 
         return str(jax.make_jaxpr(look)(bank))
@@ -254,5 +254,5 @@ def test_disabled_features_cost_nothing(bank):
         assert "random" in program(faults)
 
 
-def _alone(scene):
-    return jax.tree.map(lambda leaf: leaf[None], scene)
+def _alone(context):
+    return jax.tree.map(lambda leaf: leaf[None], context)

@@ -79,14 +79,14 @@ def test_bounds_of_the_action_spaces():
 def test_termination_and_truncation_are_separate(measured):
     facts, _ = measured
     bank = bank_of(straight_road([car(0, 0, 0, 9)]))
-    task, scene = Task(), Simulator(Task()).scene(bank, 0, 90)
-    ends = jax.tree.map(bool, task.ended(bank, scene, facts))
+    task, context = Task(), Simulator(Task()).context(bank, 0, 90)
+    ends = jax.tree.map(bool, task.ended(bank, context, facts))
     assert ends == (False, True)
     crash = replace(facts, collision=jnp.asarray(True))
-    assert jax.tree.map(bool, task.ended(bank, scene, crash)) == (True, False)
-    assert jax.tree.map(bool, replace(task, to_the_end=True).ended(bank, scene, crash)) == (False, True)
+    assert jax.tree.map(bool, task.ended(bank, context, crash)) == (True, False)
+    assert jax.tree.map(bool, replace(task, to_the_end=True).ended(bank, context, crash)) == (False, True)
     away = replace(facts, left_map=jnp.asarray(True))
-    assert jax.tree.map(bool, task.ended(bank, Simulator(task).scene(bank, 0, 20), away)) == (False, True)
+    assert jax.tree.map(bool, task.ended(bank, Simulator(task).context(bank, 0, 20), away)) == (False, True)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_lag_is_how_far_the_log_is_ahead(x, y, heading, lag):
     @jax.jit
     def displaced(bank, shift):
         state = simulator.reset(bank, 0)
-        motion = logged_motion(bank, state.scene, 1)
+        motion = logged_motion(bank, state.context, 1)
         return simulator.replay(bank, state, motion + shift, jnp.zeros(2))
 
     after, done = displaced(bank, jnp.asarray([x, y, heading, 0.0]))

@@ -90,7 +90,9 @@ def test_valid_metrics_pass(name):
 
 
 def metric(read, reads=frozenset(), **more):
-    return Metric("m", "low", "a wrong one", of=StepValue("wrong", "m", read, reads), operator="max", **more)
+    return Metric(
+        "m", "low", "a wrong one", step_value=StepValue("wrong", "m", read, reads), operator="max", **more
+    )
 
 
 def test_invalid_metrics_fail():
@@ -106,7 +108,7 @@ def test_invalid_metrics_fail():
     refused(
         check_metric, Metric("m", "low", "text", compute=lambda e, v, k: v.value), "does not compute a Value"
     )
-    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or text")
+    refused(check_metric, Metric("", "low", "text", compute=lambda e, v, k: v), "no unit or definition")
 
 
 @pytest.mark.slow
@@ -134,8 +136,8 @@ WRONG_FEATURES = {
 
 @pytest.mark.parametrize("words", some(WRONG_FEATURES, "the log's future changes"))
 def test_invalid_features_fail(words):
-    def feature(bank, scene, frames):
-        return WRONG_FEATURES[words](bank, scene, frames)
+    def feature(bank, context, frames):
+        return WRONG_FEATURES[words](bank, context, frames)
 
     refused(check_feature, feature, words)
 

@@ -29,7 +29,7 @@ class Wrong(Memoryless):
         return jnp.zeros(2)
 
     def act(self, carry, bank, state, situation, observation, key):
-        frame, scene = situation.surroundings.frame, state.scene
+        frame, context = situation.surroundings.frame, state.context
         carry = jnp.zeros(3) if self.fault == "form" else carry
         if self.fault == "python" and situation.facts.speed_mps > 3:
             return jnp.zeros(2), carry
@@ -40,8 +40,8 @@ class Wrong(Memoryless):
             "litter": jnp.stack([jnp.max(jnp.abs(frame.velocity)) / 1e3, 0.0]),
             "order": jnp.stack([frame.valid[5] * jnp.sum(frame.velocity[5] ** 2) / 1e3, 0.0]),
             "padding": jnp.stack([frame.valid.mean(dtype=jnp.float32), 0.0]),
-            "turn": jnp.stack([jnp.zeros(()), jnp.cos(scene.history[-1, 2])]),
-            "future": expert_action(bank, scene, PHYSICAL),
+            "turn": jnp.stack([jnp.zeros(()), jnp.cos(context.history[-1, 2])]),
+            "future": expert_action(bank, context, PHYSICAL),
         }
         return here.get(self.fault, jnp.zeros(2)), carry
 
@@ -61,7 +61,7 @@ def test_forms_are_checked_before_anything_runs():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["constant_velocity", "idm", "pdm", "search"])
+@pytest.mark.parametrize("name", ["constant_velocity", "idm", "pdm", "search_planner:SearchPlanner"])
 def test_built_in_planners_pass(name):
     check_planner(name)
 

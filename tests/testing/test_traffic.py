@@ -40,19 +40,19 @@ class Wrong(own_terms.Drift):
             return rows.at[:, 5:7].multiply(1.0 + jnp.abs(rows[:, 0]).max() / 2000.0)
         return jnp.zeros((9000,)).at[: rows.size].set(rows.ravel()) if self.fault == "size" else rows
 
-    def advance(self, bank, scene, frame):
+    def advance(self, bank, context, frame):
         if self.fault == "size":
-            return scene.traffic
-        rows = super().advance(bank, scene, frame)
+            return context.traffic
+        rows = super().advance(bank, context, frame)
         change = {"form": rows[1:], "random": rows + float(next(count))}
         change["turn"] = rows.at[:, 0].add(0.05)
         change["leap"] = rows.at[:, 0].add(9.0)
         return change.get(self.fault, rows)
 
-    def agents(self, bank, scene, back):
+    def agents(self, bank, context, back):
         if self.fault == "size":
-            return bank.agents[scene.index, scene.step]
-        rows = super().agents(bank, scene, 0 if self.fault == "past" else back)
+            return bank.agents[context.index, context.step]
+        rows = super().agents(bank, context, 0 if self.fault == "past" else back)
         if self.fault in ("turn", "leap", "random"):
             rows = rows.at[:, 0].add(-back * {"turn": 0.05, "leap": 9.0, "random": 0.0}[self.fault])
         change = {

@@ -14,7 +14,7 @@ from drivax.datasets.convert import Conversion, Converted, Plan, convert
 from drivax.datasets.estimate import counted
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
-from drivax.files import begun
+from drivax.files import can_resume
 from drivax.tracking.progress import Progress
 
 _SHOWN = 20
@@ -81,7 +81,7 @@ def run(args: Convert) -> int:
         try:
             result = convert(args.src, args.out, options, report, audit, _announce)
         except BaseException as error:
-            if not isinstance(error, UsageError) and begun(args.out):
+            if not isinstance(error, UsageError) and can_resume(args.out):
                 print("drivax: what is finished is kept, the same command continues", file=sys.stderr)
             raise
     print(summary(result))

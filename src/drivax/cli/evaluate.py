@@ -16,8 +16,8 @@ from drivax.evaluation.run_evaluation import (
     format_summary,
     run_evaluation,
 )
-from drivax.learning.policy_traffic import find_traffic
-from drivax.metrics.selection import selected
+from drivax.learning.policies import find_traffic
+from drivax.metrics.selection import select_metrics
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
 
@@ -74,7 +74,7 @@ def run(args: Evaluate) -> int:
     """Evaluate and print the headline metrics, and who crashed."""
     # Names that do not exist are refused before the long work.
     traffic = find_traffic(args.traffic)
-    selected(args.metrics)
+    select_metrics(args.metrics)
     data = ScenarioSet.open(args.data)
     some = load(args.data, 1, filters=args.filter, scenarios=args.scenarios)
     planner, task = find_planner(args.planner, some.bank, args.sample)

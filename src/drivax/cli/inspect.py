@@ -60,7 +60,7 @@ def run(args: Inspect) -> int:
     """Test the sets, then print them as tables or as JSON, or write a page."""
     from drivax.errors import UsageError
     from drivax.report.inspection import Inspection, described
-    from drivax.scenario.select.filters import Selection
+    from drivax.scenario.select.selection import Selection
 
     if not args.sets:
         raise UsageError("no scenario set is named", cure="write drivax inspect SET")
@@ -92,15 +92,16 @@ def _print(opened: list[Inspection]) -> None:
     console = _console()
     if len(opened) > 1:
         for table in tables.comparison(opened):
-            console.print(table)
+            console.print(table.rich())
             console.print()
         return
     (one,) = opened
-    console.print(tables.overview(one))
+    console.print(tables.overview(one).rich())
     console.print()
-    console.print(tables.audit_table(one) or "audit: not done")
+    audit = tables.audit_table(one)
+    console.print("audit: not done" if audit is None else audit.rich())
     console.print()
-    console.print(tables.listing(one))
+    console.print(tables.listing(one).rich())
     if len(one) > tables.LISTED:
         console.print(f"{len(one) - tables.LISTED:,} more; --json lists all")
 
@@ -135,9 +136,9 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics
     from drivax.learning.config import TrainConfig
-    from drivax.learning.policy_traffic import find_traffic
+    from drivax.learning.policies import find_traffic
     from drivax.planners.simple import Expert
-    from drivax.report.pictures.observation import draw_moment
+    from drivax.report.pictures.observation import draw_log_observation
     from drivax.scenario.bank.scenario_bank import ScenarioBank
 
     scenarios = list(inspection.sample(_OBSERVED))
@@ -156,14 +157,14 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
         _print_observations(found)
     if args.draw is not None:
         title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
-        draw_moment(task, bank, title).savefig(args.draw)
+        draw_log_observation(task, bank, title).savefig(args.draw)
         print(args.draw, file=sys.stderr if args.json else sys.stdout)
 
 
 def _print_observations(found: ObservationStatistics) -> None:
-    from drivax.report import observation_tables as tables
+    from drivax.report import inspection_tables as tables
 
     console = _console()
     console.print(tables.observation_overview(found))
     console.print()
-    console.print(tables.observation_table(found))
+    console.print(tables.observation_table(found).rich())

@@ -52,9 +52,9 @@ class Report:
 def run(args: Report) -> int:
     """Write what was asked for and say where it is."""
     from drivax.errors import UsageError
-    from drivax.report.exports import write_tables
     from drivax.report.pages.report import write_report
     from drivax.report.pictures.video import write_videos
+    from drivax.report.table_files import write_tables
     from drivax.tracking.progress import Progress
 
     if not args.runs:

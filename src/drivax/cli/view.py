@@ -38,13 +38,12 @@ def run(args: View) -> int:
     """Write the page and say where it is and what it leaves out."""
     from drivax.curation.scores import read_scores
     from drivax.curation.subset import top_rows
-    from drivax.report.pages.criticality import criticality_html
-    from drivax.report.pages.viewer import select, write_player
+    from drivax.report.pages.viewer import criticality_html, select, write_player
     from drivax.scenario.store import ScenarioSet
 
     data = ScenarioSet.open(args.set)
     folder = args.set.resolve()
-    beside: list[str] = []
+    details: list[str] = []
     if args.scores is None:
         chosen = select(data, args.limit, args.ids)
     else:
@@ -53,13 +52,13 @@ def run(args: View) -> int:
             data, args.limit, args.ids or [table.scenario_ids[row] for row in top_rows(table, len(data))]
         )
         row = {name: row for row, name in enumerate(table.scenario_ids)}
-        beside = [criticality_html(table, row[scenario.id]) for scenario in chosen]
+        details = [criticality_html(table, row[scenario.id]) for scenario in chosen]
     path = write_player(
         chosen,
         args.out or folder.with_name(f"{folder.name}.html"),
         args.overwrite,
         title=folder.name,
-        beside=beside,
+        details=details,
     )
     print(f"{path} ({len(chosen)} of {len(data)} scenarios, {path.stat().st_size / 1e6:.1f} MB)")
     return 0

@@ -11,11 +11,11 @@ from typing import TypeVar, get_args
 from drivax.datasets.formats import AUTO, detect, reader_named
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError, DrivaxError, UsageError
-from drivax.scenario.build.assemble import STRIDE, assemble, windows
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.routes import RouteStyle
-from drivax.scenario.recording import Recording
+from drivax.scenario.recording import STRIDE, Recording, windows
 from drivax.scenario.schema import CAPACITIES, Scenario
-from drivax.scenario.select.filters import Selection
+from drivax.scenario.select.selection import Selection
 from drivax.scenario.select.splits import Shares, parse_shares
 
 _Result = TypeVar("_Result")
@@ -29,7 +29,7 @@ class Conversion:
         format: Name of a format, or ``auto``: each file by its content.
         capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
         limit: Stop when the set holds so many scenarios; None: all.
-        filters: Keep only scenarios that satisfy all of them (``scenario.select.filters``).
+        filters: Keep only scenarios that satisfy all of them (``scenario.select.selection``).
         routes: How routes are found (``scenario.build.assemble.assemble``).
         stride: Steps between the starts of two windows of a long recording.
         split: Percentages of recordings for train/validation/test, as ``80/10/10``; None: no split files.

@@ -23,10 +23,9 @@ from drivax.datasets.formats import Survey, survey
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.spool import converted_ahead
 from drivax.errors import DataError
-from drivax.scenario.manifest import manifest_entry
 from drivax.scenario.schema import CAPACITIES, SCHEMA_VERSION, Scenario
-from drivax.scenario.select.filters import Selection
-from drivax.scenario.store import ScenarioWriter
+from drivax.scenario.select.selection import Selection
+from drivax.scenario.store import ScenarioWriter, manifest_entry
 
 __all__ = ["Conversion", "Converted", "Plan", "convert", "convert_file"]
 

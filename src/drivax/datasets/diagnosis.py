@@ -13,7 +13,7 @@ from drivax.datasets.estimate import estimate, free_bytes, input_bytes
 from drivax.datasets.formats import AUTO, Input, Survey, detect, reader_named, survey
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError, DrivaxError
-from drivax.scenario.build.assemble import STRIDE
+from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES
 
 #: So many files of a format are looked into; more are taken to be like them.

@@ -10,7 +10,7 @@ from pathlib import Path
 from drivax.datasets.formats import Input, Survey, reader_named
 from drivax.datasets.reader import Reader
 from drivax.errors import DataError, UsageError
-from drivax.scenario.build.assemble import STRIDE
+from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import STEPS, Capacity, record_dtype
 
 #: So many files of a format are counted; where there are more, they stand for the others by their size.

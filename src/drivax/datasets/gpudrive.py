@@ -16,7 +16,7 @@ import numpy as np
 from drivax.datasets import readings
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, LightState, RoadKind
 

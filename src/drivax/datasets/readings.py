@@ -12,8 +12,7 @@ from jaxtyping import Float, Float64
 
 from drivax.errors import DataError
 from drivax.scenario.arrays import differentiate as differentiate
-from drivax.scenario.build.assemble import STRIDE
-from drivax.scenario.recording import Light, MapFeature
+from drivax.scenario.recording import STRIDE, Light, MapFeature
 from drivax.scenario.schema import POLYGON_KINDS, STEPS, LightState, RoadKind
 
 #: Metres per second in a mile per hour.
@@ -115,7 +114,7 @@ def load_json(path: Path) -> Any:
 
 
 def windows_of(steps: int) -> int:
-    """How many scenarios a recording of so many steps becomes (``scenario.build.assemble.windows``)."""
+    """How many scenarios a recording of so many steps becomes (``scenario.recording.windows``)."""
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from drivax.datasets.womd.tfrecord import read_records
 from drivax.errors import DataError, UsageError
-from drivax.scenario.manifest import MANIFEST
+from drivax.scenario.store import MANIFEST
 
 #: (where in a file, bytes, what it is, cure)
 _MAGIC = (

@@ -11,81 +11,110 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.results import Results, interval_of
-from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, comparable
+from drivax.evaluation.episode_table import (
+    ADDED,
+    NOT_SUMMARISED,
+    RATES,
+    EpisodeTable,
+    ScenarioKey,
+    interval_of,
+)
+from drivax.evaluation.pairing import Pairs, mismatch
+from drivax.metrics.catalogue import METRICS
+from drivax.metrics.catalogue import headline as headline_metrics
 from drivax.scenario.select.tags import TAGS
 from drivax.simulator.contact import CollisionType
 from drivax.stats.intervals import NOTHING, Interval, paired_bootstrap, rate
+from drivax.table import Cell, Column, Table, interval_cell
 
 CONFIDENCE = 0.95
 SEED = 0
 #: Tags by which results are broken down.
 STRATA = ("difficulty", "type", "density")
-#: The word of a scenario that lacks a tag.
+#: The value of a tag in scenarios that lack it.
 UNKNOWN = "unknown"
-#: What a kind of collision says about the driver: name and reading.
-READINGS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
+#: Kinds of collision: name, and what it says about the planner.
+COLLISION_KINDS: Mapping[CollisionType, tuple[str, str]] = MappingProxyType(
     {
-        CollisionType.REAR_END: ("rear end", "ran into somebody ahead: distance and braking"),
+        CollisionType.REAR_END: ("rear end", "hit the agent ahead: distance and braking"),
         CollisionType.REAR_ENDED: ("rear-ended", "was hit from behind: slower than traffic expects, or than the log "
                                    "that traffic replays"),
-        CollisionType.SIDE_SWIPE: ("side", "touched somebody beside it or crossing: lane keeping and giving way"),
+        CollisionType.SIDE_SWIPE: ("side", "touched an agent at its side or crossing: lane keeping and giving way"),
         CollisionType.HEAD_ON: ("head-on", "met oncoming traffic: left its own side of the road"),
-        CollisionType.VULNERABLE: ("pedestrian or cyclist", "hit somebody unprotected: attention to small agents"),
-        CollisionType.STOPPED_OBJECT: ("standing object", "ran into somebody who stands: braking in time for a queue"),
+        CollisionType.VULNERABLE: ("pedestrian or cyclist", "hit an unprotected agent: attention to small agents"),
+        CollisionType.STOPPED_OBJECT: ("standing object", "hit a standing agent: braking in time for a queue"),
     }
 )  # fmt: skip
+#: Codes and counts, which have no mean.
+CODES = frozenset(NOT_SUMMARISED)
+_ARROWS = {"high": " ↑", "low": " ↓", "-": ""}
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One number of a table: which metric, its interval, and the run behind it where row and column do not say."""
-
-    metric: str
-    interval: Interval
-    run: str | None = None
-
-
-@dataclass(frozen=True)
-class Row:
-    """A row: what it is about, one word per key of the table, and its cells; None where there is nothing to say."""
-
-    labels: tuple[str, ...]
-    cells: tuple[Cell | None, ...]
-
-
-@dataclass(frozen=True)
-class Table:
-    """Numbers with intervals, for a page or a file.
+class MetricLabel:
+    """How a metric is shown.
 
     Attributes:
-        name: Of the file.
-        caption: One line.
-        keys: Headings of the columns of labels; under ``metric`` stand names of metrics.
-        across: What the other columns are: ``metric``, ``planner``, ...
-        columns: Headings of the other columns.
-        rows: The rows.
-        signed: The numbers are differences.
+        text: Its label, with the unit where it has one.
+        better: Whether ``high`` or ``low`` is better; ``-`` for neither.
+        unit: ``rate`` for a share of episodes, ``share`` for another number without a unit, else the unit.
+        explanation: One sentence; empty for unknown metrics.
     """
 
-    name: str
-    caption: str
-    keys: tuple[str, ...]
-    across: str
-    columns: tuple[str, ...]
-    rows: tuple[Row, ...]
-    signed: bool = False
+    text: str
+    better: str
+    unit: str
+    explanation: str
+
+    @property
+    def heading(self) -> str:
+        """The label with an arrow in the better direction."""
+        return self.text + _ARROWS[self.better]
+
+    @property
+    def title(self) -> str:
+        """The explanation with the better direction."""
+        direction = {"high": "Higher is better.", "low": "Lower is better.", "-": ""}[self.better]
+        return f"{self.explanation} {direction}".strip()
+
+
+def metric_label(name: str, runs: Sequence[EpisodeTable] = ()) -> MetricLabel:
+    """Return how to show a metric; ``runs`` describe the user's own metrics."""
+    known = METRICS.get(name) or ADDED.get(name)
+    metric = known or next((run.own_metrics[name] for run in runs if name in run.own_metrics), None)
+    text = (metric.label if metric else None) or name.replace("_", " ")
+    if metric is None:
+        return MetricLabel(text, "-", "", "")
+    plain = metric.unit == "-"
+    if not plain:
+        text = f"{text} [{metric.unit.replace('s2', 's²').replace('s3', 's³')}]"
+    unit = "rate" if name in RATES else "share" if plain else metric.unit
+    return MetricLabel(text, metric.better, unit, f"{metric.definition[:1].upper()}{metric.definition[1:]}.")
+
+
+def metric_names(runs: Sequence[EpisodeTable]) -> list[str]:
+    """Return the metrics of all runs, each once, in the order of first appearance."""
+    return list(dict.fromkeys(name for run in runs for name in run.metrics))
+
+
+def headline(names: Sequence[str]) -> list[str]:
+    """Return those metrics that belong in the first table, in its order."""
+    return [name for name in headline_metrics(METRICS) if name in names]
+
+
+def ordered(names: Sequence[str]) -> list[str]:
+    """Return metrics in the order of their definition, then unknown ones as given; no codes."""
+    rank = {name: place for place, name in enumerate((*METRICS, *ADDED))}
+    return sorted((name for name in names if name not in CODES), key=lambda name: rank.get(name, len(rank)))
 
 
 def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interval:
-    """Mean of a metric over episodes of a run, with the interval that ``summary.json`` gives.
-
-    Episodes of one segment form a cluster. A run without the metric gives an empty interval.
+    """Return the mean of a metric over episodes, with the interval that ``summary.json`` gives.
 
     Args:
-        run: The evaluation.
+        run: The evaluation; one without the metric gives an empty interval.
         metric: Name of the metric.
-        rows: Which episodes, as an index of an array; all of them by default.
+        rows: Which episodes, as an index of an array; all by default.
     """
     if metric not in run.metrics:
         return NOTHING
@@ -93,59 +122,165 @@ def summarise(run: EpisodeTable, metric: str, rows: Any = slice(None)) -> Interv
 
 
 def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
-    """``run - other`` of a metric, scenario by scenario; repeated episodes of a scenario are averaged first."""
+    """Return ``run - other`` of a metric, scenario by scenario; repeated episodes are averaged first."""
     pairs = Pairs.of(run, other)
-    mine, theirs = pairs.values(run, metric), pairs.values(other, metric)
-    return paired_bootstrap(mine, theirs, pairs.clusters, CONFIDENCE, seed=SEED)
+    values, others = pairs.values(run, metric), pairs.values(other, metric)
+    return paired_bootstrap(values, others, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
-def paired_differences(one: Results, other: Results, metric: str) -> Interval:
-    """:func:`paired_difference` of evaluations that have just been made.
+def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
+    """Return :func:`paired_difference` of two evaluations in memory.
 
     Raises:
-        UsageError: If they did not drive the same scenarios.
+        UsageError: If their scenarios differ.
     """
-    tables = EpisodeTable.of(one), EpisodeTable.of(other)
-    if len({frozenset(table.scenarios) for table in tables}) > 1:
-        raise UsageError("the evaluations drove different scenarios", cure="evaluate both on one set")
-    return paired_difference(*tables, metric)
+    if set(results.scenarios) != set(other.scenarios):
+        raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
+    return paired_difference(results, other, metric)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A metric of one planner minus another's, over their common scenarios.
+
+    Attributes:
+        interval: Mean difference with its interval and the number of pairs.
+        verdict: ``better``, ``worse``, ``unclear`` (the interval holds 0), ``same`` (no pair differs) or ``none`` (no
+            direction, no interval).
+    """
+
+    interval: Interval
+    verdict: str
+
+
+def difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> Difference:
+    """Return the paired difference ``run - other`` of a metric with its verdict."""
+    interval = paired_difference(run, other, metric)
+    return Difference(interval, _verdict(interval, metric_label(metric, [run]).better))
+
+
+def _verdict(interval: Interval, better: str) -> str:
+    low, high = interval.low, interval.high
+    if better == "-" or low is None or high is None:
+        return "none"
+    if low == high == 0:
+        return "same"
+    if low <= 0 <= high:
+        return "unclear"
+    return "better" if (low > 0) == (better == "high") else "worse"
+
+
+def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
+    """Return a table with planners in rows and metrics in columns, the best mean of each column marked."""
+    columns = [[summarise(run, name) for run in runs] for name in metrics]
+    best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, columns, strict=True)]
+    rows = []
+    for place, run in enumerate(runs):
+        label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
+        cells = [
+            _cell(runs, name, column[place], {"run": run.name, "metric": name}, top)
+            for name, column, top in zip(metrics, columns, best, strict=True)
+        ]
+        rows.append((label, *cells))
+    heads = (Column("planner", label=True), *_metric_columns(metrics, runs))
+    return Table("planners", heads, tuple(rows))
+
+
+def _best(intervals: Sequence[Interval], label: MetricLabel) -> float | None:
+    """Return the best mean of a column, None without a direction or a choice."""
+    means = [interval.mean for interval in intervals if interval.mean is not None]
+    if label.better == "-" or len(means) < 2 or min(means) == max(means):
+        return None
+    return max(means) if label.better == "high" else min(means)
+
+
+def _cell(
+    runs: Sequence[EpisodeTable],
+    metric: str,
+    interval: Interval,
+    link: Mapping[str, Any],
+    best: float | None = None,
+) -> Cell:
+    if interval.mean is None:
+        return interval_cell(interval, "", metric)
+    style = "best" if best is not None and interval.mean == best else ""
+    return interval_cell(interval, metric_label(metric, runs).unit, metric, style=style, link=link)
+
+
+def _metric_columns(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> list[Column]:
+    labels = [(name, metric_label(name, runs)) for name in metrics]
+    return [Column(label.heading, name, title=label.title or name) for name, label in labels]
+
+
+def _metric_cell(metric: str, runs: Sequence[EpisodeTable]) -> Cell:
+    label = metric_label(metric, runs)
+    return Cell(label.heading, metric=metric, title=label.title or metric)
+
+
+def _run_columns(runs: Sequence[EpisodeTable]) -> list[Column]:
+    return [Column(run.name, run.name) for run in runs]
 
 
 def results_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
-    """Metrics in rows, runs in columns."""
-    rows = tuple(Row((name,), tuple(Cell(name, summarise(run, name)) for run in runs)) for name in metrics)
-    caption = f"Mean and {CONFIDENCE:.0%} interval"
-    return Table("results", caption, ("metric",), "planner", tuple(run.name for run in runs), rows)
+    """Return a table with metrics in rows and runs in columns."""
+    rows = tuple(
+        (
+            _metric_cell(name, runs),
+            *(_cell(runs, name, summarise(run, name), {"run": run.name, "metric": name}) for run in runs),
+        )
+        for name in metrics
+    )
+    columns = (Column("metric", "metric", label=True), *_run_columns(runs))
+    return Table("results", columns, rows, f"Mean and {CONFIDENCE:.0%} interval", "planner")
+
+
+#: Words of a verdict; the sign repeats in shape what the colour says.
+_MARKS = {"better": "▲ better", "worse": "▼ worse", "unclear": "unclear", "same": "= same", "none": ""}
 
 
 def differences_table(policy: EpisodeTable, others: Sequence[EpisodeTable], metrics: Sequence[str]) -> Table:
-    """Metrics in rows, other runs in columns: the policy minus the other, paired by scenario."""
-    known = [other for other in others if comparable(policy, other)]
+    """Return a table with metrics in rows and other runs in columns: the policy minus the other, paired by scenario."""
     rows = tuple(
-        Row((name,), tuple(Cell(name, paired_difference(policy, other, name)) for other in known))
+        (_metric_cell(name, [policy]), *(_difference_cell(policy, other, name) for other in others))
         for name in metrics
     )
     caption = f"{policy.name} minus the others, paired by scenario, with {CONFIDENCE:.0%} interval"
-    names = tuple(one.name for one in known)
-    return Table("differences", caption, ("metric",), "against", names, rows, signed=True)
+    columns = (Column("metric", "metric", label=True), *_run_columns(others))
+    return Table("differences", columns, rows, caption, "against")
+
+
+def _difference_cell(policy: EpisodeTable, other: EpisodeTable, metric: str) -> Cell:
+    if unmatched := mismatch(policy, other):
+        return Cell(f"no pairs: {unmatched[0]}", style="undefined")
+    compared = difference(policy, other, metric)
+    if compared.interval.mean is None:
+        title = "no scenario where both are defined"
+        return interval_cell(compared.interval, "", metric, signed=True, title=title)
+    return interval_cell(
+        compared.interval, metric_label(metric, [policy]).unit, metric, signed=True, style=compared.verdict,
+        mark=_MARKS[compared.verdict], link={"run": policy.name, "metric": metric},
+    )  # fmt: skip
 
 
 def collisions_table(runs: Sequence[EpisodeTable]) -> Table:
-    """Kinds of the first collision in rows, runs in columns: share of the episodes in which they are known."""
+    """Return a table with kinds of the first collision in rows and runs in columns.
+
+    The numbers are shares of the episodes in which the kind is known; a run without kinds has no column.
+    """
     runs = [run for run in runs if "collision_type" in run.metrics]
     known = not any(np.isnan(run.metrics["collision_type"]).any() for run in runs)
     of = "all episodes" if known else "the episodes in which they are known (n)"
     rows = []
-    for code, (words, _) in READINGS.items():
+    for code, (name, _) in COLLISION_KINDS.items():
         cells = []
         for run in runs:
             kinds = run.metrics["collision_type"]
-            found = rate(np.where(np.isnan(kinds), np.nan, kinds == code), run.clusters, CONFIDENCE)
-            cells.append(Cell("collision", found))
-        rows.append(Row((words,), tuple(cells)))
+            share = rate(np.where(np.isnan(kinds), np.nan, kinds == code), run.clusters, CONFIDENCE)
+            cells.append(_cell(runs, "collision", share, {"run": run.name, "kind": int(code)}))
+        rows.append((Cell(name), *cells))
     caption = f"First collisions by kind: share of {of} with {CONFIDENCE:.0%} interval"
-    names = tuple(run.name for run in runs)
-    return Table("collisions", caption, ("first collision",), "planner", names, tuple(rows))
+    columns = (Column("first collision", label=True), *_run_columns(runs))
+    return Table("collisions", columns, tuple(rows), caption, "planner")
 
 
 def strata_table(
@@ -154,57 +289,63 @@ def strata_table(
     tag: str,
     metrics: Sequence[str],
 ) -> Table:
-    """One kind of scenario after the other, each with all runs; metrics in columns.
+    """Return a table with a row per value of a tag and run, metrics in columns.
 
     Args:
         runs: Evaluations.
-        tags: The tags of their scenarios.
-        tag: By which one to break down; a scenario without it counts as ``unknown``.
+        tags: The tags of their scenarios; a scenario without the tag counts as ``unknown``.
+        tag: The tag.
         metrics: Columns.
     """
-    words = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
-    order = {word: place for place, word in enumerate(TAGS.get(tag, ()))}
-    values = {word for found in words.values() for word in found}
+    values = {run.name: [tags.get(key, {}).get(tag, UNKNOWN) for key in run.scenarios] for run in runs}
+    order = {value: place for place, value in enumerate(TAGS.get(tag, ()))}
+    every = {value for of_run in values.values() for value in of_run}
     rows = []
-    for value in sorted(values, key=lambda word: (order.get(word, len(order)), word)):
+    for value in sorted(every, key=lambda value: (order.get(value, len(order)), value)):
         for run in runs:
-            inside = np.flatnonzero(np.array(words[run.name]) == value)
+            inside = np.flatnonzero(np.array(values[run.name]) == value)
             if inside.size:
-                cells = tuple(Cell(name, summarise(run, name, inside)) for name in metrics)
-                rows.append(Row((value, run.name), cells))
+                link = {"run": run.name, "tags": {tag: value}}
+                cells = (
+                    _cell(runs, name, summarise(run, name, inside), link | {"metric": name})
+                    for name in metrics
+                )
+                rows.append((Cell(value), Cell(run.name), *cells))
     caption = f"By {tag}: mean and {CONFIDENCE:.0%} interval"
-    return Table(f"by-{tag}", caption, (tag, "planner"), "metric", tuple(metrics), tuple(rows))
+    labels = (Column(tag, label=True), Column("planner", label=True))
+    return Table(f"by-{tag}", (*labels, *_metric_columns(metrics, runs)), tuple(rows), caption)
 
 
 def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """Names of all data sets that runs drove or were trained on, by their key: unique, as short as may be."""
-    entries = {_set_key(entry): entry for run in runs for entry in (run.data, *_trained_on(run))}
+    """Return unique short names of all data sets that runs were evaluated or trained on, by their key."""
+    entries = {set_key(entry): entry for run in runs for entry in (run.data, *_trained_on(run))}
     named = {key: _set_name(entry) for key, entry in entries.items()}
     names = list(named.values())
     return {key: name if names.count(name) == 1 else f"{name} {key[:6]}" for key, name in named.items()}
 
 
 def _trained_on(run: EpisodeTable) -> Sequence[Mapping[str, Any]]:
-    return run.about.get("trained_on") or ()
+    return run.info.get("trained_on") or ()
 
 
-def _set_key(entry: Mapping[str, Any]) -> str:
+def set_key(entry: Mapping[str, Any]) -> str:
+    """Return what identifies a data set: its hash, or else its path."""
     return str(entry.get("hash") or entry.get("path") or "unknown")
 
 
 def _set_name(entry: Mapping[str, Any]) -> str:
     path = entry.get("path")
-    return str(entry.get("name") or (Path(str(path)).name if path else _set_key(entry)[:12]))
+    return str(entry.get("name") or (Path(str(path)).name if path else set_key(entry)[:12]))
 
 
 def _planner_key(run: EpisodeTable) -> str:
-    """Who drove: what the command called it, or else the planner's name."""
-    return str(run.settings.get("planner") or run.about.get("planner", run.name))
+    """Return the planner as the command named it, or else its own name."""
+    return str(run.settings.get("planner") or run.planner)
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
-    """A name for each planner by its key: its own, or where two share that, as much of their paths as it takes."""
-    own = {_planner_key(run): str(run.about.get("planner", run.name)) for run in runs}
+    """Return a name for each planner by its key: its own, or the shortest end of its path that is unique."""
+    own = {_planner_key(run): run.planner for run in runs}
     named = {}
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]
@@ -217,23 +358,32 @@ def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
 
 
 def transfer_table(runs: Sequence[EpisodeTable], metric: str) -> Table:
-    """What was trained in rows, what was driven in columns: a metric of every pair that was evaluated.
+    """Return a table of a metric with training data in rows and evaluation data in columns.
 
-    A planner is who the command named, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``) stay apart.
-    Where the same one drove one set more than once (from other starts, say), each run has a row of its own.
+    A planner is identified as the command named it, so that policies of one name (``bc/seed-0`` and ``ppo/seed-0``)
+    stay apart. Several runs of one planner on one set (from other starts, say) have a row each.
     """
-    planners = _planner_names(runs)
-    names = set_names(runs)
-    driven = [names[_set_key(run.data)] for run in runs]
-    found: dict[tuple[str, ...], dict[str, Cell]] = {}
-    for run, where in zip(runs, driven, strict=True):
-        trained = ", ".join(names[_set_key(entry)] for entry in _trained_on(run)) or "–"
+    planners, names = _planner_names(runs), set_names(runs)
+    evaluated = [names[set_key(run.data)] for run in runs]
+    cells: dict[tuple[str, ...], dict[str, Cell]] = {}
+    for run, where in zip(runs, evaluated, strict=True):
+        trained = ", ".join(names[set_key(entry)] for entry in _trained_on(run)) or "–"
         labels = (planners[_planner_key(run)], trained, run.traffic)
-        if where in found.get(labels, {}):
+        if where in cells.get(labels, {}):
             labels = (run.name, *labels[1:])
-        found.setdefault(labels, {})[where] = Cell(metric, summarise(run, metric), run.name)
-    columns = tuple(dict.fromkeys(driven))
-    rows = tuple(Row(labels, tuple(cells.get(name) for name in columns)) for labels, cells in found.items())
+        link = {"run": run.name, "metric": metric}
+        cells.setdefault(labels, {})[where] = _cell(runs, metric, summarise(run, metric), link)
+    columns = tuple(dict.fromkeys(evaluated))
+    rows = tuple(
+        (*map(Cell, labels), *(row.get(name, Cell(style="undefined")) for name in columns))
+        for labels, row in cells.items()
+    )
+    heads = [Column(key, label=True) for key in ("planner", "trained on", "traffic")]
     caption = f"By training and evaluation data: mean and {CONFIDENCE:.0%} interval"
-    keys = ("planner", "trained on", "traffic")
-    return Table(f"transfer-{metric}", caption, keys, "evaluated on", columns, rows)
+    return Table(
+        f"transfer-{metric}",
+        (*heads, *(Column(name, name) for name in columns)),
+        rows,
+        caption,
+        "evaluated on",
+    )

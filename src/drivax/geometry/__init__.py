@@ -1,1 +1,5 @@
-"""Angles, oriented boxes and polylines: maths that knows no traffic. Works on numpy and JAX arrays alike."""
+"""Angles, oriented boxes and polylines, for NumPy and JAX arrays."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,7 @@
-"""Oriented rectangles: corners, overlap, and the time until two of them meet.
+"""Oriented rectangles: corners, overlap, gap, and time to overlap.
 
-A box is an array ``[..., 6]`` of (x, y, cos heading, sin heading, length, width) in metres. Functions take numpy or
-JAX arrays, broadcast over leading axes and return the same kind.
+A box is an array ``[..., 6]`` of (x, y, cos heading, sin heading, length, width) in metres. Functions broadcast over
+leading axes and take NumPy or JAX arrays.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ X, Y, COS, SIN, LENGTH, WIDTH = range(6)
 
 
 def corners(box: Any) -> Any:
-    """Corner points ``[..., 4, 2]``: front left, front right, rear right, rear left."""
+    """Return corner points ``[..., 4, 2]``: front left, front right, rear right, rear left."""
     xp = box.__array_namespace__()
     cos, sin = box[..., COS], box[..., SIN]
     half_length, half_width = box[..., LENGTH] / 2, box[..., WIDTH] / 2
@@ -44,39 +44,33 @@ def _axis_terms(a: Any, b: Any) -> tuple[tuple[Any, Any, Any], ...]:
 
 
 def overlap(a: Any, b: Any) -> Any:
-    """Whether two boxes share interior points (separating axis theorem; touching is not overlap)."""
+    """Return whether boxes share interior points (separating axis theorem; touching is no overlap)."""
     dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
     result = None
     for axis_x, axis_y, reach in _axis_terms(a, b):
-        meets = abs(dx * axis_x + dy * axis_y) < reach
-        result = meets if result is None else result & meets
+        overlaps = abs(dx * axis_x + dy * axis_y) < reach
+        result = overlaps if result is None else result & overlaps
     return result
 
 
 def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
-    """Where segments pass through boxes (slab test), as shares of the way from ``start`` to ``end``.
+    """Fractions of segments ``start`` to ``end`` (``[..., 2]``) at which they enter and leave boxes (slab test).
 
-    Args:
-        start: Points ``[..., 2]``.
-        end: Points ``[..., 2]``.
-        box: Boxes ``[..., 6]``.
-
-    Returns:
-        Shares in [0, 1] at which each segment enters and leaves; it passes through where the first is smaller.
+    A segment passes through the box where the first fraction is smaller. Both are in [0, 1].
     """
     xp = box.__array_namespace__()
     cos, sin = box[..., COS], box[..., SIN]
 
-    def turned(point: Any) -> tuple[Any, Any]:
+    def local(point: Any) -> tuple[Any, Any]:
         x, y = point[..., 0] - box[..., X], point[..., 1] - box[..., Y]
         return x * cos + y * sin, y * cos - x * sin
 
     enters, leaves = None, None
     halves = (box[..., LENGTH] / 2, box[..., WIDTH] / 2)
-    for begin, stop, half in zip(turned(start), turned(end), halves, strict=True):
-        way = stop - begin
-        way = xp.where(abs(way) < 1e-9, xp.full_like(way, 1e-9), way)
-        first, second = (-half - begin) / way, (half - begin) / way
+    for begin, stop, half in zip(local(start), local(end), halves, strict=True):
+        step = stop - begin
+        step = xp.where(abs(step) < 1e-9, xp.full_like(step, 1e-9), step)
+        first, second = (-half - begin) / step, (half - begin) / step
         low, high = xp.minimum(first, second), xp.maximum(first, second)
         enters = xp.maximum(low, xp.zeros_like(low)) if enters is None else xp.maximum(enters, low)
         leaves = xp.minimum(high, xp.ones_like(high)) if leaves is None else xp.minimum(leaves, high)
@@ -84,9 +78,9 @@ def passage(start: Any, end: Any, box: Any) -> tuple[Any, Any]:
 
 
 def gap(a: Any, b: Any) -> Any:
-    """Smallest distance between two boxes, m; 0 where they overlap.
+    """Smallest distance between boxes, m; 0 where they overlap.
 
-    Of two convex polygons that are apart, a corner of one of them is nearest to the other.
+    Between disjoint convex polygons the smallest distance is attained at a corner.
     """
     xp = a.__array_namespace__()
     nearest = xp.minimum(_nearest_corner(a, b), _nearest_corner(b, a))
@@ -94,14 +88,14 @@ def gap(a: Any, b: Any) -> Any:
 
 
 def _nearest_corner(box: Any, other: Any) -> Any:
-    """Squared distance of the corner of ``other`` that is nearest to ``box``, which is filled."""
+    """Squared distance from the filled ``box`` to the nearest corner of ``other``."""
     xp = box.__array_namespace__()
     points, box = corners(other), box[..., None, :]
     dx, dy = points[..., 0] - box[..., X], points[..., 1] - box[..., Y]
     ahead, left = dx * box[..., COS] + dy * box[..., SIN], dy * box[..., COS] - dx * box[..., SIN]
     beyond = xp.maximum(abs(ahead) - box[..., LENGTH] / 2, xp.zeros_like(ahead))
-    beside = xp.maximum(abs(left) - box[..., WIDTH] / 2, xp.zeros_like(left))
-    return xp.min(beyond * beyond + beside * beside, axis=-1)
+    sideways = xp.maximum(abs(left) - box[..., WIDTH] / 2, xp.zeros_like(left))
+    return xp.min(beyond * beyond + sideways * sideways, axis=-1)
 
 
 def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s: float) -> Any:
@@ -110,15 +104,10 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
     On each separating axis the centre distance is linear in time, so the boxes overlap on that axis during one
     interval; they overlap in the plane during the intersection of the four (swept separating axis theorem).
 
-    Args:
-        a: Box ``[..., 6]``.
-        velocity_a: Velocity of its centre ``[..., 2]``, m/s.
-        b: Box ``[..., 6]``.
-        velocity_b: Velocity ``[..., 2]``, m/s.
-        horizon_s: Longest time of interest, seconds.
+    Velocities ``[..., 2]`` are those of the centres, m/s.
 
     Returns:
-        Seconds ``[...]``: 0 where they overlap now, ``horizon_s`` where they do not within the horizon.
+        Seconds ``[...]``: 0 for boxes that overlap now, ``horizon_s`` for those that do not within the horizon.
     """
     xp = a.__array_namespace__()
     dx, dy = b[..., X] - a[..., X], b[..., Y] - a[..., Y]
@@ -130,10 +119,10 @@ def time_to_overlap(a: Any, velocity_a: Any, b: Any, velocity_b: Any, horizon_s:
         speed = vx * axis_x + vy * axis_y
         moving = abs(speed) > 1e-9
         inverse = 1.0 / xp.where(moving, speed, xp.ones_like(speed))
-        one, other = (-reach - distance) * inverse, (reach - distance) * inverse
+        first, second = (-reach - distance) * inverse, (reach - distance) * inverse
         inside = abs(distance) < reach
         never = xp.full_like(dx, horizon_s)
-        enter = xp.where(moving, xp.minimum(one, other), xp.where(inside, xp.zeros_like(dx), never))
-        leave = xp.where(moving, xp.maximum(one, other), never)
+        enter = xp.where(moving, xp.minimum(first, second), xp.where(inside, xp.zeros_like(dx), never))
+        leave = xp.where(moving, xp.maximum(first, second), never)
         begin, end = xp.maximum(begin, enter), xp.minimum(end, leave)
     return xp.where(begin < end, begin, xp.full_like(dx, horizon_s))

@@ -1,8 +1,7 @@
-"""Polylines: arc length, simplification, cutting, resampling and projection, for many polylines at once.
+"""Polylines: arc length, simplification, cutting, resampling and projection.
 
-A set of polylines is one array of points and one array of row starts (:class:`Polylines`), so that a whole map is
-handled without a Python loop over its features. Arc length is measured in the plane (x, y); a third coordinate is
-carried along. numpy only: this runs when scenarios are written, not when they are simulated.
+:class:`Polylines` holds many polylines in one array of points, so that a map needs no Python loop over its features.
+Arc length is measured in the plane (x, y); a third coordinate is carried along. NumPy only.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class Polylines:
 
     @classmethod
     def of(cls, lines: Sequence[Float[Array, "_ dim"]], dim: int = 3) -> Polylines:
-        """Joins separate polylines; ``dim`` names the width where there are none."""
+        """Concatenate polylines; ``dim`` is the width where there are none."""
         counts = np.array([len(line) for line in lines], dtype=np.int64)
         points = np.concatenate(list(lines)) if len(lines) else np.zeros((0, dim))
         start = np.concatenate(([0], np.cumsum(counts)))
@@ -73,8 +72,8 @@ class Polylines:
         Every polyline needs two points. Arc lengths beyond an end give fractions outside [0, 1] of the first or
         the last segment: evaluation there continues straight on.
         """
-        wanted = np.clip(s, 0.0, self.length[row]) + self._base[row]
-        index = np.searchsorted(self._key, wanted, side="right") - 1
+        key = np.clip(s, 0.0, self.length[row]) + self._base[row]
+        index = np.searchsorted(self._key, key, side="right") - 1
         index = np.clip(index, self.start[row], self.start[row + 1] - 2)
         span = self.arc[index + 1] - self.arc[index]
         return index, (s - self.arc[index]) / np.where(span > 0.0, span, 1.0)
@@ -135,7 +134,7 @@ def point_to_segment(
 
 
 def simplify(lines: Polylines, tolerance_m: float, z_weight: float = 0.0) -> Bool[Array, " point"]:
-    """Which points to keep so that no dropped point is further than the tolerance from what remains.
+    """Mask of points to keep so that no dropped point is further than the tolerance from the rest.
 
     Douglas and Peucker, Cartographica 10(2), 1973, run on all polylines at once and level by level: every interval
     between kept points whose farthest point exceeds the tolerance is split there. Distance is to the chord as a
@@ -183,7 +182,7 @@ def _chord_distance(axes: Sequence[Array], point: Array, a: Array, b: Array) -> 
 
 
 def cut_counts(length: Float[Array, " segment"], longest_m: float) -> Int[Array, " segment"]:
-    """Into how many equal pieces to cut segments so that none is longer than ``longest_m``; at least one."""
+    """Number of equal pieces of segments so that none is longer than ``longest_m``; at least one."""
     return np.maximum(np.ceil(length / longest_m - 1e-9), 1).astype(np.int64)
 
 
@@ -236,7 +235,7 @@ def project_monotone(
     window_m: Float[Array, " query"],
     first_window_m: float = np.inf,
 ) -> Float[Array, " query"]:
-    """Arc lengths of successive positions along a polyline that never run backwards nor jump to another branch.
+    """Non-decreasing arc lengths of successive positions along a polyline, without jumps to another branch.
 
     ``s[k]`` is the arc length in ``[s[k-1], s[k-1] + window[k]]`` whose point is nearest to ``xy[k]``; the first
     position is searched in ``[0, first_window_m]``.

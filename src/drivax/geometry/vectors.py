@@ -1,8 +1,21 @@
-"""Vectors in the plane. Functions take numpy or JAX arrays and return the same kind."""
+"""Angles (radians, counter-clockwise from +x) and vectors in the plane, for NumPy and JAX arrays."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
+
+
+def wrap(angle: Any) -> Any:
+    """Wrap angles to [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def rotate(xy: Any, cos: Any, sin: Any) -> Any:
+    """Rotate vectors ``[..., 2]`` by angles given as cosine and sine ``[...]``."""
+    xp = xy.__array_namespace__()
+    x, y = xy[..., 0], xy[..., 1]
+    return xp.stack([x * cos - y * sin, x * sin + y * cos], axis=-1)
 
 
 def root(squared: Any) -> Any:

@@ -1,246 +1,314 @@
-"""All metrics of an episode: what each is called, means and needs, and the named sets of them."""
+"""Specification of every episode metric: unit, direction, operator, label, definition and requirements."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from drivax.metrics import outcomes
-from drivax.metrics.scores import NUPLAN_INPUTS, VMAX_INPUTS, Value
-from drivax.metrics.steps import STEP_VALUES, StepValue
-from drivax.scenario.schema import Flag
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
 
-#: How the values of an episode's steps become one: ``worst_second`` is the largest sum over ten steps on end.
+from drivax.metrics.scores import NUPLAN_INPUTS, VMAX_INPUTS, Value, nuplan_score, vmax_score
+from drivax.metrics.steps import STEP_VALUES, StepValue
+from drivax.scenario.bank.queries import is_mapped
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.record import record
+from drivax.scenario.schema import Flag
+from drivax.simulator.contact import TTC_HORIZON_S
+
+#: How the values of an episode's steps become one: ``worst_second`` is the largest sum over ten consecutive steps.
 Operator = Literal["any", "sum", "mean", "min", "max", "last", "first", "worst_second"]
+#: ``rate``: 0 or 1 per episode (Wilson's interval); ``score``: from 0 to 1; ``code``: has no mean.
+Kind = Literal["rate", "score", "quantity", "code"]
+Direction = Literal["low", "high", "-"]
 
 
 @dataclass(frozen=True)
-class Metric:
-    """A metric of an episode: a step value under an operator, something computed from other metrics, or both.
+class Column:
+    """What tables and reports say about a column of ``episodes.csv``.
 
     Attributes:
         unit: Unit, ``-`` for shares and booleans.
         better: ``low``, ``high``, or ``-`` where neither is.
-        text: One line for tables and reports.
-        needs: Scenario flags without which it is undefined.
-        of: The step value that is accumulated.
-        operator: How it is.
-        inputs: Metrics that ``compute`` reads.
-        compute: From the ending, the accumulated value (undefined without ``of``) and the inputs to the metric.
+        definition: One line for tables and reports.
+        label: Heading; by default the name of the metric.
+        kind: Scale of the values.
+        headline: Position in the first table of a report; None: not there.
+        summarised: Whether the mean over episodes is reported.
+        fails_on_crash: Whether it is 0 in an episode in which the planner crashed.
     """
 
     unit: str
-    better: Literal["low", "high", "-"]
-    text: str
+    better: Direction
+    definition: str
+    label: str | None = None
+    kind: Kind = "quantity"
+    headline: int | None = None
+    summarised: bool = True
+    fails_on_crash: bool = False
+
+
+@dataclass(frozen=True)
+class Metric(Column):
+    """A metric of an episode: a step value under an operator, a function of other metrics, or both.
+
+    Attributes:
+        needs: Scenario flags without which it is undefined.
+        step_value: The step value that is accumulated.
+        operator: How it is accumulated.
+        inputs: Metrics that ``compute`` reads.
+        compute: ``(episode end, accumulated value, inputs) -> Value``; the second is undefined without ``step_value``.
+    """
+
     needs: Flag = Flag.NONE
-    of: StepValue | None = None
+    step_value: StepValue | None = None
     operator: Operator | None = None
     inputs: tuple[str, ...] = ()
     compute: Callable[[Any, Value, Any], Value] | None = None
 
     def __post_init__(self) -> None:
-        if (self.of is None) != (self.operator is None):
-            raise ValueError("a step value and its operator come together")
-        if self.of is None and self.compute is None:
-            raise ValueError("a metric has a step value, or something that computes it")
+        if (self.step_value is None) != (self.operator is None):
+            raise ValueError("a metric needs step_value and operator together")
+        if self.step_value is None and self.compute is None:
+            raise ValueError("a metric needs step_value or compute")
 
 
-def _over(
-    operator: Operator,
-    step: str,
-    unit: str,
-    better: Literal["low", "high", "-"],
-    text: str,
-    needs: Flag = Flag.NONE,
+@record
+class EpisodeEnd:
+    """The episode that is over: its scenario, the step at which it started, and the number of steps."""
+
+    bank: ScenarioBank
+    index: Int[Array, ""]
+    start: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+#: Values of the metrics that a metric is computed from, by name.
+Inputs = Mapping[str, Value]
+#: Time to collision that counts as safe, and mean speeding at which compliance is 0 (nuPlan).
+_SAFE_TTC_S, _SPEEDING_MPS = 0.95, 2.23
+
+
+def _boolean(value: Bool[Array, ""], defined: Any = True) -> Value:
+    return Value(value.astype(jnp.float32), jnp.asarray(defined))
+
+
+def _graded(value: Value, good: float, fair: float) -> Value:
+    """Return 1 up to ``good``, 0.5 up to ``fair``, else 0."""
+    grade = jnp.where(value.value <= good, 1.0, jnp.where(value.value <= fair, 0.5, 0.0))
+    return Value(grade, value.defined)
+
+
+def _on_a_map(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return Value(value.value, value.defined & is_mapped(end.bank, end.index))
+
+
+def _steps(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return Value(end.steps.astype(jnp.float32), jnp.ones((), bool))
+
+
+def _progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    start = end.bank.log_progress[end.index, end.start]
+    return Value(jnp.where(end.steps > 0, value.value - start, 0.0), value.defined)
+
+
+def _progress_ratio(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    log = end.bank.log_progress[end.index]
+    logged = log[-1] - log[end.start]
+    gain = inputs["progress"]
+    ratio = jnp.where(logged < 0.5, 1.0, jnp.clip(gain.value / jnp.maximum(logged, 0.5), 0.0, 1.0))
+    return Value(ratio, gain.defined)
+
+
+def _making_progress(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return _boolean(inputs["progress_ratio"].value >= 0.2, inputs["progress_ratio"].defined)
+
+
+def _reached_goal(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    near = inputs["goal_distance"].value <= 3.0
+    return _boolean(near | (inputs["progress_ratio"].value >= 0.95), inputs["progress_ratio"].defined)
+
+
+def _ttc_ok(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    # A car that never moves has no time to collision and is safe.
+    least = inputs["min_ttc"]
+    safe = jnp.where(least.defined, least.value, TTC_HORIZON_S) >= _SAFE_TTC_S
+    return _boolean(safe, end.steps > 0)
+
+
+def _comfortable(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return _boolean(inputs["comfort"].value >= 1.0 - 1e-6, inputs["comfort"].defined)
+
+
+def _speed_compliance(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    mean = inputs["speeding_mean"]
+    return Value(jnp.maximum(0.0, 1.0 - mean.value / _SPEEDING_MPS), mean.defined)
+
+
+def _direction(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return _graded(inputs["wrong_way_worst"], 2.0, 6.0)
+
+
+def _lane_keeping(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    # Sums of 0.1 s in float32: a hundredth of a step keeps 3.4 s on the right side.
+    return _graded(inputs["lane_straddle"], 3.401, 5.701)
+
+
+def _without(collision: str, inputs: Inputs) -> Value:
+    """Whether there is no such collision, off-road step or red light; a red light counts where lights are known."""
+    ran_red = inputs["red_light"].defined & (inputs["red_light"].value > 0)
+    clean = ~(inputs[collision].value > 0) & ~(inputs["offroad"].value > 0) & ~ran_red
+    return _boolean(clean, inputs[collision].defined & inputs["offroad"].defined)
+
+
+def _accuracy(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return _without("collision", inputs)
+
+
+def _accuracy_at_fault(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    return _without("at_fault_collision", inputs)
+
+
+def _success(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    clean, reached = inputs["accuracy"], inputs["reached_goal"]
+    return _boolean((clean.value > 0) & (reached.value > 0), clean.defined & reached.defined)
+
+
+def _success_moving(end: EpisodeEnd, value: Value, inputs: Inputs) -> Value:
+    moves = end.bank.log_ahead[end.index, end.start] > 5.0
+    return Value(inputs["success"].value, inputs["success"].defined & moves)
+
+
+def _score(score: Callable[[Inputs], tuple[Value, Value]], partial: bool) -> Callable[..., Value]:
+    return lambda end, value, inputs: score(inputs)[int(partial)]
+
+
+def _accumulated(
+    step_value: str, operator: Operator, unit: str, better: Direction, definition: str, **more: Any
 ) -> Metric:
-    return Metric(unit, better, text, needs, STEP_VALUES[step], operator)
+    return Metric(unit, better, definition, step_value=STEP_VALUES[step_value], operator=operator, **more)
+
+
+def _computed(
+    compute: Callable[..., Value], inputs: tuple[str, ...], better: Direction, definition: str, **more: Any
+) -> Metric:
+    return Metric("-", better, definition, inputs=inputs, compute=compute, **more)
 
 
 _LANES, _ROUTE = Flag.LANE_GRAPH, Flag.ROUTE
-_CRASH = ("offroad", "red_light")
+_RATE = {"kind": "rate"}
+_OUTCOME = {"kind": "rate", "fails_on_crash": True}
+_SCORE = {"kind": "score", "fails_on_crash": True}
+
+# fmt: off
 METRICS: dict[str, Metric] = {
-    "accuracy": Metric(
-        "-",
-        "high",
-        "no collision, not off the road, no red light run",
-        inputs=("collision", *_CRASH),
-        compute=outcomes.accuracy,
-    ),
-    "accuracy_at_fault": Metric(
-        "-",
-        "high",
-        "the same, counting only collisions that are ego's fault",
-        inputs=("at_fault_collision", *_CRASH),
-        compute=outcomes.accuracy_at_fault,
-    ),
-    "success": Metric(
-        "-",
-        "high",
-        "accuracy and the goal reached",
-        inputs=("accuracy", "reached_goal"),
-        compute=outcomes.success,
-    ),
-    "success_moving": Metric(
-        "-",
-        "high",
-        "success where the log drives more than 5 m",
-        inputs=("success",),
-        compute=outcomes.success_moving,
-    ),
-    "vmax_score": Metric(
-        "-",
-        "high",
-        "safety gates times ttc, progress, speed, lanes and comfort",
-        inputs=VMAX_INPUTS,
-        compute=outcomes.full_vmax_score,
-    ),
-    "nuplan_score": Metric(
-        "-",
-        "high",
-        "nuPlan's closed-loop score",
-        inputs=NUPLAN_INPUTS,
-        compute=outcomes.full_nuplan_score,
-    ),
-    "vmax_score_partial": Metric(
-        "-",
-        "high",
-        "vmax_score where an input is undefined",
-        inputs=VMAX_INPUTS,
-        compute=outcomes.partial_vmax_score,
-    ),
-    "nuplan_score_partial": Metric(
-        "-",
-        "high",
-        "nuplan_score where an input is undefined",
-        inputs=NUPLAN_INPUTS,
-        compute=outcomes.partial_nuplan_score,
-    ),
-    "collision": _over("any", "collision", "-", "low", "boxes overlap"),
-    "at_fault_collision": _over(
-        "any", "at_fault_collision", "-", "low", "a collision that is ego's fault by nuPlan's rules"
-    ),
-    "collision_type": _over("first", "collision_type", "-", "-", "kind of the first collision"),
-    "offroad": Metric(
-        "-",
-        "low",
-        "a corner more than 0.3 m off the road",
-        of=STEP_VALUES["offroad"],
-        operator="any",
-        compute=outcomes.on_a_map,
-    ),
-    "left_map": Metric(
-        "-",
-        "low",
-        "left the mapped area",
-        of=STEP_VALUES["left_map"],
-        operator="any",
-        compute=outcomes.on_a_map,
-    ),
-    "red_light": _over("any", "red_light", "-", "low", "ran a red light", Flag.LIGHTS),
-    "min_ttc": _over("min", "ttc", "s", "high", "smallest time to collision, at most 5"),
-    "average_ttc": _over("mean", "ttc", "s", "high", "mean time to collision"),
-    "ttc_ok": Metric(
-        "-",
-        "high",
-        "time to collision always at least 0.95 s",
-        inputs=("min_ttc",),
-        compute=outcomes.ttc_ok,
-    ),
-    "comfort": _over("mean", "comfort", "-", "high", "share of steps within nuPlan's limits"),
-    "comfortable": Metric(
-        "-",
-        "high",
-        "every step within nuPlan's limits",
-        inputs=("comfort",),
-        compute=outcomes.comfortable,
-    ),
-    "max_jerk": _over("max", "jerk", "m/s3", "low", "largest jerk magnitude"),
-    "max_lateral_acceleration": _over(
-        "max", "lateral_acceleration", "m/s2", "low", "largest lateral acceleration"
-    ),
-    "speeding_mean": _over("mean", "speeding", "m/s", "low", "mean speed above the limit"),
-    "speeding_max": _over("max", "speeding", "m/s", "low", "largest speed above the limit"),
-    "speed_compliance": Metric(
-        "-",
-        "high",
-        "1 - mean speeding / 2.23 m/s, at least 0",
-        inputs=("speeding_mean",),
-        compute=outcomes.speed_compliance,
-    ),
-    "wrong_way": _over("sum", "wrong_way", "m", "low", "distance driven against traffic", _LANES),
-    "wrong_way_worst": _over(
-        "worst_second", "wrong_way", "m", "low", "most distance against traffic within 1 s", _LANES
-    ),
-    "direction": Metric(
-        "-",
-        "high",
-        "1, 0.5 or 0: at most 2 m, 6 m or more against traffic in 1 s",
-        inputs=("wrong_way_worst",),
-        compute=outcomes.direction,
-    ),
-    "lane_straddle": _over(
-        "sum", "lane_straddle", "s", "low", "time across the border of ego's lanes", _LANES
-    ),
-    "lane_keeping": Metric(
-        "-",
-        "high",
-        "1, 0.5 or 0: straddling at most 3.4 s, 5.7 s or longer",
-        inputs=("lane_straddle",),
-        compute=outcomes.lane_keeping,
-    ),
-    "progress": Metric(
-        "m",
-        "high",
-        "distance gained along the route",
-        _ROUTE,
-        STEP_VALUES["progress"],
-        "last",
-        compute=outcomes.gained,
-    ),
-    "progress_ratio": Metric(
-        "-",
-        "high",
-        "progress as a share of the log's",
-        inputs=("progress",),
-        compute=outcomes.progress_ratio,
-    ),
-    "making_progress": Metric(
-        "-",
-        "high",
-        "progress ratio at least 0.2",
-        inputs=("progress_ratio",),
-        compute=outcomes.making_progress,
-    ),
-    "route_deviation_mean": _over(
-        "mean", "route_deviation", "m", "low", "mean distance to the route", _ROUTE
-    ),
-    "route_deviation_max": _over(
-        "max", "route_deviation", "m", "low", "largest distance to the route", _ROUTE
-    ),
-    "off_route": _over("any", "off_route", "-", "low", "left the lanes of the route", _ROUTE | _LANES),
-    "ade": _over("mean", "log_divergence", "m", "-", "mean distance to the logged position"),
-    "fde": _over("last", "log_divergence", "m", "-", "distance to the logged position at the end"),
-    "goal_distance": _over("last", "goal_distance", "m", "low", "distance to the goal at the end", _ROUTE),
-    "reached_goal": Metric(
-        "-",
-        "high",
-        "within 3 m of the goal, or progress ratio at least 0.95",
-        inputs=("goal_distance", "progress_ratio"),
-        compute=outcomes.reached_goal,
-    ),
-    "distance": _over("sum", "distance", "m", "-", "distance driven"),
-    "ignored_overlaps": _over("max", "ignored", "-", "-", "agents ignored because they overlapped at first"),
-    "steps": Metric("-", "-", "steps driven", compute=outcomes.steps),
+    "accuracy": _computed(
+        _accuracy, ("collision", "offroad", "red_light"), "high", "no collision, not off the road, no red light run",
+        headline=3, **_OUTCOME),
+    "accuracy_at_fault": _computed(
+        _accuracy_at_fault, ("at_fault_collision", "offroad", "red_light"), "high",
+        "no at-fault collision, not off the road, no red light run", label="accuracy, at-fault only", **_OUTCOME),
+    "success": _computed(
+        _success, ("accuracy", "reached_goal"), "high", "accuracy and the goal reached", headline=1, **_OUTCOME),
+    "success_moving": _computed(
+        _success_moving, ("success",), "high", "success where the log drives more than 5 m",
+        label="success, moving", headline=2, **_OUTCOME),
+    "vmax_score": _computed(
+        _score(vmax_score, False), VMAX_INPUTS, "high", "safety gates times ttc, progress, speed, lanes and comfort",
+        label="V-Max score", headline=11, **_SCORE),
+    "nuplan_score": _computed(
+        _score(nuplan_score, False), NUPLAN_INPUTS, "high", "nuPlan's closed-loop score",
+        label="nuPlan score", headline=12, **_SCORE),
+    "vmax_score_partial": _computed(
+        _score(vmax_score, True), VMAX_INPUTS, "high", "vmax_score where an input is undefined",
+        label="partial V-Max score", **_SCORE),
+    "nuplan_score_partial": _computed(
+        _score(nuplan_score, True), NUPLAN_INPUTS, "high", "nuplan_score where an input is undefined",
+        label="partial nuPlan score", **_SCORE),
+    "collision": _accumulated("collision", "any", "-", "low", "boxes overlap", headline=4, **_RATE),
+    "at_fault_collision": _accumulated(
+        "at_fault_collision", "any", "-", "low", "a collision that is ego's fault by nuPlan's rules",
+        label="at-fault collision", headline=5, **_RATE),
+    "collision_type": _accumulated(
+        "collision_type", "first", "-", "-", "kind of the first collision", kind="code", summarised=False),
+    "offroad": _accumulated(
+        "offroad", "any", "-", "low", "a corner more than 0.3 m off the road",
+        label="off-road", headline=6, compute=_on_a_map, **_RATE),
+    "left_map": _accumulated(
+        "left_map", "any", "-", "low", "left the mapped area", label="left the map", compute=_on_a_map, **_RATE),
+    "red_light": _accumulated(
+        "red_light", "any", "-", "low", "ran a red light", needs=Flag.LIGHTS, headline=7, **_RATE),
+    "min_ttc": _accumulated("ttc", "min", "s", "high", "smallest time to collision, at most 5", label="minimum TTC"),
+    "average_ttc": _accumulated("ttc", "mean", "s", "high", "mean time to collision", label="mean TTC"),
+    "ttc_ok": _computed(
+        _ttc_ok, ("min_ttc",), "high", "time to collision always at least 0.95 s", label="TTC ok", headline=9, **_RATE),
+    "comfort": _accumulated("comfort", "mean", "-", "high", "share of steps within nuPlan's limits"),
+    "comfortable": _computed(
+        _comfortable, ("comfort",), "high", "every step within nuPlan's limits", headline=10, **_RATE),
+    "max_jerk": _accumulated("jerk", "max", "m/s3", "low", "largest jerk magnitude"),
+    "max_lateral_acceleration": _accumulated(
+        "lateral_acceleration", "max", "m/s2", "low", "largest lateral acceleration"),
+    "speeding_mean": _accumulated("speeding", "mean", "m/s", "low", "mean speed above the limit"),
+    "speeding_max": _accumulated("speeding", "max", "m/s", "low", "largest speed above the limit"),
+    "speed_compliance": _computed(
+        _speed_compliance, ("speeding_mean",), "high", "1 - mean speeding / 2.23 m/s, at least 0"),
+    "wrong_way": _accumulated("wrong_way", "sum", "m", "low", "distance driven against traffic", needs=_LANES),
+    "wrong_way_worst": _accumulated(
+        "wrong_way", "worst_second", "m", "low", "most distance against traffic within 1 s",
+        label="wrong way within 1 s", needs=_LANES),
+    "direction": _computed(
+        _direction, ("wrong_way_worst",), "high", "1, 0.5 or 0: at most 2 m, 6 m or more against traffic in 1 s"),
+    "lane_straddle": _accumulated(
+        "lane_straddle", "sum", "s", "low", "time across the border of ego's lanes", needs=_LANES),
+    "lane_keeping": _computed(
+        _lane_keeping, ("lane_straddle",), "high", "1, 0.5 or 0: straddling at most 3.4 s, 5.7 s or longer"),
+    "progress": _accumulated(
+        "progress", "last", "m", "high", "distance gained along the route",
+        label="progress along the route", needs=_ROUTE, compute=_progress),
+    "progress_ratio": _computed(
+        _progress_ratio, ("progress",), "high", "progress as a share of the log's", label="progress", headline=8),
+    "making_progress": _computed(
+        _making_progress, ("progress_ratio",), "high", "progress ratio at least 0.2", **_RATE),
+    "route_deviation_mean": _accumulated(
+        "route_deviation", "mean", "m", "low", "mean distance to the route", needs=_ROUTE),
+    "route_deviation_max": _accumulated(
+        "route_deviation", "max", "m", "low", "largest distance to the route", needs=_ROUTE),
+    "off_route": _accumulated(
+        "off_route", "any", "-", "low", "left the lanes of the route", needs=_ROUTE | _LANES, **_RATE),
+    "ade": _accumulated("log_divergence", "mean", "m", "-", "mean distance to the logged position", label="ADE"),
+    "fde": _accumulated(
+        "log_divergence", "last", "m", "-", "distance to the logged position at the end", label="FDE"),
+    "goal_distance": _accumulated(
+        "goal_distance", "last", "m", "low", "distance to the goal at the end", needs=_ROUTE),
+    "reached_goal": _computed(
+        _reached_goal, ("goal_distance", "progress_ratio"), "high",
+        "within 3 m of the goal, or progress ratio at least 0.95", label="goal reached", **_RATE),
+    "distance": _accumulated("distance", "sum", "m", "-", "distance driven"),
+    "ignored_overlaps": _accumulated(
+        "ignored", "max", "-", "-", "agents ignored because they overlapped at the start"),
+    "steps": _computed(_steps, (), "-", "steps driven", summarised=False),
 }
-#: Events whose first step is kept beside the metrics.
-EVENTS = ("collision", "offroad", "red_light")
-#: Metrics that are no quantities, so that no mean of them says anything.
+# fmt: on
+#: Metrics without a mean.
 CODES = ("collision_type",)
-#: What a training loop logs: needs neither contacts' faults, nor time to collision, comfort or limits.
+#: Metrics whose first step is stored as well.
+EVENTS = ("collision", "offroad", "red_light")
+#: What a training loop logs: needs neither fault, time to collision, comfort nor limits.
 TRAINING = (
     "success", "success_moving", "accuracy", "collision", "offroad", "left_map", "red_light", "off_route",
     "progress", "progress_ratio", "making_progress", "reached_goal", "goal_distance", "distance", "steps",
 )  # fmt: skip
 #: Metric sets by name.
 SETS: dict[str, tuple[str, ...]] = {"none": (), "training": TRAINING, "full": tuple(METRICS)}
+
+
+def headline(columns: Mapping[str, Column]) -> tuple[str, ...]:
+    """Return the names of the headline columns in the order of the first table."""
+    ranks = {name: column.headline for name, column in columns.items() if column.headline is not None}
+    return tuple(sorted(ranks, key=ranks.__getitem__))
+
+
+def names_of(columns: Mapping[str, Column], *kinds: Kind) -> tuple[str, ...]:
+    """Return the names of the columns of these kinds."""
+    return tuple(name for name, column in columns.items() if column.kind in kinds)

@@ -1,6 +1,6 @@
 """Comfort by nuPlan's limits and Savitzky-Golay windows, one step at a time.
 
-A window of 15 samples is centred 7 steps back, so a running simulation judges step t - 7 at step t and the last eight
+A window of 15 samples is centred 7 steps back, so a simulation evaluates step t - 7 at step t and the last eight
 steps when the episode ends; the edge is SciPy's ``interp`` mode. The result equals ``scipy.signal.savgol_filter`` over
 the whole episode (tests).
 """
@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 
-#: Samples of a comfort window, and how many trailing steps are judged at once when an episode ends.
+#: Samples of a comfort window, and how many trailing steps are evaluated at once when an episode ends.
 WINDOW, TAIL = 15, 8
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)
@@ -33,17 +33,17 @@ LATERAL_MPS2, JERK_MPS3, JERK_MAGNITUDE_MPS3, YAW_RATE_RPS, YAW_ACCELERATION_RPS
 
 
 @cache
-def tail_operator(window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
+def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
     """The Savitzky-Golay filter as a matrix ``[8, 15]`` from the last 15 samples to the values at the last 8.
 
     Row 0 is an interior point; the last ``window // 2`` rows are read off the last window's polynomial.
     """
-    return filter_operator(WINDOW, window, order, derivative)[-TAIL:]
+    return savgol_matrix(WINDOW, window, order, derivative)[-TAIL:]
 
 
 @cache
-def filter_operator(samples: int, window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter of so many samples as a matrix ``[samples, samples]``.
+def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
+    """The Savitzky-Golay filter of a number of samples as a matrix ``[samples, samples]``.
 
     Least-squares polynomial of ``order`` over ``window`` samples, differentiated ``derivative`` times per sample
     (Savitzky and Golay 1964). Rows near an end are read off the polynomial of the first or last window. As in SciPy,
@@ -75,19 +75,19 @@ class ComfortSteps:
     lateral_mps2: Float[Array, " steps"]
 
 
-def judge_trip(motion: Float[Array, "time 4"]) -> ComfortSteps:
-    """Judges every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
+def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
+    """Evaluate every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
 
-    An episode judges the same, step by step; nothing before row 8 can be judged as a centred window asks for.
+    An episode evaluates the same, step by step; nothing before row 8 can be evaluated as a centred window asks for.
     """
     rows = WINDOW + 1
     windows = jnp.arange(len(motion) - rows + 1)[:, None] + jnp.arange(rows)
-    judged = jax.vmap(judge_comfort)(motion[windows])
+    judged = jax.vmap(check_comfort)(motion[windows])
     return jax.tree.map(lambda part: jnp.concatenate([part[:-1, 0], part[-1]]), judged)
 
 
-def judge_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
-    """Judges the last eight steps of a motion history (x, y, heading, speed) against the limits.
+def check_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
+    """Evaluate the last eight steps of a motion history (x, y, heading, speed) against the limits.
 
     Row 0, seven steps back, is final; the later rows are what SciPy's edge mode would say if the history ended now.
     """
@@ -98,7 +98,11 @@ def judge_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
     lateral = (speed[1:] + speed[:-1]) / 2 * turned / DT_S
 
     def filtered(signal: Array, window: int, order: int, derivative: int) -> Array:
-        return jnp.asarray(tail_operator(window, order, derivative), jnp.float32) @ signal / DT_S**derivative
+        return (
+            jnp.asarray(savgol_tail_matrix(window, order, derivative), jnp.float32)
+            @ signal
+            / DT_S**derivative
+        )
 
     smooth_along, smooth_lateral = filtered(along, 8, 2, 0), filtered(lateral, 8, 2, 0)
     jerk = filtered(along, 15, 2, 1)

@@ -11,10 +11,9 @@ from functools import partial
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.metrics.catalogue import Metric, Operator
-from drivax.metrics.outcomes import Ending
+from drivax.metrics.catalogue import EpisodeEnd, Metric, Operator
 from drivax.metrics.scores import Value
-from drivax.metrics.selection import Selection, Wanted, selected
+from drivax.metrics.selection import MetricNames, MetricSelection, select_metrics
 from drivax.metrics.steps import STEP_VALUES, Moment, StepValue
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
@@ -48,7 +47,7 @@ class Episode:
     event_step: Int[Array, "*batch events"]
     second: Float[Array, "*batch windows 10"]
     worst: Float[Array, "*batch windows"]
-    selection: Selection = static()
+    selection: MetricSelection = static()
 
 
 #: Which operators read which accumulator.
@@ -57,20 +56,20 @@ _HIGH: tuple[Operator, ...] = ("any", "max")
 _WORST: tuple[Operator, ...] = ("worst_second",)
 
 
-def episode_start(wanted: Wanted = "full") -> Episode:
+def episode_start(metrics: MetricNames = "full") -> Episode:
     """Accumulators of an episode with no step yet."""
-    selection = selected(wanted)
-    added, high = len(selection.rows(*_ADDED)), len(selection.rows(*_HIGH))
-    windows = len(selection.rows(*_WORST))
+    selection = select_metrics(metrics)
+    added, high = len(selection.step_values(*_ADDED)), len(selection.step_values(*_HIGH))
+    windows = len(selection.step_values(*_WORST))
     # Types as strong as those of later steps: else a program that steps is traced and compiled twice.
     full = partial(jnp.full, dtype=float)
     return Episode(
         total=jnp.zeros(added),
         count=jnp.zeros(added, jnp.int16),
-        low=full(len(selection.rows("min")), jnp.inf),
+        low=full(len(selection.step_values("min")), jnp.inf),
         high=full(high, -jnp.inf),
-        last=full(len(selection.rows("last")), jnp.nan),
-        first=full(len(selection.rows("first")), jnp.nan),
+        last=full(len(selection.step_values("last")), jnp.nan),
+        first=full(len(selection.step_values("first")), jnp.nan),
         event_step=jnp.full(len(selection.events), _NEVER, jnp.int16),
         second=jnp.zeros((windows, _SECOND)),
         worst=full(windows, -jnp.inf),
@@ -85,18 +84,18 @@ def episode_add(episode: Episode, found: Situation, start: Int[Array, ""], final
         episode: Accumulators so far.
         found: What the step led to.
         start: Step at which the episode began.
-        final: The episode ends here, so the comfort of its last steps is judged too.
+        final: The episode ends here, so the comfort of its last steps is evaluated too.
     """
     selection, seen = episode.selection, _Seen(Moment(found, start, final))
-    added, number = seen.sums(selection.rows(*_ADDED))
-    low, _ = seen.extremes(selection.rows("min"), jnp.min, jnp.inf)
-    high, _ = seen.extremes(selection.rows(*_HIGH), jnp.max, -jnp.inf)
-    last, last_counts = seen.extremes(selection.rows("last"), jnp.max, -jnp.inf)
-    first, first_counts = seen.extremes(selection.rows("first"), jnp.max, -jnp.inf)
+    added, number = seen.sums(selection.step_values(*_ADDED))
+    low, _ = seen.extremes(selection.step_values("min"), jnp.min, jnp.inf)
+    high, _ = seen.extremes(selection.step_values(*_HIGH), jnp.max, -jnp.inf)
+    last, last_counts = seen.extremes(selection.step_values("last"), jnp.max, -jnp.inf)
+    first, first_counts = seen.extremes(selection.step_values("first"), jnp.max, -jnp.inf)
     waiting = first_counts & ~(episode.first > 0)
     happens, _ = seen.extremes(tuple(STEP_VALUES[name] for name in selection.events), jnp.max, 0.0)
     begins = (happens > 0) & (episode.event_step == _NEVER)
-    window, _ = seen.sums(selection.rows(*_WORST))
+    window, _ = seen.sums(selection.step_values(*_WORST))
     second = jnp.concatenate([episode.second[:, 1:], window[:, None]], axis=1)
     return Episode(
         total=episode.total + added,
@@ -105,7 +104,7 @@ def episode_add(episode: Episode, found: Situation, start: Int[Array, ""], final
         high=jnp.maximum(episode.high, high),
         last=jnp.where(last_counts, last, episode.last),
         first=jnp.where(waiting, first, episode.first),
-        event_step=jnp.where(begins, found.scene.step.astype(jnp.int16), episode.event_step),
+        event_step=jnp.where(begins, found.context.step.astype(jnp.int16), episode.event_step),
         second=second,
         worst=jnp.maximum(episode.worst, second.sum(axis=1)),
         selection=selection,
@@ -150,13 +149,13 @@ def _stacked(scalars: Sequence[Array], kind: type) -> Array:
 
 def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
     """The selected metrics of the episode that ``state`` ended, by name; undefined ones have the value 0."""
-    scene, episode = state.scene, state.episode
-    ending = Ending(bank, scene.index, state.start, scene.step - state.start)
+    context, episode = state.context, state.episode
+    end = EpisodeEnd(bank, context.index, state.start, context.step - state.start)
     result: dict[str, Value] = {}
     for name, metric in episode.selection.metrics:
         value = _accumulated(episode, metric)
         if metric.compute is not None:
-            value = metric.compute(ending, value, result)
+            value = metric.compute(end, value, result)
         defined = value.defined & _has(bank, state, metric.needs) & jnp.isfinite(value.value)
         result[name] = Value(jnp.where(defined, value.value, 0.0), defined)
     return {name: result[name] for name in episode.selection.names}
@@ -164,37 +163,37 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
 
 def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
     """Whether the scenario has what a metric needs. The route is ego's; other slots have none."""
-    wanted = jnp.uint32(int(needs))
-    held = (bank.flags[state.scene.index] & wanted) == wanted
-    return held & ((Flag.ROUTE not in needs) | (state.scene.slot == 0))
+    desired = jnp.uint32(int(needs))
+    held = (bank.flags[state.context.index] & desired) == desired
+    return held & ((Flag.ROUTE not in needs) | (state.context.slot == 0))
 
 
 def _accumulated(episode: Episode, metric: Metric) -> Value:
     """An accumulated step value; undefined where no step defined it."""
-    if metric.of is None:
+    if metric.step_value is None:
         return Value(jnp.zeros(()), jnp.zeros((), bool))
-    rows = episode.selection.rows
+    step_values = episode.selection.step_values
     operator = metric.operator
     if operator in _ADDED:
-        row = rows(*_ADDED).index(metric.of)
+        row = step_values(*_ADDED).index(metric.step_value)
         total, count = episode.total[row], episode.count[row]
         mean = total / jnp.maximum(count, 1).astype(jnp.float32)
         return Value(mean if operator == "mean" else total, count > 0)
     if operator in _HIGH:
-        value = episode.high[rows(*_HIGH).index(metric.of)]
+        value = episode.high[step_values(*_HIGH).index(metric.step_value)]
         return Value((value > 0).astype(jnp.float32) if operator == "any" else value, jnp.isfinite(value))
     if operator in _WORST:
-        value = episode.worst[rows(*_WORST).index(metric.of)]
+        value = episode.worst[step_values(*_WORST).index(metric.step_value)]
     elif operator == "min":
-        value = episode.low[rows("min").index(metric.of)]
+        value = episode.low[step_values("min").index(metric.step_value)]
     elif operator == "first":
-        value = episode.first[rows("first").index(metric.of)]
+        value = episode.first[step_values("first").index(metric.step_value)]
     else:
-        value = episode.last[rows("last").index(metric.of)]
+        value = episode.last[step_values("last").index(metric.step_value)]
     return Value(value, jnp.isfinite(value))
 
 
-def first_steps(episode: Episode) -> dict[str, Int[Array, ""]]:
+def event_steps(episode: Episode) -> dict[str, Int[Array, ""]]:
     """Step of the first collision, off-road step and red light, as far as they are selected; -1 for none."""
     return {
         name: jnp.where(episode.event_step[row] == _NEVER, -1, episode.event_step[row])

@@ -1,4 +1,4 @@
-"""Which metrics are wanted, and what has to be measured and carried for them."""
+"""Select metrics by name, and derive what has to be measured and carried for them."""
 
 from __future__ import annotations
 
@@ -13,101 +13,93 @@ from drivax.metrics.steps import StepValue
 from drivax.plugins import find_named, is_dotted
 from drivax.simulator.types import FACTS
 
-#: What a configuration says: the name of a set, or names of sets, metrics and metrics of the user's own.
-Wanted = str | tuple[str, ...]
+#: A configuration's choice: the name of a set, or names of sets, metrics and the user's own metrics.
+MetricNames = str | tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Selection:
-    """Metrics that are computed, in order. :func:`selected` makes each selection once, and compiled programs go by it.
+class MetricSelection:
+    """Metrics that are computed, in order. :func:`select_metrics` caches them: compiled programs compare by identity.
 
     Attributes:
-        names: What was asked for.
-        metrics: These, and whatever they are computed from, inputs first.
-        reads: Facts that their step values look at; all of them for the full set, which planners may read too.
+        names: The requested metrics.
+        metrics: These and their inputs, inputs first.
+        reads: Facts that their step values read; all of them for the full set, which planners may read too.
     """
 
     names: tuple[str, ...]
     metrics: tuple[tuple[str, Metric], ...]
     reads: frozenset[str]
 
-    def rows(self, *operators: Operator) -> tuple[StepValue, ...]:
-        """Step values that one of these operators accumulates, each once."""
-        found = {m.of: None for _, m in self.metrics if m.of is not None and m.operator in operators}
-        return tuple(found)
+    def step_values(self, *operators: Operator) -> tuple[StepValue, ...]:
+        """Return the step values that one of these operators (by default any) accumulates, each once."""
+        metrics = [m for _, m in self.metrics if not operators or m.operator in operators]
+        return tuple({m.step_value: None for m in metrics if m.step_value is not None})
 
     @property
     def events(self) -> tuple[str, ...]:
-        """Events whose first step is kept."""
+        """Events whose first step is stored."""
         return tuple(name for name in EVENTS if name in dict(self.metrics))
-
-    @property
-    def values(self) -> tuple[StepValue, ...]:
-        """All step values, each once."""
-        return tuple({m.of: None for _, m in self.metrics if m.of is not None})
 
 
 @cache
-def selected(wanted: Wanted) -> Selection:
-    """The metrics that a configuration asks for.
+def select_metrics(names: MetricNames) -> MetricSelection:
+    """Return the metrics that a configuration names.
 
     Args:
-        wanted: ``none``, ``training`` or ``full``; or a tuple of such sets, names of metrics, and dotted names
-            (``package.module:name``) of metrics of the user's own, which are called by their last word.
+        names: ``none``, ``training`` or ``full``; or a tuple of such sets, names of metrics, and dotted names
+            (``package.module:name``) of the user's own metrics, which take their last word as name.
 
     Raises:
-        UsageError: There is no such set or metric, or two of one name.
+        UsageError: There is no such set or metric, or two metrics have the same name.
     """
-    entries = (wanted,) if isinstance(wanted, str) else wanted
-    names: dict[str, None] = {}
+    requested: dict[str, None] = {}
     own: dict[str, Metric] = {}
-    for entry in entries:
+    for entry in (names,) if isinstance(names, str) else names:
         if is_dotted(entry):
             name = entry.rpartition(":")[2].rpartition(".")[2]
-            own[name] = _own(entry, name, own)
-            names[name] = None
+            own[name] = _own_metric(entry, name, own)
+            requested[name] = None
         else:
-            names |= dict.fromkeys(SETS[entry] if entry in SETS else (_known(entry),))
-    closed: dict[str, Metric] = {}
-    for name in names:
-        _close(name, METRICS | own, closed)
-    steps = [m.of for m in closed.values() if m.of is not None]
-    reads = frozenset[str]().union(*(s.reads for s in steps))
-    if set(METRICS) <= set(names):
+            requested |= dict.fromkeys(SETS[entry] if entry in SETS else (_known(entry),))
+    metrics: dict[str, Metric] = {}
+    for name in requested:
+        _add_with_inputs(name, METRICS | own, metrics)
+    reads = frozenset[str]().union(
+        *(m.step_value.reads for m in metrics.values() if m.step_value is not None)
+    )
+    if set(METRICS) <= set(requested):
         reads |= FACTS
-    return Selection(tuple(names), tuple(closed.items()), reads)
+    return MetricSelection(tuple(requested), tuple(metrics.items()), reads)
 
 
-def catalogue(wanted: Wanted) -> Mapping[str, Metric]:
-    """The metrics that are asked for, by name: units and directions for tables."""
-    selection = selected(wanted)
-    known = dict(selection.metrics)
-    return MappingProxyType({name: known[name] for name in selection.names})
+def metric_specs(names: MetricNames) -> Mapping[str, Metric]:
+    """Return the specification of each requested metric by name."""
+    selection = select_metrics(names)
+    specs = dict(selection.metrics)
+    return MappingProxyType({name: specs[name] for name in selection.names})
 
 
 def _known(name: str) -> str:
     if name not in METRICS:
-        raise UsageError(f"there is no metric {name!r}", cure=did_you_mean(name, [*SETS, *METRICS]))
+        raise UsageError(f"unknown metric {name!r}", cure=did_you_mean(name, [*SETS, *METRICS]))
     return name
 
 
-def _own(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
-    found = find_named(entry)
-    if not isinstance(found, Metric):
-        raise UsageError(f"{entry!r} is no metric", cure="make it a drivax.metrics.catalogue.Metric")
+def _own_metric(entry: str, name: str, others: Mapping[str, Metric]) -> Metric:
+    metric = find_named(entry)
+    if not isinstance(metric, Metric):
+        raise UsageError(f"{entry!r} is not a metric", cure="make it a drivax.metrics.catalogue.Metric")
     if name in METRICS or name in others:
-        raise UsageError(f"{entry!r}: there is another metric {name!r}", cure="give it another name")
-    missing = [one for one in found.inputs if one not in METRICS and one not in others]
-    if missing:
-        raise UsageError(
-            f"{entry!r} is computed from {missing[0]!r}", cure=did_you_mean(missing[0], [*METRICS])
-        )
-    return found
+        raise UsageError(f"{entry!r}: the metric {name!r} already exists", cure="choose another name")
+    for needed in metric.inputs:
+        if needed not in METRICS and needed not in others:
+            raise UsageError(f"{entry!r}: unknown input {needed!r}", cure=did_you_mean(needed, [*METRICS]))
+    return metric
 
 
-def _close(name: str, known: Mapping[str, Metric], closed: dict[str, Metric]) -> None:
-    """Adds a metric after its inputs."""
-    if name not in closed:
+def _add_with_inputs(name: str, known: Mapping[str, Metric], metrics: dict[str, Metric]) -> None:
+    if name not in metrics:
         for needed in known[name].inputs:
-            _close(needed, known, closed)
-        closed[name] = known[name]
+            _add_with_inputs(needed, known, metrics)
+        metrics[name] = known[name]

@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from drivax.metrics.comfort import TAIL, ComfortSteps, judge_comfort
+from drivax.metrics.comfort import TAIL, ComfortSteps, check_comfort
 from drivax.metrics.scores import Value
 from drivax.scenario.schema import DT_S
 from drivax.simulator.types import FACTS, Facts, Situation
@@ -28,24 +28,24 @@ class Moment:
     Attributes:
         found: The situation.
         start: Step at which the episode began.
-        final: Whether the episode ends here, so that the comfort of its last steps is judged too.
+        final: Whether the episode ends here, so that the comfort of its last steps is evaluated too.
     """
 
-    found: Situation
+    situation: Situation
     start: Int[Array, ""]
     final: Bool[Array, ""]
 
     @property
     def facts(self) -> Facts:
         """What was measured."""
-        return self.found.facts
+        return self.situation.facts
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " 8"]]:
-        """The last eight steps, and which of them are judged now: the oldest, and all at the end."""
-        step = self.found.scene.step - (TAIL - 1) + jnp.arange(TAIL)
+        """The last eight steps, and which of them are evaluated now: the oldest, and all at the end."""
+        step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
-        return judge_comfort(self.found.scene.history), counts
+        return check_comfort(self.situation.context.history), counts
 
 
 #: Numbers, of no axis or one, and whether each is defined.
@@ -61,14 +61,14 @@ class StepValue:
         unit: Its unit, ``-`` for booleans and codes.
         read: The value at a moment and whether it is defined (a boolean, or a plain True).
         reads: Names of the facts that ``read`` looks at.
-        late: Judged some steps later, several at once; not a number of its own step.
+        delayed: Judged some steps later, several at once; not a number of its own step.
     """
 
     name: str
     unit: str
     read: Read
     reads: frozenset[str] = FACTS
-    late: bool = False
+    delayed: bool = False
 
 
 def _fact(name: str, unit: str, fact: str) -> StepValue:
@@ -87,7 +87,7 @@ def _comfort(name: str, unit: str, part: str) -> StepValue:
         steps, counts = moment.comfort
         return getattr(steps, part), counts
 
-    return StepValue(name, unit, read, frozenset(), late=True)
+    return StepValue(name, unit, read, frozenset(), delayed=True)
 
 
 _ALL = (
@@ -127,19 +127,19 @@ _ALL = (
 STEP_VALUES: dict[str, StepValue] = {value.name: value for value in _ALL}
 
 
-def step_metrics(found: Situation, values: Sequence[StepValue] | None = None) -> dict[str, Value]:
+def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None) -> dict[str, Value]:
     """Step values of one situation, for tables and plots.
 
-    Comfort needs the seven steps that follow; :func:`drivax.metrics.comfort.judge_trip` judges a whole trip.
+    Comfort needs the seven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
 
     Args:
-        found: What was measured; its facts must hold what the values read (a task with ``metrics: full`` holds all).
+        situation: Its facts must hold what the values read (a task with ``metrics: full`` holds all).
         values: Which; by default all that belong to one step.
     """
     never = jnp.zeros((), bool)
-    moment = Moment(found, found.scene.step, never)
+    moment = Moment(situation, situation.context.step, never)
     result = {}
-    for value in values or [v for v in STEP_VALUES.values() if not v.late]:
+    for value in values or [v for v in STEP_VALUES.values() if not v.delayed]:
         number, defined = value.read(moment)
         result[value.name] = Value(number.astype(jnp.float32), jnp.asarray(defined, bool))
     return result

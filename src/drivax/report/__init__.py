@@ -1,1 +1,5 @@
-"""Tables, pictures, videos and HTML pages of runs and scenario sets."""
+"""Reports of runs and scenario sets: pages, tables, comparisons, videos and pictures."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,8 +1,10 @@
-"""Drives of evaluations in the scenarios that they drove, for player and video."""
+"""Episodes that a report shows: their selection (failures first), scenarios and rollouts."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,35 +12,154 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.evaluation.stored import ScenarioKey, open_driven_set
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.traffic_trajectories import unpacked
 from drivax.report.charts.motion import COMMANDED
-from drivax.report.episode_selection import Choice, outcome
-from drivax.report.loaded_runs import Evaluation
-from drivax.report.pictures.episode import Drive
+from drivax.report.pictures.drawing import Rollout
+from drivax.report.runs import Evaluation
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 
+#: Kinds of failure, gravest first: (words, metric, value that means failure).
+FAILURES = (
+    ("planner crashed", "crashed", 1.0),
+    ("at-fault collision", "at_fault_collision", 1.0),
+    ("collision", "collision", 1.0),
+    ("off-road", "offroad", 1.0),
+    ("red light", "red_light", 1.0),
+    ("left the map", "left_map", 1.0),
+    ("goal not reached", "reached_goal", 0.0),
+)
+#: Share of successes among the shown episodes where there are enough failures.
+_SUCCESS_SHARE = 0.25
 
-class DrivenSet:
-    """The scenarios that an evaluation drove.
+
+@dataclass(frozen=True)
+class EpisodeGroup:
+    """The episodes of all runs in one scenario.
+
+    Attributes:
+        dataset, scenario_id: The scenario.
+        rows: Episode of that scenario in each run, None where the run lacks it.
+        outcome: Outcome of the policy: a kind of failure, or ``success``.
+    """
+
+    dataset: str
+    scenario_id: str
+    rows: tuple[int | None, ...]
+    outcome: str
+
+    @property
+    def key(self) -> ScenarioKey:
+        """The scenario."""
+        return self.dataset, self.scenario_id
+
+
+def outcome(run: EpisodeTable, row: int) -> str:
+    """Return the gravest failure of an episode, ``success``, or ``unjudged`` where nothing is defined."""
+    defined = False
+    for words, metric, bad in FAILURES:
+        value = _value(run, metric, row)
+        defined |= not np.isnan(value)
+        if value == bad:
+            return words
+    return "success" if defined else "unjudged"
+
+
+def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]:
+    """Return the rows of a run, worst episode first: by failure, then by score.
+
+    Among equals those come first that more of the other runs completed without failure, then by scenario id.
+    """
+    order = [words for words, _, _ in FAILURES]
+    rank = {words: place for place, words in enumerate([*order, "unjudged", "success"])}
+    completed: Counter[ScenarioKey] = Counter()
+    for other in others:
+        if comparable(run, other):
+            keys = enumerate(other.scenarios)
+            completed.update({key for row, key in keys if outcome(other, row) == "success"})
+    scenarios = run.scenarios
+
+    def key(row: int) -> tuple[int, float, int, str, int]:
+        score = _value(run, "vmax_score", row)
+        known = 1.0 if np.isnan(score) else score
+        return rank[outcome(run, row)], known, -completed[scenarios[row]], scenarios[row][1], row
+
+    return sorted(range(len(run)), key=key)
+
+
+def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
+    """Return episodes of the last run: failures of every kind in turn, worst score first, and some successes.
+
+    Among equal failures those come first that another planner completed; among successes those where others failed.
+    """
+    kinds: dict[str, list[EpisodeGroup]] = {}
+    for group in ranked(runs):
+        kinds.setdefault(group.outcome, []).append(group)
+    successes = sorted(
+        kinds.pop("success", []), key=lambda group: (_completed(runs, group), group.scenario_id)
+    )
+    failures = _in_turn(list(kinds.values()))
+    most = max(count - len(successes), count - round(_SUCCESS_SHARE * count))
+    return (failures[:most] + successes[: count - min(most, len(failures))])[:count]
+
+
+def _in_turn(kinds: list[list[EpisodeGroup]]) -> list[EpisodeGroup]:
+    """Return the first of each kind, then the second of each, and so on."""
+    longest = max(map(len, kinds), default=0)
+    return [groups[place] for place in range(longest) for groups in kinds if place < len(groups)]
+
+
+def _completed(runs: Sequence[Evaluation], group: EpisodeGroup) -> int:
+    """Return the number of runs without a failure."""
+    rows = zip(runs, group.rows, strict=True)
+    return sum(outcome(run, row) == "success" for run, row in rows if row is not None)
+
+
+def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
+    """Return all scenarios of the last run with a stored trajectory, worst first."""
+    policy = runs[-1]
+    others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
+    groups = {
+        row: EpisodeGroup(*key, (*(rows.get(key) for rows in others), row), outcome(policy, row))
+        for key, row in _first_rows(policy).items()
+    }
+    return [groups[row] for row in worst_first(policy, runs[:-1]) if row in groups]
+
+
+def _first_rows(run: Evaluation) -> dict[ScenarioKey, int]:
+    """Return the first episode of each scenario."""
+    rows: dict[ScenarioKey, int] = {}
+    for row, key in enumerate(run.scenarios):
+        rows.setdefault(key, row)
+    return rows
+
+
+def _value(run: EpisodeTable, metric: str, row: int) -> float:
+    """Return a metric of an episode; NaN where it is undefined or missing."""
+    return float(run.metrics[metric][row]) if metric in run.metrics else float("nan")
+
+
+class EvaluatedSet:
+    """The scenarios of an evaluation.
 
     Args:
         run: The evaluation.
-        data: Where its scenario set is, if it has moved.
+        data: Path of its scenario set, if it has moved.
 
     Raises:
-        DataError: It is not there, or another one is.
+        DataError: The set is missing, or has another hash.
     """
 
     def __init__(self, run: Evaluation, data: Path | None = None) -> None:
-        self.scenarios: ScenarioSet = open_driven_set(run, data)
+        self.scenarios: ScenarioSet = run.open_set(data)
         self._rows = {
             (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
         }
 
     def scenario(self, key: ScenarioKey) -> Scenario:
-        """A scenario by data set and id.
+        """Return a scenario by data set and id.
 
         Raises:
             DataError: It is not in the set.
@@ -54,37 +175,38 @@ class DrivenSet:
         return self.scenarios[row]
 
     def tags(self) -> dict[ScenarioKey, Mapping[str, str]]:
-        """The tags of every scenario."""
+        """Return the tags of every scenario."""
         return {key: self.scenarios.entries[row]["tags"] for key, row in self._rows.items()}
 
 
-def drives_of(runs: Sequence[Evaluation], choice: Choice, scenario: Scenario) -> list[Drive]:
-    """What each run that drove the chosen scenario did there."""
-    rows = zip(runs, choice.rows, strict=True)
-    return [_drive(run, place, scenario) for run, place in rows if place is not None]
+def rollouts_of(runs: Sequence[Evaluation], group: EpisodeGroup, scenario: Scenario) -> list[Rollout]:
+    """Return the rollout of each run that has an episode in the group."""
+    rows = zip(runs, group.rows, strict=True)
+    return [_rollout(run, row, scenario) for run, row in rows if row is not None]
 
 
-def _drive(run: Evaluation, row: int, scenario: Scenario) -> Drive:
+def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
     stored = run.trajectories
-    place = stored.rows[run.occurrences[row]]
-    steps, start = int(scenario.steps), int(stored.start[place])
+    steps, start = int(scenario.steps), int(stored.start[row])
     ego = np.full((steps, 4), np.nan)
-    ego[:start] = logged_drive(scenario)[:start]
-    driven = stored.ego[place, : steps - start]
-    ego[start : start + len(driven)] = driven
-    events = {name: int(at[place]) for name, at in stored.events.items()}
-    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
-    action, asked = np.full((steps, COMMANDED), np.nan), stored.action[place, : steps - start, :COMMANDED]
-    action[start : start + len(asked), : asked.shape[1]] = asked
+    ego[:start] = logged_motion(scenario)[:start]
+    motion = stored.ego[row, : steps - start]
+    ego[start : start + len(motion)] = motion
+    events = {name: int(at[row]) for name, at in stored.events.items()}
+    crash = run.crash_by_scenario.get(run.scenarios[row])
+    events["crashed"] = -1 if crash is None else crash.step
+    action = np.full((steps, COMMANDED), np.nan)
+    commands = stored.action[row, : steps - start, :COMMANDED]
+    action[start : start + len(commands), : commands.shape[1]] = commands
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(driven)] = unpacked(stored.others[place, : steps - start])
-    return Drive(run.name, ego, start, events, outcome(run, row), action, others)
+        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
+    return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 
-def logged_drive(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
-    """The logged ego: position, heading, speed; NaN where it was not valid."""
+def logged_motion(scenario: Scenario) -> Float[np.ndarray[Any, Any], "step 4"]:
+    """Return position, heading and speed of the logged ego; NaN where it is not valid."""
     steps = int(scenario.steps)
     speed = np.linalg.norm(scenario.agent_velocity[:steps, 0], axis=-1)
     pose = np.column_stack((scenario.agent_xy[:steps, 0], scenario.agent_heading[:steps, 0], speed))

@@ -1,4 +1,4 @@
-"""What scenario sets hold, as numbers: opened, tested, selected and summed up for tables and pages."""
+"""Contents of scenario sets as numbers: opened, tested, selected and summed up for tables and pages."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from jaxtyping import Float
 
 from drivax.errors import DataError
 from drivax.scenario.schema import DT_S, Scenario
-from drivax.scenario.select.filters import FINDINGS, Selection, tag_words
+from drivax.scenario.select.selection import FINDINGS, Selection, tag_words
 from drivax.scenario.store import ScenarioSet
 
 Array = np.ndarray[Any, Any]
 Entry = Mapping[str, Any]
 
 _SOURCE = ("steps", "tracks", "tracks_valid_now", "map_features", "map_points", "lights")
-#: Scenarios whose records are looked into; the rest is told by the manifest.
+#: Scenarios with records that are read; the manifest describes the rest.
 SAMPLE = 1000
 
 
 def described(entry: Entry) -> dict[str, Any]:
-    """One scenario as ``inspect --json`` prints it: a stable contract."""
+    """Return one scenario as ``inspect --json`` prints it: a stable contract."""
     return {
         **{name: entry[name] for name in ("scenario_id", "dataset", "segment")},
         **{name: entry["source"][name] for name in _SOURCE},
@@ -35,13 +35,13 @@ def described(entry: Entry) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A scenario set, opened for a look.
+    """An opened scenario set.
 
     Attributes:
-        name: What tables call it.
+        name: Its name in tables.
         scenarios: The set.
         rows: Rows of the selected scenarios, at least one.
-        unknown: How many scenarios do not know what a filter asks for, by filter.
+        unknown: Number of scenarios that lack what a filter asks for, by filter.
         checked: Whether every checksum was tested.
     """
 
@@ -53,7 +53,7 @@ class Inspection:
 
     @classmethod
     def open(cls, path: Path, selection: Selection, check: bool = True) -> Inspection:
-        """Opens a set.
+        """Open a set.
 
         Args:
             path: Its folder.
@@ -83,16 +83,16 @@ class Inspection:
 
     @property
     def entries(self) -> list[Entry]:
-        """What the manifest says about the selected scenarios."""
+        """The manifest entries of the selected scenarios."""
         return [self.scenarios.entries[row] for row in self.rows]
 
     @property
     def source(self) -> Mapping[str, Any]:
-        """How the set was made, and what was read and is not in it; empty for sets that were written by hand."""
+        """The origin of the set, and what was read and left out; empty for sets that were written by hand."""
         return self.scenarios.manifest["source"]
 
     def sample(self, most: int | None = None) -> Iterator[Scenario]:
-        """At most so many (``SAMPLE`` otherwise) of the selected scenarios, evenly spread."""
+        """Return at most ``most`` (``SAMPLE`` by default) of the selected scenarios, evenly spread."""
         most = SAMPLE if most is None else most
         places = np.unique(np.linspace(0, len(self.rows) - 1, min(most, len(self.rows))).round())
         return (self.scenarios[self.rows[int(place)]] for place in places)
@@ -103,49 +103,54 @@ class Inspection:
         return sum(max(entry["source"]["steps"] - 1, 0) for entry in self.entries) * DT_S / 3600
 
     @property
+    def recordings(self) -> int:
+        """Number of recordings: segments of data sets."""
+        return len({(entry["dataset"], entry["segment"]) for entry in self.entries})
+
+    @property
     def megabytes(self) -> float:
         """Size of the whole set on disk, MB."""
         files = (path for path in self.scenarios.path.rglob("*") if path.is_file())
         return sum(path.stat().st_size for path in files) / 1e6
 
     def rate_hz(self) -> tuple[float, float]:
-        """Smallest and largest rate of the sampled scenarios, Hz."""
+        """Return the smallest and largest rate of the sampled scenarios, Hz."""
         rates = [1.0 / float(scenario.record["dt_s"]) for scenario in self.sample()]
         return min(rates), max(rates)
 
     def values(self, read: Callable[[Entry], Any]) -> Float[Array, " known"]:
-        """A number of every scenario that knows it."""
-        found = (read(entry) for entry in self.entries)
-        return np.array([value for value in found if value is not None], np.float64)
+        """Return a number of every scenario that has it."""
+        numbers = (read(entry) for entry in self.entries)
+        return np.array([value for value in numbers if value is not None], np.float64)
 
     def words(self, read: Callable[[Entry], Sequence[str]]) -> dict[str, int]:
-        """How many scenarios say each word, the most frequent first."""
+        """Return the number of scenarios with each word, the most frequent first."""
         counts = Counter(word for entry in self.entries for word in read(entry))
         return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
     def tags(self) -> dict[str, dict[str, int]]:
-        """How many scenarios have each value of each tag; the data set is told elsewhere."""
+        """Return the number of scenarios with each value of each tag except the data set."""
         names = self.words(lambda entry: [name for name in entry["tags"] if name != "dataset"])
         return {name: self.words(lambda e, name=name: sorted(tag_words(e, name))) for name in names}
 
     def totals(self, read: Callable[[Entry], Mapping[str, int]]) -> dict[str, tuple[int, int]]:
-        """Sum of each counter, and in how many scenarios it is not zero."""
-        counts, places = Counter[str](), Counter[str]()
+        """Return the sum of each counter, and the number of scenarios where it is not zero."""
+        counts, scenarios = Counter[str](), Counter[str]()
         for entry in self.entries:
-            found = {name: number for name, number in read(entry).items() if number}
-            counts.update(found)
-            places.update(found.keys())
-        return {name: (counts[name], places[name]) for name in sorted(counts)}
+            nonzero = {name: number for name, number in read(entry).items() if number}
+            counts.update(nonzero)
+            scenarios.update(nonzero.keys())
+        return {name: (counts[name], scenarios[name]) for name in sorted(counts)}
 
     def findings(self) -> list[str]:
-        """Names of what the audit says of some scenario, in the order of ``scenario.select.filters.FINDINGS``."""
-        found = {name for e in self.entries for name, value in e["audit"].items() if value is not None}
-        return [*(name for name in FINDINGS if name in found), *sorted(found - set(FINDINGS))]
+        """Return the names of the audit's findings, in the order of ``scenario.select.selection.FINDINGS``."""
+        names = {name for e in self.entries for name, value in e["audit"].items() if value is not None}
+        return [*(name for name in FINDINGS if name in names), *sorted(names - set(FINDINGS))]
 
     def finding(self, name: str) -> list[Any]:
-        """What the audit says under a name, of every scenario that it says it of."""
-        found = (entry["audit"].get(name) for entry in self.entries)
-        return [value for value in found if value is not None]
+        """Return a finding of the audit for every scenario that has it."""
+        values = (entry["audit"].get(name) for entry in self.entries)
+        return [value for value in values if value is not None]
 
 
 def _counted(name: str) -> Callable[[Entry], Any]:
@@ -156,20 +161,20 @@ def _mapped(name: str) -> Callable[[Entry], Any]:
     return lambda entry: entry["source"]["map_features"].get(name, 0)
 
 
-def _found(name: str) -> Callable[[Entry], Any]:
+def _audited(name: str) -> Callable[[Entry], Any]:
     return lambda entry: entry["audit"].get(name)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number of a scenario, as tables and histograms show it."""
+    """A number of a scenario in tables and histograms."""
 
     label: str
     unit: str
     read: Callable[[Entry], Any]
 
 
-#: What every scenario is measured by: its source, before cropping and capping, and its audit.
+#: Numbers of every scenario: of its source, before cropping and capping, and of its audit.
 QUANTITIES = (
     Quantity("agents now", "", _counted("tracks_valid_now")),
     Quantity("tracks", "", _counted("tracks")),
@@ -182,9 +187,9 @@ QUANTITIES = (
     Quantity("map points", "", _counted("map_points")),
     Quantity("stored segments", "", lambda entry: entry["segments"]),
     Quantity("lights", "", _counted("lights")),
-    Quantity("ego drives", "m", _found("distance_m")),
-    Quantity("log to route, mean", "m", _found("route_deviation_mean_m")),
-    Quantity("log to route, most", "m", _found("route_deviation_max_m")),
+    Quantity("ego drives", "m", _audited("distance_m")),
+    Quantity("log to route, mean", "m", _audited("route_deviation_mean_m")),
+    Quantity("log to route, most", "m", _audited("route_deviation_max_m")),
 )
 
 
@@ -193,9 +198,9 @@ class Speeds:
     """Speeds in sampled scenarios, m/s.
 
     Attributes:
-        ego: Ego, at every step of its log.
-        vehicles: Other vehicles that move in their log, at the current step.
-        scenarios: How many scenarios were sampled.
+        ego: Ego at every step of its log.
+        vehicles: Other moving vehicles at the current step.
+        scenarios: Number of sampled scenarios.
     """
 
     ego: Float[Array, " step"]
@@ -204,7 +209,7 @@ class Speeds:
 
 
 def speeds(inspection: Inspection) -> Speeds:
-    """Reads speeds from the records of a sample."""
+    """Return speeds from the records of a sample."""
     ego, vehicles = [np.zeros(0)], [np.zeros(0)]
     count = 0
     for count, scenario in enumerate(inspection.sample(), 1):  # noqa: B007

@@ -1,55 +1,58 @@
-"""Tables of ``drivax inspect`` for a terminal: one set in full, or several side by side."""
+"""Tables of ``drivax inspect``: one set in full, several side by side, and what a policy observes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rich.table import Table
 
+from drivax.evaluation.observation_statistics import FeatureStatistics, ObservationStatistics
+from drivax.report.charts.distributions import short
 from drivax.report.inspection import QUANTITIES, Entry, Inspection
+from drivax.table import MISSING, Cell, Column, Table
 
-#: Scenarios that are listed, values of a tag that are named, and sets that stand side by side.
-LISTED, NAMED, ABREAST = 30, 6, 4
-#: Records that could not be read, of which the cause is told.
-_CAUSES = 3
+#: Listed scenarios, named values of a tag, sets next to each other, and printed causes of unreadable records, at most.
+LISTED, NAMED, ACROSS, _CAUSES = 30, 6, 4, 3
+#: A label and one text per set.
+Row = tuple[str, list[str]]
 
 
 def overview(inspection: Inspection) -> Table:
-    """What a set is: counts, size, tags, flags, what did not fit."""
+    """Return the facts of a set: counts, size, tags, flags, overflow."""
     scenarios, count = inspection.scenarios, len(inspection)
     manifest, capacity = scenarios.manifest, scenarios.capacity
-    table = _facts()
-    table.add_row("set", str(scenarios.path))
-    table.add_row("scenarios", f"{_selected(inspection)} ({_recorded(inspection)}{_shards(inspection)})")
-    for name, lacking in inspection.unknown.items():
-        table.add_row("", f"{lacking:,} do not know what {name!r} asks for and are left out")
-    datasets = inspection.words(lambda entry: [entry["dataset"]])
-    table.add_row("data sets", _counted(datasets, count))
-    table.add_row("duration", f"{_hours(inspection)} at {_rate(inspection)}")
+    segments = f"recorded segments: {inspection.recordings:,}, shards: {len(manifest['shards']):,}"
+    rows = [("set", str(scenarios.path)), ("scenarios", f"{_selected(inspection)} ({segments})")]
+    rows += [
+        ("", f"{lacking:,} lack what {name!r} asks for and are left out")
+        for name, lacking in inspection.unknown.items()
+    ]
     size = f"{inspection.megabytes:,.1f} MB, {manifest['record_bytes'] / 1e3:,.0f} kB per scenario"
-    table.add_row("size", size)
-    table.add_row(
-        "capacity",
-        f"{capacity.name}: {capacity.agents} moving and {capacity.parked} parked agents, "
-        f"{capacity.segments:,} map segments, {capacity.lanes} lanes, {capacity.lights} lights",
-    )
-    table.add_row("written by", f"drivax {manifest['drivax_version']}, schema {manifest['schema_version']}")
-    for label, cell in _not_in_it(inspection.source):
-        table.add_row(label, cell)
-    for name, values in inspection.tags().items():
-        table.add_row(name, _counted(values, count))
-    table.add_row("flags", _counted(inspection.words(lambda entry: entry["flags"]), count))
-    table.add_row("did not fit", _totals(inspection.totals(lambda entry: entry["overflow"])))
-    table.add_row("left out", _totals(inspection.totals(lambda entry: entry["source"].get("lost", {}))))
-    table.add_row("integrity", "every checksum is right" if inspection.checked else "not tested (--no-check)")
-    return table
+    rows += [
+        ("data sets", _counted(inspection.words(lambda entry: [entry["dataset"]]), count)),
+        ("duration", f"{_hours(inspection)} at {_rate(inspection)}"),
+        ("size", size),
+        (
+            "capacity",
+            f"{capacity.name}: {capacity.agents} moving and {capacity.parked} parked agents, "
+            f"{capacity.segments:,} map segments, {capacity.lanes} lanes, {capacity.lights} lights",
+        ),
+        ("written by", f"drivax {manifest['drivax_version']}, schema {manifest['schema_version']}"),
+        *_left_out(inspection.source),
+        *((name, _counted(values, count)) for name, values in inspection.tags().items()),
+        ("flags", _counted(inspection.words(lambda entry: entry["flags"]), count)),
+        ("did not fit", _totals(inspection.totals(lambda entry: entry["overflow"]))),
+        ("left out", _totals(inspection.totals(lambda entry: entry["source"].get("lost", {})))),
+        ("integrity", "every checksum is right" if inspection.checked else "not tested (--no-check)"),
+    ]
+    return _table("overview", ["", ""], [(label, [text]) for label, text in rows], left=True)
 
 
-def _not_in_it(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """What a conversion read and did not store: counts, and the first causes."""
+def _left_out(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what a conversion read and did not store: counts, and the first causes."""
     bad, filtered = source.get("skipped_records", []), source.get("filtered", 0)
     if bad:
         yield "skipped", f"{len(bad):,} record{'s' if len(bad) > 1 else ''} that could not be converted"
@@ -59,180 +62,150 @@ def _not_in_it(source: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if len(bad) > _CAUSES:
         yield "", f"{len(bad) - _CAUSES:,} more in manifest.json"
     if filtered:
-        yield (
-            "filtered",
-            f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {' and '.join(source['filters'])}",
-        )
+        filters = " and ".join(source["filters"])
+        yield "filtered", f"{filtered:,} scenario{'s' if filtered > 1 else ''} left out by {filters}"
 
 
 def audit_table(inspection: Inspection) -> Table | None:
-    """What the replay of the logs found; None where no scenario was audited."""
+    """Return the findings of the log replay; None where no scenario was audited."""
     names = inspection.findings()
     if not names:
         return None
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    table.add_column("audit", no_wrap=True)
-    table.add_column("found")
-    table.add_column("n", justify="right")
-    for name in names:
-        found = inspection.finding(name)
-        table.add_row(name, finding_text(found), f"{len(found):,}")
-    return table
+    columns = (Column("audit", label=True), Column("found", left=True), Column("n"))
+    values = {name: inspection.finding(name) for name in names}
+    rows = tuple(
+        (Cell(name), Cell(finding_text(known)), Cell(f"{len(known):,}")) for name, known in values.items()
+    )
+    return Table("audit", columns, rows)
 
 
-def finding_text(found: Sequence[Any]) -> str:
-    """Truths as a count, numbers as mean, median and largest, words as counts."""
-    if all(isinstance(value, bool) for value in found):
-        return f"{share(sum(found), len(found))}"
-    if all(isinstance(value, str) for value in found):
-        words = {word: found.count(word) for word in sorted(set(found))}
-        return _counted(words, len(found))
-    return spread(np.array(found, np.float64))
+def finding_text(values: Sequence[Any]) -> str:
+    """Return booleans as a count, numbers as mean, median and largest, words as counts."""
+    if all(isinstance(value, bool) for value in values):
+        return _share(sum(values), len(values))
+    if all(isinstance(value, str) for value in values):
+        return _counted({word: values.count(word) for word in sorted(set(values))}, len(values))
+    return _spread(np.array(values, np.float64))
 
 
-def share(number: int, of: int) -> str:
-    """A count and its share."""
-    return f"{number:,} of {of:,} ({100 * number / of:.3g} %)" if of else "–"
+def _share(count: int, of: int) -> str:
+    """Return a count with its share."""
+    return f"{count:,} of {of:,} ({100 * count / of:.3g} %)" if of else MISSING
 
 
-def spread(values: Float[np.ndarray[Any, Any], " n"]) -> str:
-    """Mean, median and largest."""
+def _spread(values: Float[np.ndarray[Any, Any], " n"]) -> str:
+    """Return mean, median and largest value."""
     if not len(values):
-        return "–"
+        return MISSING
     return f"mean {short(values.mean())}, median {short(np.median(values))}, most {short(values.max())}"
 
 
-def short(value: Any) -> str:
-    """A number with about three figures."""
-    number = float(value)
-    digits = 0 if abs(number) >= 100 or number == round(number) else 1 if abs(number) >= 10 else 2
-    return f"{number:,.{digits}f}"
-
-
 def listing(inspection: Inspection) -> Table:
-    """The first scenarios, with the counts of their source."""
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    table.add_column("scenario", no_wrap=True, max_width=24)
-    names = ["steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments"]
-    for name in names:
-        table.add_column(name, justify="right")
-    for entry in inspection.entries[:LISTED]:
-        table.add_row(entry["scenario_id"], *(f"{number:,}" for number in _counts(entry)))
-    return table
+    """Return the first scenarios with the counts of their source."""
+    names = ("steps", "tracks", "now", "lanes", "lines", "edges", "others", "points", "lights", "segments")
+    columns = (Column("scenario", label=True, most=24), *map(Column, names))
+    rows = tuple(
+        (Cell(entry["scenario_id"]), *(Cell(f"{count:,}") for count in _counts(entry)))
+        for entry in inspection.entries[:LISTED]
+    )
+    return Table("scenarios", columns, rows)
 
 
 def _counts(entry: Entry) -> tuple[int, ...]:
     source, kinds = entry["source"], entry["source"]["map_features"]
     shown = [kinds.get(name, 0) for name in ("lane", "road_line", "road_edge")]
-    return (
-        source["steps"],
-        source["tracks"],
-        source["tracks_valid_now"],
-        *shown,
-        sum(kinds.values()) - sum(shown),
-        source["map_points"],
-        source["lights"],
-        entry["segments"],
-    )
+    first = [source[name] for name in ("steps", "tracks", "tracks_valid_now")]
+    others = sum(kinds.values()) - sum(shown)
+    return (*first, *shown, others, source["map_points"], source["lights"], entry["segments"])
 
 
 def comparison(inspections: Sequence[Inspection]) -> list[Table]:
-    """Several sets side by side, ``ABREAST`` per table: how many, how long, what a scenario holds, shares of tags."""
-    groups = [inspections[first : first + ABREAST] for first in range(0, len(inspections), ABREAST)]
-    return [_abreast(group) for group in groups]
+    """Return several sets side by side, ``ACROSS`` per table: sizes, averages per scenario, shares of tags."""
+    groups = [inspections[first : first + ACROSS] for first in range(0, len(inspections), ACROSS)]
+    return [content_table(group, _share_rows(group), most=24) for group in groups]
 
 
-def _abreast(inspections: Sequence[Inspection]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    table.add_column("", no_wrap=True, style="bold")
-    for inspection in inspections:
-        table.add_column(inspection.name, justify="right", max_width=24, overflow="fold")
-    for label, cells in [*content_rows(inspections), *share_rows(inspections)]:
-        table.add_row(label, *cells)
-    return table
-
-
-Rows = list[tuple[str, list[str]]]
-
-
-def content_rows(inspections: Sequence[Inspection]) -> Rows:
-    """How many scenarios, of what, and what one holds on average: a label and one cell per set."""
-    rows = [
-        ("scenarios", [_selected(one) for one in inspections]),
-        ("recordings", [f"{_segments(one):,}" for one in inspections]),
-        ("data sets", [", ".join(one.words(lambda entry: [entry["dataset"]])) for one in inspections]),
-        ("places", [_places(one) for one in inspections]),
-        ("duration", [_hours(one) for one in inspections]),
-        ("rate", [_rate(one) for one in inspections]),
-        ("skipped", [f"{one.source.get('skipped', 0):,}" for one in inspections]),
-        ("MB", [f"{one.megabytes:,.1f}" for one in inspections]),
+def content_table(inspections: Sequence[Inspection], more: Sequence[Row] = (), **columns: Any) -> Table:
+    """Return sizes of sets and averages of their scenarios, one column per set."""
+    rows: list[Row] = [
+        ("scenarios", [_selected(inspection) for inspection in inspections]),
+        ("recordings", [f"{inspection.recordings:,}" for inspection in inspections]),
+        (
+            "data sets",
+            [", ".join(inspection.words(lambda entry: [entry["dataset"]])) for inspection in inspections],
+        ),
+        ("places", [_places(inspection) for inspection in inspections]),
+        ("duration", [_hours(inspection) for inspection in inspections]),
+        ("rate", [_rate(inspection) for inspection in inspections]),
+        ("skipped", [f"{inspection.source.get('skipped', 0):,}" for inspection in inspections]),
+        ("MB", [f"{inspection.megabytes:,.1f}" for inspection in inspections]),
     ]
     for quantity in QUANTITIES:
-        values = [one.values(quantity.read) for one in inspections]
+        known = [inspection.values(quantity.read) for inspection in inspections]
         label = f"{quantity.label}, {quantity.unit}" if quantity.unit else quantity.label
-        rows.append((label, [short(found.mean()) if len(found) else "–" for found in values]))
-    return rows
+        rows.append((label, [short(values.mean()) if len(values) else MISSING for values in known]))
+    names = ["", *(inspection.name for inspection in inspections)]
+    return _table("sets", names, [*rows, *more], **columns)
 
 
-def share_rows(inspections: Sequence[Inspection]) -> Rows:
-    """Shares of scenarios of which a finding is true, with each value of a tag, with each flag."""
-    rows: Rows = []
-    findings = {name: None for one in inspections for name in one.findings()}
-    for name in findings:
-        found = [one.finding(name) for one in inspections]
-        if any(isinstance(value, bool) for values in found for value in values):
-            rows.append((name, [_percent(sum(map(bool, values)), len(values)) for values in found]))
-    tagged = [one.tags() for one in inspections]
-    for name in {name: None for tags in tagged for name in tags}:
-        if name != "place":
-            rows += _tag_rows(name, [tags.get(name, {}) for tags in tagged], inspections)
-    counted = [one.words(lambda entry: entry["flags"]) for one in inspections]
-    for flag in {flag: None for counts in counted for flag in counts}:
-        cells = zip(counted, inspections, strict=True)
-        rows.append((f"flag {flag}", [_percent(counts.get(flag, 0), len(one)) for counts, one in cells]))
-    return rows
+def _table(name: str, headings: Sequence[str], rows: Sequence[Row], **columns: Any) -> Table:
+    """Return a table of texts under one label column."""
+    heads = (Column(headings[0], label=True), *(Column(heading, **columns) for heading in headings[1:]))
+    return Table(name, heads, tuple((Cell(label), *map(Cell, texts)) for label, texts in rows))
 
 
-def _tag_rows(name: str, counts: Sequence[Mapping[str, int]], inspections: Sequence[Inspection]) -> Rows:
-    """Shares of the values of one tag; nothing for tags with a value for nearly everyone."""
-    values = {value: None for found in counts for value in found}
-    if len(values) > 2 * NAMED:
-        return [(name, [f"{len(found):,} values" if found else "–" for found in counts])]
-    return [
-        (
-            f"{name} {value}",
-            [_percent(found.get(value, 0), len(one)) for found, one in zip(counts, inspections, strict=True)],
-        )
-        for value in values
+def _share_rows(inspections: Sequence[Inspection]) -> list[Row]:
+    """Return shares of scenarios with a finding, a value of a tag, a flag."""
+    sizes = [len(inspection) for inspection in inspections]
+    rows = [
+        (name, [_percent(*count) for count in counts]) for name, counts in true_findings(inspections).items()
     ]
+    tagged = [inspection.tags() for inspection in inspections]
+    for name in {name: None for tags in tagged for name in tags}:
+        counts = [tags.get(name, {}) for tags in tagged]
+        values = {value: None for of_set in counts for value in of_set}
+        if name != "place" and len(values) > 2 * NAMED:
+            rows.append((name, [f"{len(of_set):,} values" if of_set else MISSING for of_set in counts]))
+        elif name != "place":
+            rows += _percents(f"{name} ", of_all(counts, sizes))
+    flags = [inspection.words(lambda entry: entry["flags"]) for inspection in inspections]
+    return rows + _percents("flag ", of_all(flags, sizes))
 
 
-def _percent(number: int, of: int) -> str:
-    return f"{100 * number / of:.3g} %" if of else "–"
+#: Per value, ``(count, of)`` for each set.
+Counts = dict[str, list[tuple[int, int]]]
 
 
-def _facts() -> Table:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
-    return table
+def true_findings(inspections: Sequence[Inspection]) -> Counts:
+    """Return for each yes-or-no finding of the audit in how many of how many scenarios it is true."""
+    findings = {}
+    for name in dict.fromkeys(name for inspection in inspections for name in inspection.findings()):
+        known = [inspection.finding(name) for inspection in inspections]
+        if any(isinstance(value, bool) for values in known for value in values):
+            findings[name] = [(sum(map(bool, values)), len(values)) for values in known]
+    return findings
+
+
+def of_all(counts: Sequence[Mapping[str, int]], sizes: Sequence[int]) -> Counts:
+    """Return the counts of each value with the sizes of the sets."""
+    values = dict.fromkeys(value for of_set in counts for value in of_set)
+    return {
+        value: [(of_set.get(value, 0), size) for of_set, size in zip(counts, sizes, strict=True)]
+        for value in values
+    }
+
+
+def _percents(prefix: str, counts: Counts) -> list[Row]:
+    return [(prefix + value, [_percent(*count) for count in sets]) for value, sets in counts.items()]
+
+
+def _percent(count: int, of: int) -> str:
+    return f"{100 * count / of:.3g} %" if of else MISSING
 
 
 def _selected(inspection: Inspection) -> str:
     count, whole = len(inspection), len(inspection.scenarios)
     return f"{count:,}" if count == whole else f"{count:,} of {whole:,}"
-
-
-def _segments(inspection: Inspection) -> int:
-    return len({(entry["dataset"], entry["segment"]) for entry in inspection.entries})
-
-
-def _recorded(inspection: Inspection) -> str:
-    return f"recorded segments: {_segments(inspection):,}"
-
-
-def _shards(inspection: Inspection) -> str:
-    return f", shards: {len(inspection.scenarios.manifest['shards']):,}"
 
 
 def _hours(inspection: Inspection) -> str:
@@ -248,18 +221,59 @@ def _rate(inspection: Inspection) -> str:
 def _places(inspection: Inspection) -> str:
     places = inspection.words(lambda entry: [entry["tags"]["place"]] if "place" in entry["tags"] else [])
     more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
-    return ", ".join(list(places)[:NAMED]) + more if places else "–"
+    return ", ".join(list(places)[:NAMED]) + more if places else MISSING
 
 
 def _counted(counts: Mapping[str, int], of: int) -> str:
-    parts = [
-        name if number == of else f"{name} ({number:,} of {of:,})"
-        for name, number in list(counts.items())[: 2 * NAMED]
+    texts = [
+        name if count == of else f"{name} ({count:,} of {of:,})"
+        for name, count in list(counts.items())[: 2 * NAMED]
     ]
-    more = len(counts) - len(parts)
-    return ", ".join(parts) + (f" and {more:,} more" if more else "") or "none"
+    more = len(counts) - len(texts)
+    return ", ".join(texts) + (f" and {more:,} more" if more else "") or "none"
 
 
 def _totals(totals: Mapping[str, tuple[int, int]]) -> str:
-    parts = [f"{name} {number:,} (in {places:,})" for name, (number, places) in totals.items()]
-    return ", ".join(parts) or "nothing"
+    texts = [f"{name} {count:,} (in {scenarios:,})" for name, (count, scenarios) in totals.items()]
+    return ", ".join(texts) or "nothing"
+
+
+def observation_overview(statistics: ObservationStatistics) -> str:
+    """Return the size of the statistics in one line, with the number of NaN or infinite entries."""
+    states = f"{statistics.states:,} states of {statistics.episodes:,} episodes of {statistics.planner}"
+    finite = (
+        f"{statistics.broken:,} entries are NaN or infinite"
+        if statistics.broken
+        else "every number is finite"
+    )
+    return f"{states}, {statistics.collisions:,} with a collision; {finite}"
+
+
+def observation_table(statistics: ObservationStatistics) -> Table:
+    """Return a row per column of each group, under a row for the group."""
+    names = ["n", "mean", "std", "min", "max", "NaN, Inf", "r collision"]
+    names += ["importance"] if statistics.permuted else []
+    rows, group = [], None
+    for feature in statistics.features:
+        if feature.group != group:
+            group = feature.group
+            empty = (Cell(""),) * (len(names) - 1)
+            last = statistics.groups[group] if statistics.permuted else math.nan
+            rows.append((Cell(group, style="group"), *empty, Cell(_decimal(last))))
+        rows.append(
+            (Cell(f"  {feature.name}"), *map(Cell, _feature_texts(feature, bool(statistics.permuted))))
+        )
+    columns = (Column("feature", label=True), *map(Column, names))
+    return Table("observations", columns, tuple(rows))
+
+
+def _feature_texts(feature: FeatureStatistics, permuted: bool) -> list[str]:
+    numbers = [_decimal(value) for value in (feature.mean, feature.std, feature.low, feature.high)]
+    broken = f"{feature.broken:,}" if feature.broken else ""
+    importance = [_decimal(feature.importance)] if permuted else []
+    return [f"{feature.count:,}", *numbers, broken, _decimal(feature.collision), *importance]
+
+
+def _decimal(value: float) -> str:
+    """Return a number with two decimals; empty for NaN."""
+    return "" if math.isnan(value) else f"{value:.2f}".replace("-0.00", "0.00")

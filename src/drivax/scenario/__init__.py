@@ -1,1 +1,5 @@
-"""What a driving scene is: schema, lane graph, routes, grid index, map queries, store and device bank."""
+"""Driving scenarios: recordings, their fixed-size records, scenario sets on disk, and banks on the device."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

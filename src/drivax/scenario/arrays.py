@@ -1,4 +1,4 @@
-"""People's own data: plain arrays in, a recording or a scenario out, with errors that name the argument."""
+"""Recordings and scenarios from plain arrays, with errors that name the argument."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from drivax.errors import UsageError
+from drivax.scenario.build.assemble import assemble
 from drivax.scenario.build.tracks import DEFAULT_SIZES
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
-from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind
+from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag, LightState, RoadKind, Scenario
 
 Array = np.ndarray[Any, Any]
 
@@ -36,34 +37,34 @@ def recording_from_arrays(
     dt_s: float = DT_S,
     dataset: str = "own",
 ) -> Recording:
-    """A recording of any length from plain arrays: metres, radians anticlockwise from +x, m/s, one map frame.
+    """Return a recording of any length from plain arrays in one map frame: metres, radians anticlockwise from +x, m/s.
 
     Args:
         scenario_id: Name of the recording; windows that are cut from it share it as their segment.
         agents: ``xy`` [agent, time, 2], ``heading`` [agent, time], ``valid`` [agent, time]; box ``size`` [agent, 3] or
             [agent, time, 3] (length, width, height; class defaults where it is missing or 0). Optional: ``kind``, one
             per agent ("vehicle", "pedestrian", "cyclist", "other", "static"; vehicles if missing); ``velocity``
-            [agent, time, 2] (taken from the positions if missing); ``z`` [agent, time] of the box centre (needed where
-            the roads have heights); ``id``, whole numbers. Entries that are not valid may hold anything.
+            [agent, time, 2] (differentiated positions if missing); ``z`` [agent, time] of the box centre (required if
+            the roads have heights); ``id``, integers. Invalid entries may hold anything.
         roads: ``lanes``, a sequence of mappings with ``points`` [point, 2 or 3] in driving direction and optionally
-            ``successors``, ``left``, ``right`` (places in this sequence; neighbours run the same way), ``limit_mps``,
-            ``width_m``, ``kind`` ("surface", "freeway", "bike"); without any successor lanes are joined where they
-            touch. ``edges``, polylines [point, 2 or 3] with the drivable side on the left. Optional: ``crosswalks``,
-            polygons; ``stop_signs``, mappings with ``point`` and ``lanes`` (places).
-        lights: Mappings with ``lane`` (place), ``states``, one per step ("red", "yellow", "green", "unknown", None
-            where nobody saw it, or :class:`~drivax.scenario.schema.LightState`), and optionally ``stop_point``
+            ``successors``, ``left``, ``right`` (indices in this sequence; neighbours have the same direction),
+            ``limit_mps``, ``width_m``, ``kind`` ("surface", "freeway", "bike"); without any successor lanes are joined
+            where they touch. ``edges``, polylines [point, 2 or 3] with the drivable side on the left. Optional:
+            ``crosswalks``, polygons; ``stop_signs``, mappings with ``point`` and ``lanes`` (indices).
+        lights: Mappings with ``lane`` (index), ``states``, one per step ("red", "yellow", "green", "unknown", None
+            if unobserved, or :class:`~drivax.scenario.schema.LightState`), and optionally ``stop_point``
             (otherwise the beginning of the lane).
-        route: Places of the lanes of the intended route in order, where it is known.
+        route: Indices of the lanes of the intended route in order, if known.
         ego: Row of the agent that is driven.
-        dt_s: Seconds between steps; anything but 0.1 has to be resampled first (:func:`resample`).
-        dataset: A short name for where the data come from.
+        dt_s: Seconds between steps; resample other steps than 0.1 first (:func:`resample`).
+        dataset: Short name of the source.
 
     Raises:
-        UsageError: An argument is missing, misspelt, or has another shape; the message names it.
+        UsageError: An argument is missing, misspelt, or has another shape.
     """
     _check_step(dt_s)
-    _known(agents, _AGENT_KEYS, "agents")
-    _known(roads, _ROAD_KEYS, "roads")
+    _check_keys(agents, _AGENT_KEYS, "agents")
+    _check_keys(roads, _ROAD_KEYS, "roads")
     features = tuple(_features(roads))
     high = any(np.ptp(feature.points[:, 2]) > 0 for feature in features)
     tracks = _tracks(agents, ego, needs_height=high)
@@ -81,25 +82,47 @@ def recording_from_arrays(
         lights=tuple(
             _light(light, f"lights[{i}]", features[:lanes], steps) for i, light in enumerate(lights)
         ),
-        route_lanes=_places(route, lanes, "route"),
+        route_lanes=_lane_indices(route, lanes, "route"),
         flags=Flag.NONE if "velocity" in agents else Flag.DIFFERENTIATED_VELOCITY,
         tags={"source_format": "arrays"},
     )
+
+
+def scenario_from_arrays(
+    scenario_id: str,
+    agents: Mapping[str, Any],
+    roads: Mapping[str, Any],
+    lights: Sequence[Mapping[str, Any]] = (),
+    route: Sequence[int] = (),
+    ego: int = 0,
+    dt_s: float = DT_S,
+    dataset: str = "own",
+) -> Scenario:
+    """Return a scenario from plain arrays of at most 91 steps; step 10 is the current one.
+
+    Takes the arguments of :func:`recording_from_arrays`; cut longer recordings with
+    :func:`drivax.scenario.recording.windows`.
+
+    Raises:
+        UsageError: An argument is missing, misspelt, or has another shape.
+        DataError: The data make no scenario (the ego is not valid at the current step, a number is not finite).
+    """
+    return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
 
 
 def _check_step(dt_s: float) -> None:
     if abs(dt_s - DT_S) > 1e-3:
         raise UsageError(
             f"dt_s is {dt_s}, scenarios have steps of {DT_S} s",
-            cure=f"agents = drivax.scenario.arrays.resample(agents, {dt_s}) first, and leave dt_s out",
+            cure=f"call drivax.scenario.resample(agents, {dt_s}) first, and leave dt_s out",
         )
 
 
 def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
-    """Agents at 10 Hz from steps of another length: interpolated linearly, headings the short way round.
+    """Resample agents to 10 Hz by linear interpolation, headings along the shorter arc.
 
-    Nothing is made up: a new step is valid where it falls on a valid old one or between two neighbouring valid ones.
-    Velocities are left out, so that they are taken from the new positions.
+    A new step is valid if it falls on a valid step or between two neighbouring valid steps. Velocities are left out, to
+    be differentiated from the new positions.
 
     Args:
         agents: As for :func:`recording_from_arrays`.
@@ -108,7 +131,7 @@ def resample(agents: Mapping[str, Any], dt_s: float) -> dict[str, Any]:
     Raises:
         UsageError: ``dt_s`` is not positive, or an array has another shape.
     """
-    _known(agents, _AGENT_KEYS, "agents")
+    _check_keys(agents, _AGENT_KEYS, "agents")
     if not 0.0 < dt_s <= 10.0:
         raise UsageError(f"dt_s is {dt_s}", cure="give the seconds between two steps")
     valid = _array(agents, "valid", bool, (None, None))
@@ -138,9 +161,9 @@ def differentiate(
     valid: Bool[np.ndarray, "track time"],
     timestamps_s: Float64[np.ndarray, " time"],
 ) -> Float64[np.ndarray, "track time 2"]:
-    """Velocities from positions, m/s: central differences inside, one-sided at the ends of what was observed.
+    """Velocities from positions, m/s: central differences, one-sided at the ends of observed intervals.
 
-    No difference is taken over a gap; a position without a valid neighbour, and what is not valid, gets zero.
+    No difference spans a gap; invalid steps and those without a valid neighbour get zero.
     """
     step = np.arange(len(timestamps_s))
     behind = np.zeros_like(valid)
@@ -155,8 +178,8 @@ def differentiate(
     return np.divide(moved, seconds_apart, out=np.zeros_like(moved), where=(behind | ahead)[..., None])
 
 
-def _known(given: Any, keys: Sequence[str], what: str) -> None:
-    """Refuse a misspelt key, which would otherwise be data that silently disappears."""
+def _check_keys(given: Any, keys: Sequence[str], what: str) -> None:
+    """Refuse unknown keys."""
     if not isinstance(given, Mapping):
         raise UsageError(f"{what} is no mapping", cure=f"give a dictionary with {', '.join(keys)}")
     for key in given:
@@ -165,7 +188,7 @@ def _known(given: Any, keys: Sequence[str], what: str) -> None:
 
 
 def _array(given: Mapping[str, Any], name: str, kind: type, shape: tuple[int | None, ...]) -> Array:
-    """One of the agents' arrays, of this shape (None: any size)."""
+    """Return an array of the agents, of a shape in which None is any size."""
     if name not in given:
         raise UsageError(f'agents["{name}"] is missing', cure="see recording_from_arrays")
     try:
@@ -175,15 +198,15 @@ def _array(given: Mapping[str, Any], name: str, kind: type, shape: tuple[int | N
     if len(values.shape) != len(shape) or any(
         w not in (None, n) for w, n in zip(shape, values.shape, strict=True)
     ):
-        wanted = tuple("any" if size is None else size for size in shape)
+        expected = tuple("any" if size is None else size for size in shape)
         raise UsageError(
-            f'agents["{name}"] has shape {values.shape}, not {wanted}', cure="see recording_from_arrays"
+            f'agents["{name}"] has shape {values.shape}, not {expected}', cure="see recording_from_arrays"
         )
     return values
 
 
 def _where(values: Array, valid: Array) -> Array:
-    """Zeros where not valid."""
+    """Replace invalid entries by zeros."""
     return np.where(valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim)), values, 0.0)
 
 
@@ -226,7 +249,7 @@ def _kinds(agents: Mapping[str, Any], count: int) -> list[AgentKind]:
 
 
 def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
-    """Box sizes of every step; zeros, for which the class gives a size, where there are none."""
+    """Box sizes of every step; zeros stand for the size of the class."""
     if "size" not in agents:
         return np.zeros((count, steps, 3))
     if np.ndim(agents["size"]) == 3:
@@ -235,7 +258,7 @@ def _sizes(agents: Mapping[str, Any], count: int, steps: int) -> Array:
 
 
 def _named(value: Any, names: Mapping[Any, Any], kinds: type[Any], what: str) -> Any:
-    """A member of an enumeration, given as one, by its number, or by a word."""
+    """Return a member of an enumeration, given as member, number or word."""
     try:
         return names[value] if isinstance(value, str) or value is None else kinds(value)
     except (KeyError, ValueError, TypeError) as error:
@@ -259,7 +282,7 @@ def _features(roads: Mapping[str, Any]) -> Iterator[MapFeature]:
 
 
 def _points(given: Any, what: str, least: int) -> Array:
-    """Points with heights, 0 where the argument has none."""
+    """Points with heights, 0 if not given."""
     try:
         points = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -276,7 +299,7 @@ def _points(given: Any, what: str, least: int) -> Array:
 
 
 def _lane(number: int, given: Any, what: str, lanes: int) -> MapFeature:
-    _known(given, _LANE_KEYS, what)
+    _check_keys(given, _LANE_KEYS, what)
     limit, width = given.get("limit_mps"), given.get("width_m")
     return MapFeature(
         feature_id=number,
@@ -284,9 +307,9 @@ def _lane(number: int, given: Any, what: str, lanes: int) -> MapFeature:
         points=_points(given.get("points"), f'{what}["points"]', 2),
         limit_mps=None if limit is None else float(limit),
         width_m=None if width is None else float(width),
-        successors=_places(given.get("successors", ()), lanes, f'{what}["successors"]'),
-        left_neighbours=_places(given.get("left", ()), lanes, f'{what}["left"]'),
-        right_neighbours=_places(given.get("right", ()), lanes, f'{what}["right"]'),
+        successors=_lane_indices(given.get("successors", ()), lanes, f'{what}["successors"]'),
+        left_neighbours=_lane_indices(given.get("left", ()), lanes, f'{what}["left"]'),
+        right_neighbours=_lane_indices(given.get("right", ()), lanes, f'{what}["right"]'),
     )
 
 
@@ -299,13 +322,15 @@ def _crosswalk(number: int, given: Any, what: str, lanes: int) -> MapFeature:
 
 
 def _stop_sign(number: int, given: Any, what: str, lanes: int) -> MapFeature:
-    _known(given, ("point", "lanes"), what)
+    _check_keys(given, ("point", "lanes"), what)
     point = _points([given.get("point")], f'{what}["point"]', 1)
-    return MapFeature(number, RoadKind.STOP_SIGN, point, lanes=_places(given.get("lanes", ()), lanes, what))
+    return MapFeature(
+        number, RoadKind.STOP_SIGN, point, lanes=_lane_indices(given.get("lanes", ()), lanes, what)
+    )
 
 
-def _places(given: Any, lanes: int, what: str) -> tuple[int, ...]:
-    """Places in the sequence of lanes."""
+def _lane_indices(given: Any, lanes: int, what: str) -> tuple[int, ...]:
+    """Return indices of lanes."""
     rows = [given] if isinstance(given, int | np.integer) else list(given)
     for row in rows:
         if not isinstance(row, int | np.integer) or not 0 <= row < lanes:
@@ -314,8 +339,8 @@ def _places(given: Any, lanes: int, what: str) -> tuple[int, ...]:
 
 
 def _light(given: Any, what: str, lanes: Sequence[MapFeature], steps: int) -> Light:
-    _known(given, _LIGHT_KEYS, what)
-    (lane,) = _places(given.get("lane", -1), len(lanes), f'{what}["lane"]')
+    _check_keys(given, _LIGHT_KEYS, what)
+    (lane,) = _lane_indices(given.get("lane", -1), len(lanes), f'{what}["lane"]')
     states = list(given.get("states", ()))
     if len(states) != steps:
         raise UsageError(f'{what}["states"] has {len(states)} entries, not {steps}', cure="give one per step")

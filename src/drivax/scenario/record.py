@@ -12,20 +12,16 @@ Record = TypeVar("Record")
 
 
 def static(*, default: Any = MISSING) -> Any:
-    """A field that is part of the pytree's structure: hashable, compared when a program is compiled."""
-    return (
-        field(metadata={"static": True})
-        if default is ...
-        else field(default=default, metadata={"static": True})
-    )
+    """Declare a field that is part of the pytree structure: hashable, and fixed when a program is compiled."""
+    return field(default=default, metadata={"static": True})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, static))
 def record(cls: type[Record]) -> type[Record]:
-    """Makes a class a frozen dataclass and a pytree.
+    """Make a class a frozen dataclass and a pytree.
 
-    Rebuilding one from its leaves bypasses ``__init__``: transformations put other things than arrays into leaves, and
-    a constructor that checks shapes would refuse them.
+    Unflattening bypasses ``__init__``: transformations put other objects than arrays into leaves, which a constructor
+    that checks shapes would refuse.
     """
     made = dataclass(frozen=True)(cls)
     leaves = tuple(f.name for f in fields(cast(Any, made)) if not f.metadata.get("static"))

@@ -1,22 +1,32 @@
-"""What readers and the built-in world produce: a log as its source tells it, before it is assembled."""
+"""Recordings: logs in the frame of their source, as readers and the built-in world produce them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int8, Int64
+from jaxtyping import Bool, Float, Float64, Int8, Int64
 
-from drivax.scenario.schema import Flag, RoadKind
+from drivax.errors import DataError, UsageError
+from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, AgentKind, Capacity, Flag, RoadKind
+
+Array = np.ndarray[Any, Any]
+#: The median step may differ from 0.1 s by this much.
+STEP_TOLERANCE_S = 0.005
+TEXT_BYTES = {"scenario_id": 64, "segment": 64, "dataset": 16}
+#: Largest distance from the ego and largest speed; beyond them the file is damaged or its unit is not the metre.
+EXTENT_M, SPEED_MPS = 100_000.0, 500.0
+#: Steps between the starts of two windows.
+STRIDE = 40
+_UNITS = "repair it, or convert it to metres in the reader"
+Finding = tuple[str, str] | None
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Everything that moves (or could), one row per track, in the source's map frame.
-
-    Invalid entries hold zeros. ``size`` is per step where the source measures it per step.
-    """
+    """Tracks of all road users in the map frame of the source; invalid entries hold zeros."""
 
     xy: Float64[np.ndarray, "track time 2"]
     z: Float64[np.ndarray, "track time"]
@@ -30,7 +40,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class MapFeature:
-    """One element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
+    """An element of the map: a lane centre, a marking, an edge, a polygon or a stop sign.
 
     ``points`` are (x, y, z) in metres; polygons are implicitly closed; a stop sign has one point. Road edges have
     the drivable side on their left. Links name other features by ``feature_id`` and may dangle.
@@ -52,7 +62,7 @@ class MapFeature:
 
 @dataclass(frozen=True)
 class Light:
-    """A traffic light as it concerns one lane."""
+    """A traffic light for one lane."""
 
     lane_id: int
     stop_point: Float64[np.ndarray, " 3"]
@@ -61,7 +71,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Event:
-    """A labelled rare event of the built-in world. ``actors`` are track ids, steps are inclusive."""
+    """A labelled rare event of the built-in world; ``actors`` are track ids, steps are inclusive."""
 
     kind: int
     start: int
@@ -71,22 +81,21 @@ class Event:
 
 @dataclass(frozen=True)
 class Recording:
-    """A log as its source tells it: ragged arrays, float64, the source's frame; what readers produce.
+    """A log in the frame of its source: ragged arrays, float64.
 
     Attributes:
         ego: Row of ``tracks`` that is the ego vehicle.
-        timestamps_s: Seconds, one per step, starting anywhere.
-        current_step: Step at which the future begins (10 in WOMD).
+        timestamps_s: Seconds, one per step.
+        current_step: Last step of the past (10 in WOMD).
         to_predict, of_interest: Rows of ``tracks``.
-        route_lanes: Feature ids of the lanes of the intended route in order, where the source knows it.
-        route_corridor: Feature ids of all lanes that the intended route may use, where the source knows only that
-            (nuPlan's roadblocks).
-        seen: Which valid steps of which tracks ego's sensors would have seen, where the source holds the truth and
-            knows the difference; None: everything that was recorded was seen.
-        tags: What the source says in words: ``place`` (city), ``source_format``, the world's ``family``, ...
-        lost: What the reader left out, by name and number.
-        flags: Facts that only the reader knows (defaulted sizes, truncated map, ...).
-        split_gap_m: Polylines are cut where neighbouring points are further apart (clipping jumps); None: never.
+        route_lanes: Feature ids of the lanes of the intended route in order, if known.
+        route_corridor: Feature ids of all lanes that the intended route may use, if only these are known (nuPlan's
+            roadblocks).
+        seen: Mask of the valid steps that the sensors of the ego would see; None if all recorded steps were seen.
+        tags: Words of the source: ``place`` (city), ``source_format``, ``family`` of the built-in world, ...
+        lost: Numbers of items that the reader left out, by name.
+        flags: Facts that only the reader knows (default sizes, truncated map, ...).
+        split_gap_m: Polylines are split where neighbouring points are further apart (clipped maps).
     """
 
     scenario_id: str
@@ -108,3 +117,234 @@ class Recording:
     lost: Mapping[str, int] = field(default_factory=dict)
     flags: Flag = Flag.NONE
     split_gap_m: float | None = None
+
+
+def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
+    """Cut a recording into windows of 91 steps that share its segment.
+
+    Window ``k`` begins at step ``k * stride``; steps at the end that fill no window are left out (110 steps make one
+    window, 199 make three). Windows without a valid ego at the current step are left out and counted in ``lost`` of the
+    others as ``windows_without_ego``. A recording of at most 91 steps is its own window.
+
+    Raises:
+        UsageError: The stride is not positive.
+        DataError: No window has a valid ego at its current step.
+    """
+    if stride < 1:
+        raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
+    steps = len(recording.timestamps_s)
+    if steps <= STEPS:
+        yield recording
+        return
+    starts = range(0, steps - STEPS + 1, stride)
+    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
+    if not usable:
+        raise DataError(
+            f"the ego is not valid at the current step of any of {len(starts)} windows",
+            record=recording.scenario_id,
+            cure="skip the recording",
+        )
+    lost = dict(recording.lost)
+    if len(usable) < len(starts):
+        lost["windows_without_ego"] = len(starts) - len(usable)
+    for start in usable:
+        yield replace(_window(recording, start), lost=lost)
+
+
+def _window(recording: Recording, start: int) -> Recording:
+    """The 91 steps from ``start`` on."""
+    part = slice(start, start + STEPS)
+    tracks = recording.tracks
+    time_fields = ("xy", "z", "heading", "velocity", "size", "valid")
+    events = (replace(e, start=e.start - start, end=e.end - start) for e in recording.events)
+    return replace(
+        recording,
+        scenario_id=f"{recording.scenario_id}@{start}",
+        timestamps_s=recording.timestamps_s[part],
+        current_step=CURRENT_STEP,
+        tracks=replace(tracks, **{name: getattr(tracks, name)[:, part] for name in time_fields}),
+        seen=None if recording.seen is None else recording.seen[:, part],
+        lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
+        events=tuple(
+            replace(e, start=max(e.start, 0), end=min(e.end, STEPS - 1))
+            for e in events
+            if e.end >= 0 and e.start < STEPS
+        ),
+    )
+
+
+def with_ego(recording: Recording, row: int) -> Recording:
+    """Return the recording with another logged vehicle as the ego, without the route and ``seen`` of the former ego.
+
+    Raises:
+        UsageError: The row is no vehicle that is valid at the current step.
+    """
+    tracks = recording.tracks
+    good = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
+    if not good or not tracks.valid[row, recording.current_step]:
+        raise UsageError(
+            f"track row {row} is no vehicle that is valid at step {recording.current_step}",
+            record=recording.scenario_id,
+            cure="choose a vehicle that is valid at the current step",
+        )
+    if row == recording.ego:
+        return recording
+    return replace(
+        recording,
+        scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
+        ego=row,
+        seen=None,
+        route_lanes=(),
+        route_corridor=(),
+    )
+
+
+def check(recording: Recording, capacity: Capacity) -> None:
+    """Refuse an invalid recording.
+
+    Raises:
+        DataError: The recording is invalid.
+    """
+    for test in (
+        _check_names,
+        _check_time,
+        _check_shapes,
+        _check_tracks,
+        _check_ego,
+        _check_extent,
+        _check_map,
+        _check_lights,
+    ):
+        problem = test(recording, capacity)
+        if problem is not None:
+            raise DataError(problem[0], record=recording.scenario_id, cure=problem[1])
+
+
+def step_seconds(timestamps_s: Float[Array, " time"]) -> tuple[float, float]:
+    """Median step and largest deviation from it, seconds; 0.1 and 0 for a single step."""
+    steps = np.diff(timestamps_s)
+    if len(steps) == 0:
+        return DT_S, 0.0
+    median = float(np.median(steps))
+    return median, float(np.abs(steps - median).max())
+
+
+def _check_names(recording: Recording, capacity: Capacity) -> Finding:
+    for name, size in TEXT_BYTES.items():
+        text = getattr(recording, name)
+        if not text or len(text.encode()) > size or "\0" in text:
+            return f"{name} {text[:80]!r} is empty or longer than {size} bytes", f"shorten the {name}"
+    return None
+
+
+def _check_time(recording: Recording, capacity: Capacity) -> Finding:
+    times = np.asarray(recording.timestamps_s)
+    steps = len(times)
+    if steps == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        return "timestamps do not increase", "repair the time base in the reader"
+    if steps > capacity.steps:
+        return f"{steps} steps, more than {capacity.steps}", "cut it with windows()"
+    if not 0 <= recording.current_step < steps:
+        return f"current step {recording.current_step} of {steps} steps", "name a step that exists"
+    median, _ = step_seconds(times)
+    if abs(median - DT_S) > STEP_TOLERANCE_S:
+        return f"steps of {median:.3f} s instead of {DT_S} s", "resample the recording to 10 Hz"
+    return None
+
+
+def _check_shapes(recording: Recording, capacity: Capacity) -> Finding:
+    tracks, steps = recording.tracks, len(recording.timestamps_s)
+    count = len(tracks.track_id)
+    widths = {"xy": (2,), "z": (), "heading": (), "velocity": (2,), "size": (3,), "valid": ()}
+    expected = {name: (count, steps, *width) for name, width in widths.items()} | {"kind": (count,)}
+    for name, shape in expected.items():
+        given = np.shape(getattr(tracks, name))
+        if given != shape:
+            return f"tracks.{name} has shape {given}, not {shape}", "give every track every step"
+    if recording.seen is not None and np.shape(recording.seen) != (count, steps):
+        return (
+            f"seen has shape {np.shape(recording.seen)}, not {(count, steps)}",
+            "give every track every step",
+        )
+    rows = (recording.ego, *recording.to_predict, *recording.of_interest)
+    if any(not 0 <= row < count for row in rows):
+        return f"a track row out of {count} is named in {rows}", "name rows of the track table"
+    return None
+
+
+def _check_tracks(recording: Recording, capacity: Capacity) -> Finding:
+    tracks = recording.tracks
+    for name in ("xy", "z", "heading", "velocity"):
+        values = getattr(tracks, name)
+        bad = tracks.valid & ~np.isfinite(values.reshape(*tracks.valid.shape, -1)).all(axis=-1)
+        if bad.any():
+            track, step = (int(i) for i in np.argwhere(bad)[0])
+            place = f"track {int(tracks.track_id[track])} at step {step}"
+            return f"tracks.{name} of {place} is not finite", "mark the step as not valid or repair it"
+    kinds = {int(kind) for kind in AgentKind}
+    if not set(np.unique(tracks.kind).tolist()) <= kinds:
+        return "an agent kind is unknown", f"use kinds {min(kinds)} to {max(kinds)}"
+    ids = tracks.track_id
+    if len(ids) and (ids.min() < 0 or ids.max() >= 2**31):
+        return "track ids do not fit into 31 bits", "number the tracks in the reader"
+    return None
+
+
+def _check_ego(recording: Recording, capacity: Capacity) -> Finding:
+    if not recording.tracks.valid[recording.ego, recording.current_step]:
+        return f"the ego is not valid at the current step {recording.current_step}", "skip the recording"
+    return None
+
+
+def _here(recording: Recording) -> Float[Array, "3"]:
+    """Position of the ego at the current step."""
+    now = recording.ego, recording.current_step
+    return np.append(recording.tracks.xy[now], recording.tracks.z[now])
+
+
+def _check_extent(recording: Recording, capacity: Capacity) -> Finding:
+    """Positions and speeds of any size would not fit into memory or float32."""
+    tracks, here = recording.tracks, _here(recording)
+    places = np.concatenate((tracks.xy[tracks.valid], tracks.z[tracks.valid][:, None]), axis=1)
+    if np.abs(places - here).max() > EXTENT_M:
+        return f"a track is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+    if np.abs(tracks.velocity[tracks.valid]).max() > SPEED_MPS:
+        return f"a track is faster than {SPEED_MPS:.0f} m/s", _UNITS
+    stops = [np.asarray(light.stop_point) for light in recording.lights if np.shape(light.stop_point) == (3,)]
+    if stops and np.nanmax(np.abs(np.array(stops) - here), initial=0.0) > EXTENT_M:
+        return f"a light is more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+    return None
+
+
+def _check_map(recording: Recording, capacity: Capacity) -> Finding:
+    for feature in recording.features:
+        shape = np.shape(feature.points)
+        if len(shape) != 2 or shape[1] != 3 or not shape[0]:
+            return f"points of feature {feature.feature_id} have shape {shape}", "give (point, 3)"
+        if not -(2**63) <= feature.feature_id < 2**63:
+            return f"the feature id {feature.feature_id} does not fit into 64 bits", "number the features"
+        if feature.kind not in RoadKind:
+            return f"feature {feature.feature_id} is of unknown kind {feature.kind}", "use a RoadKind"
+    if not recording.features:
+        return None
+    counts = [len(feature.points) for feature in recording.features]
+    points = np.concatenate([feature.points for feature in recording.features])
+    far = ~(np.abs(points - _here(recording)).max(axis=1) <= EXTENT_M)
+    if not far.any():
+        return None
+    row = int(np.searchsorted(np.cumsum(counts), np.argmax(far), side="right"))
+    place = f"feature {recording.features[row].feature_id} has a point"
+    if not np.isfinite(points[np.argmax(far)]).all():
+        return f"{place} that is not finite", "repair it or drop it"
+    return f"{place} more than {EXTENT_M / 1000:.0f} km away from the ego", _UNITS
+
+
+def _check_lights(recording: Recording, capacity: Capacity) -> Finding:
+    steps = len(recording.timestamps_s)
+    for light in recording.lights:
+        states = np.asarray(light.states)
+        if states.shape != (steps,) or states.min() < -1 or states.max() > 8:
+            return f"the light of lane {light.lane_id} has no state from -1 to 8 per step", "use LightState"
+        if np.shape(light.stop_point) != (3,) or not np.isfinite(light.stop_point).all():
+            return f"the light of lane {light.lane_id} has no finite stop point", "repair it or drop it"
+    return None

@@ -1,17 +1,13 @@
-"""What a driving scenario is: the vocabulary of its parts and the padded record that is stored.
+"""Driving scenarios: kinds, flags, capacities, and the padded record that is stored.
 
-Two steps lead from a public log to the simulator. A reader (or the built-in world) fills a
-:class:`~drivax.scenario.recording.Recording`: ragged, float64, in the source's own map frame, nothing invented.
-``scenario.build.assemble`` turns it into a :class:`Scenario`: local frame, float32, fixed shapes named by
-:class:`Capacity`, with segments, grid and routes.
-
-This module needs numpy only, so that worker processes that convert data never import JAX.
+A reader or the built-in world produces a :class:`~drivax.scenario.recording.Recording`: ragged, float64, in the map
+frame of the source. ``scenario.build.assemble`` makes it a :class:`Scenario`: local frame, float32, with shapes given
+by :class:`Capacity`, map segments, grid and routes. This module needs no JAX.
 """
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any
@@ -39,7 +35,7 @@ class AgentKind(enum.IntEnum):
 
 
 class RoadKind(enum.IntEnum):
-    """Type of a map feature; the numbers are those of WOMD's road graph."""
+    """Type of a map feature, numbered as in the road graph of WOMD."""
 
     LANE_UNDEFINED = 0
     LANE_FREEWAY = 1
@@ -64,7 +60,7 @@ class RoadKind(enum.IntEnum):
 
 
 LANE_KINDS = (RoadKind.LANE_UNDEFINED, RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE, RoadKind.LANE_BIKE)
-#: Lanes that answer "which lane is this car on"; bike lanes do not.
+#: Lanes for cars.
 CAR_LANE_KINDS = LANE_KINDS[:3]
 LINE_KINDS = tuple(kind for kind in RoadKind if 5 <= kind <= 13)
 EDGE_KINDS = (RoadKind.EDGE_UNKNOWN, RoadKind.EDGE_BOUNDARY, RoadKind.EDGE_MEDIAN)
@@ -72,21 +68,21 @@ POLYGON_KINDS = (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY)
 
 
 def among(kind: Int[np.ndarray, "*n"], group: tuple[int, ...]) -> Bool[np.ndarray, "*n"]:
-    """Which kinds (-1 or more) are in a group: ``np.isin``, but by a table, which is several times faster."""
+    """Mask of kinds (-1 or more) in a group: ``np.isin`` by a table, which is several times faster."""
     table = _member(group)
     return table[np.minimum(kind, len(table) - 1)]
 
 
 @cache
 def _member(group: tuple[int, ...]) -> Bool[np.ndarray, " kind"]:
-    """Whether each number is in a group; the last entry stands for all that are larger, and for -1."""
+    """Mask of the numbers in a group; the last entry stands for larger numbers and -1."""
     result = np.zeros(max(group) + 2, dtype=bool)
     result[list(group)] = True
     return result
 
 
 class LightState(enum.IntEnum):
-    """State of a traffic light for one lane; the numbers are WOMD's, -1 where nobody observed it."""
+    """State of a traffic light for one lane, numbered as in WOMD; -1 unobserved."""
 
     UNOBSERVED = -1
     UNKNOWN = 0
@@ -117,13 +113,13 @@ class Flag(enum.IntFlag):
     JITTERED_TIME = 1024
     ROUTE = 2048
     ELEVATION = 4096
-    #: Some lane has no limit of its own and gets that of its class (freeway, surface street).
+    #: Some lane without a limit gets the limit of its class (freeway, surface street).
     DEFAULT_LIMITS = 8192
 
 
 @dataclass(frozen=True)
 class Capacity:
-    """Padded sizes of a stored scenario; what does not fit is counted in ``overflow``, never silently lost."""
+    """Padded sizes of a stored scenario; items that do not fit are counted in ``overflow``."""
 
     name: str = "default"
     agents: int = 80
@@ -156,7 +152,7 @@ CAPACITIES = {
 
 
 def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Names, dtypes and shapes of a stored scenario of this capacity, in storage order."""
+    """Return names, dtypes and shapes of a stored scenario, in storage order."""
     c = capacity
     t, a, p, s, m, n = c.steps, c.agents, c.parked, c.segments, c.features, c.lanes
     k, r, o, lt, st = c.routes, c.route_points, c.road_rows, c.lights, c.stops
@@ -255,7 +251,7 @@ def scenario_fields(capacity: Capacity) -> dict[str, tuple[str, tuple[int, ...]]
 
 
 def record_dtype(capacity: Capacity) -> np.dtype[Any]:
-    """The structured dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
+    """Return the dtype of a stored scenario: 64-byte aligned fields, item size a multiple of 4096."""
     names, formats, offsets, end = [], [], [], 0
     for name, (kind, shape) in scenario_fields(capacity).items():
         formats.append((kind, shape))
@@ -269,7 +265,7 @@ def record_dtype(capacity: Capacity) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class SourceCounts:
-    """What the source held before capping and cropping; printed by ``drivax inspect``."""
+    """Counts of the source before capping and cropping, as shown by ``drivax inspect``."""
 
     steps: int
     tracks: int
@@ -277,25 +273,25 @@ class SourceCounts:
     map_features: dict[str, int]
     map_points: int
     lights: int
-    #: What the reader or the assembly had to leave out, by name (``dangling_links``, ...); only what is not zero.
+    #: Nonzero numbers of items that the reader or the assembly left out, by name (``dangling_links``, ...).
     lost: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One log as fixed-shape numpy arrays in one structured record, plus what was counted on the way.
+    """A log as fixed-shape NumPy arrays in a structured record.
 
-    Fields are read as attributes (``scenario.agent_xy``); names, dtypes and shapes are :func:`scenario_fields`.
-    Frame: the ego's position at the current step is the origin, axes are the source's. Metres, m/s, radians CCW
-    from +x wrapped to [-pi, pi), time step 0.1 s.
+    Fields are read as attributes (``scenario.agent_xy``); :func:`scenario_fields` lists them. The origin is the
+    position of the ego at the current step, the axes are those of the source. Metres, m/s, radians counter-clockwise
+    from +x in [-pi, pi), time step 0.1 s.
 
     Attributes:
         record: A zero-dimensional structured array of ``record_dtype(capacity)``.
         capacity: The padded sizes.
         source: Counts of the source before capping.
-        overflow: How many agents, segments, ... did not fit, by name; empty when all did.
-        audit: Findings of the log replay through the metrics, by name (see ``evaluation.audit``).
-        tags: Words for filters and strata (``domain``, ``family``, ``event``, ...).
+        overflow: Nonzero numbers of agents, segments, ... that did not fit, by name.
+        audit: Findings of the audit, by name (``evaluation.audit``).
+        tags: Words for filters and strata.
     """
 
     record: np.ndarray[Any, Any]
@@ -304,32 +300,6 @@ class Scenario:
     overflow: dict[str, int] = field(default_factory=dict)
     audit: dict[str, float | int | bool | None] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def from_arrays(
-        cls,
-        scenario_id: str,
-        agents: Mapping[str, Any],
-        roads: Mapping[str, Any],
-        lights: Sequence[Mapping[str, Any]] = (),
-        route: Sequence[int] = (),
-        ego: int = 0,
-        dt_s: float = DT_S,
-        dataset: str = "own",
-    ) -> Scenario:
-        """A scenario from plain arrays of at most 91 steps, the current one being number 10.
-
-        The arguments are those of :func:`drivax.scenario.arrays.recording_from_arrays`; cut what it makes of longer
-        data with :func:`drivax.scenario.build.assemble.windows` (docs/data/own-data.md).
-
-        Raises:
-            UsageError: An argument is missing, misspelt, or has another shape.
-            DataError: The data make no scenario (the ego is not valid at the current step, a number is not finite).
-        """
-        from drivax.scenario.arrays import recording_from_arrays
-        from drivax.scenario.build.assemble import assemble
-
-        return assemble(recording_from_arrays(scenario_id, agents, roads, lights, route, ego, dt_s, dataset))
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name in _OWN_FIELDS:
@@ -341,16 +311,16 @@ class Scenario:
 
     @property
     def id(self) -> str:
-        """The scenario's id as text."""
+        """Id of the scenario."""
         return self.text("scenario_id")
 
     def text(self, name: str) -> str:
-        """A field of bytes (``scenario_id``, ``dataset``, ``segment``) as text."""
+        """Return a field of bytes (``scenario_id``, ``dataset``, ``segment``) as text."""
         return bytes(self.record[name][()]).rstrip(b"\0").decode()
 
     @property
     def has(self) -> Flag:
-        """The scenario's flags."""
+        """Flags of the scenario."""
         return Flag(int(self.record["flags"]))
 
 

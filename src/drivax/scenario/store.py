@@ -5,18 +5,19 @@ A set is a folder::
     manifest.json        schema version, capacity, field table, shards, one entry per scenario
     shard-00000.npy      one-dimensional structured array of ``schema.record_dtype(capacity)``
     shard-00000.crc.npy  uint32, ``zlib.crc32`` of every record
-    splits/              lists for training, validation and test, if asked for (``scenario.select.splits``)
-    scores.npz           criticality of its scenarios, if they were chosen by it (``curation.subset``)
+    splits/              lists for training, validation and test (``scenario.select.splits``)
+    scores.npz           criticality scores by which the scenarios were selected (``curation.subset``)
 
 Any tool reads a shard with ``numpy.load(path, mmap_mode="r")``; record ``i`` lies at a fixed offset, so one
-scenario is one range read. Sets appear under their name only when they are complete. Numpy only, so that
-worker processes never import JAX.
+scenario is one range read. A set appears under its name only when it is complete. This module needs no JAX.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
+import math
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,36 +29,36 @@ from typing import IO, Any, Self
 import numpy as np
 
 from drivax.errors import DataError, UsageError
-from drivax.files import PartialFolder, sync_and_close, write_json
-from drivax.scenario.manifest import (
-    AGAIN,
-    MANIFEST,
-    Shard,
-    crc_name,
-    field_table,
-    manifest_entry,
-    plain,
-    read_manifest,
-    shard_name,
-    write_header,
+from drivax.files import PartialFolder, check_output, sync_and_close, write_json
+from drivax.scenario.schema import (
+    SCHEMA_VERSION,
+    Capacity,
+    Scenario,
+    SourceCounts,
+    record_dtype,
+    scenario_fields,
 )
-from drivax.scenario.schema import SCHEMA_VERSION, Capacity, Scenario, SourceCounts, record_dtype
 from drivax.scenario.select.splits import Shares, write_splits
+
+MANIFEST = "manifest.json"
+#: The cure for a set that cannot be repaired.
+AGAIN = "convert or generate the set again"
+_HEADER_LIMIT = 100_000
 
 
 class ScenarioWriter:
-    """Writes a scenario set; it appears under ``path`` when the ``with`` block ends without an exception.
+    """Write a scenario set; it appears as ``path`` when the ``with`` block ends without an exception.
 
     Args:
         path: Folder to create.
-        capacity: Padded sizes that all scenarios of the set share.
-        source: Where the scenarios come from, as plain JSON values; may be completed until the block ends.
+        capacity: Padded sizes of all scenarios.
+        source: Origin of the scenarios, as JSON values; may be completed until the block ends.
         shard_size: Records per shard.
         overwrite: Replace an existing scenario set; other folders are never replaced.
-        shares: Percentages of train, validation and test for the files of ``splits/``; None: no such files.
-        identity: What is written, for a set that can be continued: closed shards outlive an exception or a kill, and
-            the next writer with the same identity begins after them (:attr:`notes`).
-        further: Called with the folder of the whole set before it gets its name, to write what else it shall hold.
+        shares: Percentages of train, validation and test for the files of ``splits/``; None writes no files.
+        identity: What is written, for a set that can be resumed: closed shards survive an exception or a kill, and the
+            next writer with the same identity continues after them (:attr:`notes`).
+        further: Called with the complete folder before it is published, to write additional files.
 
     Raises:
         UsageError: ``path`` exists, another process writes it, or a scenario has another capacity.
@@ -82,7 +83,7 @@ class ScenarioWriter:
         self.overwrite = overwrite
         self._refuse_existing()
         self.source: dict[str, Any] = plain(dict(source or {}))
-        #: What :meth:`add` was told with the last scenario of every shard that an earlier writer closed.
+        #: Notes given to :meth:`add` with the last scenario of every shard that an earlier writer closed.
         self.notes: list[Any] = []
         self._shard_size = shard_size
         self._shares = shares
@@ -96,45 +97,38 @@ class ScenarioWriter:
         self._partial = PartialFolder(self.path, identity)
 
     def __enter__(self) -> Self:
-        for part in self._partial.open(anew=self.overwrite):
-            if (
-                part["shard"]["count"] < self._shard_size
-            ):  # closed by the end of the data: that end comes again
+        for part in self._partial.open(restart=self.overwrite):
+            if part["shard"]["count"] < self._shard_size:  # The last shard of the data is written again.
                 break
             self._shards.append(part["shard"])
             self._entries += part["scenarios"]
             self.notes.append(part["note"])
         self._known = {_key(entry) for entry in self._entries}
         names = {name for shard in self._shards for name in (shard["file"], crc_name(shard["file"]))}
-        for left in self._partial.content.iterdir():  # of a shard that was never closed
-            if left.name not in names:
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
+        for entry in self._partial.content.iterdir():  # Remove a shard that was never closed.
+            if entry.name not in names:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         return self
 
     @property
     def folder(self) -> Path:
-        """Where the set is being made; for files that are needed until it is complete."""
+        """The hidden folder that holds the set and temporary files until it is complete."""
         return self._partial.root
 
     @property
     def room(self) -> int:
-        """How many more scenarios the current shard holds."""
+        """Number of scenarios that still fit into the current shard."""
         return self._shard_size - len(self._crcs)
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __contains__(self, key: object) -> bool:
-        """Whether a scenario is in the set, by its (dataset, scenario id)."""
+        """Return whether a scenario is in the set, by its (dataset, scenario id)."""
         return key in self._known
 
     def add(self, scenario: Scenario, note: Any = None) -> None:
-        """Append one scenario.
-
-        Args:
-            scenario: What to append.
-            note: What :attr:`notes` shall tell a later writer if this scenario fills its shard, as JSON values.
-        """
+        """Append a scenario; a later writer finds ``note`` in :attr:`notes` if the scenario fills its shard."""
         if scenario.capacity != self.capacity:
             raise UsageError(
                 f"capacity is {scenario.capacity.name!r}, the set's is {self.capacity.name!r}",
@@ -218,7 +212,7 @@ class ScenarioWriter:
         write_json(self._partial.content / MANIFEST, manifest)
         if self._further is not None:
             self._further(self._partial.content)
-        self._refuse_existing()  # someone may have written it in the meantime
+        self._refuse_existing()  # Another process may have written it in the meantime.
         self._partial.publish()
 
     def _refuse_existing(self) -> None:
@@ -229,19 +223,16 @@ class ScenarioWriter:
             return
         if not (path / MANIFEST).is_file():
             raise UsageError("exists and is not a scenario set", file=path, cure="choose another name")
-        if not self.overwrite:
-            raise UsageError("exists already", file=path, cure="choose another name or pass --overwrite")
+        check_output(path, self.overwrite, folder=True)
 
 
 class ScenarioSet(Sequence[Scenario]):
-    """A scenario set opened for reading: memory-mapped, every record's checksum tested when first touched.
+    """A memory-mapped scenario set; the checksum of a record is tested when it is first read.
 
     Attributes:
-        path: The folder.
         capacity: Padded sizes of all records.
-        entries: The manifest's entry of every scenario (see :func:`manifest_entry`).
-        manifest: The whole manifest.
-        verify: Whether checksums are tested.
+        entries: Manifest entry of every scenario (:func:`manifest_entry`).
+        verify: Whether to test checksums.
     """
 
     def __init__(self, path: str | Path, manifest: dict[str, Any], verify: bool = True) -> None:
@@ -256,11 +247,11 @@ class ScenarioSet(Sequence[Scenario]):
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = True) -> ScenarioSet:
-        """Open a set and check that it is whole (checksums follow when records are read).
+        """Open a set and check its manifest and the size and layout of its shards.
 
         Raises:
-            DataError: Manifest missing, damaged or of another version; a shard missing, cut short or laid out
-                otherwise.
+            DataError: The manifest is missing, damaged or of another version; a shard is missing, truncated or laid
+                out differently.
         """
         opened = cls(path, read_manifest(Path(path)), verify)
         if len(opened.entries) != int(opened._starts[-1]):
@@ -277,7 +268,7 @@ class ScenarioSet(Sequence[Scenario]):
         return len(self.entries)
 
     def __getitem__(self, index: Any) -> Any:
-        """One scenario (a view of the file), or a list of them for a slice."""
+        """Return a scenario (a view of the file), or a list for a slice."""
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         shard, row = self._locate(int(index))
@@ -296,50 +287,48 @@ class ScenarioSet(Sequence[Scenario]):
         return (self[index] for index in range(len(self)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return ScenarioSet.open, (self.path, self.verify)  # a worker maps the files itself
+        return ScenarioSet.open, (self.path, self.verify)  # Each process maps the files itself.
 
     @property
     def hash(self) -> str:
-        """Identity of the data: SHA-256 (hex) over the checksums of the shards."""
-        return hashlib.sha256(
-            "".join(shard["sha256"] for shard in self.manifest["shards"]).encode()
-        ).hexdigest()
+        """SHA-256 (hex) over the checksums of the shards."""
+        digests = "".join(shard["sha256"] for shard in self.manifest["shards"])
+        return hashlib.sha256(digests.encode()).hexdigest()
 
     def records(self, indices: Any, out: np.ndarray[Any, Any] | None = None) -> np.ndarray[Any, Any]:
-        """Copies of many records at once: structured array ``[n]``, in the order of ``indices``.
+        """Copy records into a structured array ``[n]``, in the order of ``indices``.
 
         Args:
-            indices: Which; negative ones count from the end.
-            out: Where to put them: what an earlier call of as many returned. A loader that reads batch after batch
-                reads twice as fast into the same memory.
+            indices: Negative ones count from the end.
+            out: Result of an earlier call with as many indices, to be filled again; twice as fast as new memory.
 
         Raises:
-            IndexError: There is no such scenario.
+            IndexError: An index is out of range.
             DataError: A record is damaged.
         """
-        wanted = np.asarray(indices, np.int64).reshape(-1)
+        index = np.asarray(indices, np.int64).reshape(-1)
         total = len(self)
-        if wanted.size and (wanted.min() < -total or wanted.max() >= total):
+        if index.size and (index.min() < -total or index.max() >= total):
             raise IndexError(f"scenario indices must be in [-{total}, {total})")
-        wanted = np.where(wanted < 0, wanted + total, wanted)
+        index = np.where(index < 0, index + total, index)
         if out is None:
-            out = np.empty(wanted.size, self._dtype)
-        if out.shape != wanted.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
+            out = np.empty(index.size, self._dtype)
+        if out.shape != index.shape or out.dtype != self._dtype or not out.flags.c_contiguous:
             raise UsageError(
-                "out has not the size and type of the records", file=self.path, cure="leave it out"
+                "out does not have the size and type of the records", file=self.path, cure="leave it out"
             )
-        data = out.view(np.uint8).reshape(wanted.size, self._dtype.itemsize)
-        owner = np.searchsorted(self._starts, wanted, side="right") - 1
-        # One contiguous copy each, right after the test that brought it into the cache; take() is slower.
-        for place, (shard, index) in enumerate(zip(owner.tolist(), wanted.tolist(), strict=True)):
-            data[place] = self._shards[shard].record(index - int(self._starts[shard]), self.verify)
+        data = out.view(np.uint8).reshape(index.size, self._dtype.itemsize)
+        shards = np.searchsorted(self._starts, index, side="right") - 1
+        # A contiguous copy right after the test that brought the record into the cache; take() is slower.
+        for row, (shard, number) in enumerate(zip(shards.tolist(), index.tolist(), strict=True)):
+            data[row] = self._shards[shard].record(number - int(self._starts[shard]), self.verify)
         return out
 
     def check(self) -> None:
-        """Read everything: every record's CRC and every shard's SHA-256.
+        """Test the CRC of every record and the SHA-256 of every shard.
 
         Raises:
-            DataError: The first damaged record or shard.
+            DataError: A record or shard is damaged.
         """
         for shard in self._shards:
             for row in range(shard.count):
@@ -354,5 +343,200 @@ class ScenarioSet(Sequence[Scenario]):
         return shard, index - int(self._starts[shard])
 
 
+class Shard:
+    """A shard file: expected layout, memory map, and a mask of the records that passed their checksum."""
+
+    def __init__(self, folder: Path, entry: Mapping[str, Any], dtype: np.dtype[Any]) -> None:
+        self.path = folder / entry["file"]
+        self.crc_path = folder / crc_name(entry["file"])
+        self.count = int(entry["count"])
+        self._sha256 = entry["sha256"]
+        self._dtype = dtype
+        self._data: np.ndarray[Any, Any] | None = None
+        self._crcs = np.zeros(0, np.uint32)
+        self._intact = np.zeros(self.count, bool)
+
+    def check_files(self) -> int:
+        """Test presence, layout and size; return the offset of the first record."""
+        for path in (self.path, self.crc_path):
+            if not path.is_file():
+                raise DataError("shard is missing", file=path, cure=f"restore the file or {AGAIN}")
+        with self.path.open("rb") as file:
+            shape, dtype = read_header(file, self.path)
+            offset = file.tell()
+        if shape != (self.count,) or dtype != self._dtype:
+            raise DataError("shard does not have the layout its manifest names", file=self.path, cure=AGAIN)
+        size = self.path.stat().st_size
+        if size != offset + self.count * self._dtype.itemsize:
+            whole = max(0, size - offset) // self._dtype.itemsize
+            raise DataError(
+                f"shard is truncated or has trailing bytes: {whole} whole records of {self.count}",
+                file=self.path,
+                record=min(whole, self.count),
+                cure=f"copy the file again or {AGAIN}",
+            )
+        return offset
+
+    def record(self, row: int, verify: bool) -> np.ndarray[Any, Any]:
+        """Return a view of the bytes of a record; with ``verify``, test its checksum at first use."""
+        data = self._map() if self._data is None else self._data
+        if verify and not self._intact[row]:
+            self._test(data, row)
+        return data[row]
+
+    def check_digest(self) -> None:
+        """Compare the file's SHA-256 with the manifest's."""
+        with self.path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != self._sha256:
+                raise DataError("SHA-256 differs from the manifest's", file=self.path, cure=AGAIN)
+
+    def _map(self) -> np.ndarray[Any, Any]:
+        offset = self.check_files()
+        shape = (self.count, self._dtype.itemsize)
+        # A plain view: indexing a memmap costs Python time.
+        self._data = np.asarray(np.memmap(self.path, np.uint8, "r", offset, shape))
+        with self.crc_path.open("rb") as file:
+            shape, dtype = read_header(file, self.crc_path)
+            crcs = file.read()
+        if shape != (self.count,) or dtype != np.uint32 or len(crcs) != 4 * self.count:
+            raise DataError("checksum file does not fit its shard", file=self.crc_path, cure=AGAIN)
+        self._crcs = np.frombuffer(crcs, np.uint32)
+        return self._data
+
+    def _test(self, data: np.ndarray[Any, Any], row: int) -> None:
+        if zlib.crc32(data[row].data) != int(self._crcs[row]):
+            raise DataError(
+                "checksum mismatch, the record is damaged",
+                file=self.path,
+                record=row,
+                cure=f"copy the file again or {AGAIN}",
+            )
+        self._intact[row] = True
+
+
 def _key(entry: Mapping[str, Any]) -> tuple[str, str]:
     return entry["dataset"], entry["scenario_id"]
+
+
+def manifest_entry(scenario: Scenario) -> dict[str, Any]:
+    """Return the manifest entry of a scenario."""
+    return {
+        "scenario_id": scenario.id,
+        "dataset": scenario.text("dataset"),
+        "segment": scenario.text("segment"),
+        "flags": [str(flag.name) for flag in scenario.has],
+        "segments": int(scenario.record["segment_blocks"][3]),
+        "source": plain(dataclasses.asdict(scenario.source)),
+        "overflow": plain(scenario.overflow),
+        "audit": plain(scenario.audit),
+        "tags": plain(scenario.tags),
+    }
+
+
+def field_table(capacity: Capacity) -> list[dict[str, Any]]:
+    """Return name, dtype, shape and byte offset of every field of a record."""
+    offsets = {name: entry[1] for name, entry in (record_dtype(capacity).fields or {}).items()}
+    return [
+        {"name": name, "dtype": np.dtype(kind).str, "shape": list(shape), "offset": offsets[name]}
+        for name, (kind, shape) in scenario_fields(capacity).items()
+    ]
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Read and check the manifest of the set at ``path``.
+
+    Raises:
+        DataError: No such folder, no manifest, damaged JSON, a missing key, another schema version or layout.
+    """
+    file = path / MANIFEST
+    if not path.is_dir():
+        problem = "is not a scenario set (a folder)" if path.exists() else "folder not found"
+        raise DataError(problem, file=path, cure="name the folder that drivax convert or generate wrote")
+    if not file.is_file():
+        raise DataError(
+            "no manifest.json, so this is no complete scenario set",
+            file=path,
+            cure=f"if these are recordings, `drivax convert` makes a set of them; otherwise {AGAIN}",
+        )
+    try:
+        manifest = json.loads(file.read_bytes())
+        version = manifest["schema_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"manifest is damaged ({error})", file=file, cure=AGAIN) from error
+    if version != SCHEMA_VERSION:
+        newer = isinstance(version, int) and version > SCHEMA_VERSION
+        raise DataError(
+            f"schema version {version}, this drivax reads {SCHEMA_VERSION}",
+            file=file,
+            cure="upgrade drivax" if newer else AGAIN,
+        )
+    _check_manifest(manifest, file)
+    return manifest
+
+
+def _check_manifest(manifest: dict[str, Any], file: Path) -> None:
+    try:
+        fields_agree = manifest["fields"] == field_table(Capacity(**manifest["capacity"]))
+        _need(manifest["shards"], ("file", "count", "sha256"))
+        _need(
+            manifest["scenarios"], ("scenario_id", "dataset", "segment", "flags", "overflow", "audit", "tags")
+        )
+        for entry in manifest["scenarios"]:
+            SourceCounts(**entry["source"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"manifest is damaged ({error!r})", file=file, cure=AGAIN) from error
+    if not fields_agree:
+        raise DataError("field table is not this version's", file=file, cure=AGAIN)
+
+
+def _need(rows: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
+    for row in rows:
+        for key in keys:
+            if key not in row:
+                raise KeyError(key)
+
+
+def shard_name(number: int) -> str:
+    """Return the file name of a shard."""
+    return f"shard-{number:05d}.npy"
+
+
+def crc_name(shard: str) -> str:
+    """Return the file name of the checksums of a shard file."""
+    return shard.removesuffix(".npy") + ".crc.npy"
+
+
+def write_header(file: IO[bytes], dtype: np.dtype[Any], count: int) -> None:
+    """Write the ``.npy`` header of ``count`` records; its length does not depend on ``count``."""
+    # numpy pads headers so that a growing first axis never changes their length (numpy.lib.format).
+    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (count,)}
+    np.lib.format.write_array_header_1_0(file, header)
+
+
+def read_header(file: IO[bytes], path: Path) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read shape and dtype of a ``.npy`` file; leaves ``file`` at the first byte of data.
+
+    Raises:
+        DataError: The header is damaged.
+    """
+    try:
+        np.lib.format.read_magic(file)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER_LIMIT)
+    except (ValueError, SyntaxError, TypeError) as error:
+        raise DataError("header is damaged, not a .npy shard", file=path, cure=AGAIN) from error
+    return shape, dtype
+
+
+def plain(value: Any) -> Any:
+    """Return a value as strict JSON: NumPy scalars unpacked, paths as text, NaN and infinities as null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value

@@ -13,14 +13,14 @@ from drivax.scenario.record import record
 from drivax.scenario.schema import LightState
 from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.simulator.traffic.corridor import FREE_M, LEAST_GAP_M, closest, reaching
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 
 #: Look-ahead along the route and its spacing, m.
 _STEP_M, _POINTS = 2.0, 46
 _FALLBACK_LIMIT_MPS = 13.4
-#: Free space kept beside the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
+#: Free space kept next to the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
-#: Things further beside the route than this, and ego's half width, are not looked at, m.
+#: Things further along the route than this, and ego's half width, are not looked at, m.
 _NEAR_M = 0.4
 #: A yellow light is a red one for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
@@ -36,32 +36,32 @@ class Ahead:
         gap: To the nearest thing in the way, bumper to bumper, or a little less than to a light that asks to stop, m;
             10 km where there is neither.
         leader: Speed of that thing along the route, m/s; 0 for a light.
-        wanted: The limit here, or what the curves ahead allow; 13.4 where no limit is known, 0 at the route's end, m/s.
+        desired: The limit here, or what the curves ahead allow; 13.4 where none is known, 0 at the route's end, m/s.
     """
 
     gap: Float[Array, ""]
     leader: Float[Array, ""]
-    wanted: Float[Array, ""]
+    desired: Float[Array, ""]
 
     def acceleration(self, speed: Float[Array, ""], parameters: IdmParameters) -> Float[Array, ""]:
         """What the IDM does with it at a speed, m/s2."""
-        return idm_acceleration(speed, self.wanted, self.gap, self.leader, parameters)
+        return idm_acceleration(speed, self.desired, self.gap, self.leader, parameters)
 
 
-def ahead(bank: ScenarioBank, scene: Scene, frame: Frame, min_gap_m: float) -> Ahead:
+def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float) -> Ahead:
     """Looks 90 m along the route from where the driven agent is.
 
     Args:
         bank: The scenarios.
-        scene: The scene.
-        frame: Everyone now.
+        context: The context.
+        frame: All agents now.
         min_gap_m: What the driver keeps from a thing, so that it stands 1 m before a stop line.
     """
-    me = frame.box[scene.slot]
+    me = frame.box[context.slot]
     offsets = jnp.arange(_POINTS) * _STEP_M
-    path, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    others = frame.valid & (jnp.arange(frame.valid.shape[0]) != scene.slot)
-    others &= jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
+    path, there = route_ahead(bank, context.index, context.route_m, offsets)
+    others = frame.valid & (jnp.arange(frame.valid.shape[0]) != context.slot)
+    others &= jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
     # Only the closest of those that come near the route are measured against all of its points.
     nodes = jnp.where(there[:, None], path[:, RouteColumn.XY], path[0, RouteColumn.XY])[None]
     boxes = frame.box.T
@@ -75,20 +75,20 @@ def ahead(bank: ScenarioBank, scene: Scene, frame: Frame, min_gap_m: float) -> A
     gaps = jnp.where(blocks, along - half_length - me[4] / 2, jnp.inf)
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1)) * cos
     nearest = first_smallest(gaps, least=LEAST_GAP_M)
-    stop = stop_line_m(bank, scene, frame) + min_gap_m - STOP_SHORT_M
+    stop = stop_line_m(bank, context, frame) + min_gap_m - STOP_SHORT_M
     gap = jnp.minimum(gaps[nearest], stop)
     return Ahead(
         gap=jnp.where(jnp.isfinite(gap), gap, FREE_M),
         leader=jnp.where(stop < gaps[nearest], 0.0, speed[nearest]),
-        wanted=jnp.where(there[1], desired_speed(path, there, offsets), 0.0),
+        desired=jnp.where(there[1], desired_speed(path, there, offsets), 0.0),
     )
 
 
-def stop_line_m(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
+def stop_line_m(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Float[Array, ""]:
     """Distance from the front bumper to the nearest stop line of the route whose light asks to stop; inf: none does."""
-    line, state = bank.light_line[scene.index], frame.lights
-    front = line[LightRow.ARC] - scene.route_m - frame.box[scene.slot, 4] / 2
-    speed = scene.history[-1, 3]
+    line, state = bank.light_line[context.index], frame.lights
+    front = line[LightRow.ARC] - context.route_m - frame.box[context.slot, 4] / 2
+    speed = context.history[-1, 3]
     can_stop = speed * speed / (2.0 * jnp.maximum(front, 0.1)) < _YELLOW_BRAKING_MPS2
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     yellow = (state == LightState.CAUTION) | (state == LightState.ARROW_CAUTION)

@@ -9,31 +9,31 @@ from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import light_crossing
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import LightState
-from drivax.simulator.types import HISTORY, MOTION_SPEED, LightMemory, Scene
+from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext, LightMemory
 
-#: A stop before a right turn on red: slower than this, this near, within so many steps.
+#: A stop before a right turn on red: slower than this, this near, within this many steps.
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
-#: Off the route, which of the lights it crossed an agent obeyed is judged by its heading so many steps later.
+#: Off the route, which of the lights it crossed an agent obeyed is evaluated by its heading this many steps later.
 JUDGED_AFTER = 20
 
 
-def _fronts(scene: Scene, length_m: Float[Array, ""]) -> Float[Array, "16 2"]:
-    """Front bumper at every step of the scene's history."""
-    past = scene.history
+def _fronts(context: AgentContext, length_m: Float[Array, ""]) -> Float[Array, "16 2"]:
+    """Front bumper at every step of the context's history."""
+    past = context.history
     ahead = jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1)
     return past[:, :2] + ahead * length_m / 2
 
 
-def remember_lights(bank: ScenarioBank, scene: Scene) -> LightMemory:
-    """The memory that a scene's recent motion implies, as if it had been driven."""
-    length = bank.length_m(scene.index, scene.slot)
-    ground = scene.z - bank.height_m(scene.index, scene.slot) / 2
+def remember_lights(bank: ScenarioBank, context: AgentContext) -> LightMemory:
+    """The memory that a context's recent motion implies, as if it had been driven."""
+    length = bank.length_m(context.index, context.slot)
+    ground = context.z - bank.height_m(context.index, context.slot) / 2
     pause = jnp.full(bank.light_line.shape[2], PAUSE_STEPS + 1, jnp.int32)
-    fronts = _fronts(scene, length)
+    fronts = _fronts(context, length)
     for age in range(HISTORY - 1, -1, -1):
         front = fronts[HISTORY - 1 - age]
-        _, before_m = light_crossing(bank, scene.index, front, front, ground)
-        stands = scene.history[HISTORY - 1 - age, MOTION_SPEED] < _PAUSE_MPS
+        _, before_m = light_crossing(bank, context.index, front, front, ground)
+        stands = context.history[HISTORY - 1 - age, MOTION_SPEED] < _PAUSE_MPS
         pause = jnp.where(stands & (before_m >= 0.0) & (before_m < _PAUSE_M), age, pause)
     return LightMemory(pause.astype(jnp.int8), jnp.zeros_like(pause, jnp.int8))
 
@@ -43,8 +43,9 @@ def nothing_crossed(memory: LightMemory) -> LightMemory:
     return LightMemory(memory.pause, jnp.zeros_like(memory.crossed))
 
 
-def judge_lights(
-    bank: ScenarioBank, scene: Scene, me: Float[Array, " 6"], ground: Float[Array, ""], on_route: Bool[Array, ""],
+def check_lights(
+    bank: ScenarioBank, context: AgentContext,
+    me: Float[Array, " 6"], ground: Float[Array, ""], on_route: Bool[Array, ""],
     memory: LightMemory,
 ) -> tuple[Bool[Array, ""], LightMemory]:  # fmt: skip
     """Whether a red light was run, found out at this step, and what to remember.
@@ -52,26 +53,26 @@ def judge_lights(
     On the route only its own lights count, at once. Off it, of the lines that were crossed together the one counts
     whose lane ends most nearly in the heading that the agent has two seconds later, or at the end of the log.
     """
-    front_before, front = _fronts(scene, me[4])[-2:]
-    crossed, before_m = light_crossing(bank, scene.index, front_before, front, ground)
+    front_before, front = _fronts(context, me[4])[-2:]
+    crossed, before_m = light_crossing(bank, context.index, front_before, front, ground)
     last = bank.steps - 1
-    now = bank.light_state[scene.index, jnp.clip(scene.step, 0, last)]
-    then = bank.light_state[scene.index, jnp.clip(scene.step - 1, 0, last)]
+    now = bank.light_state[context.index, jnp.clip(context.step, 0, last)]
+    then = bank.light_state[context.index, jnp.clip(context.step - 1, 0, last)]
     is_red = _red(now) & _red(then)
     # A stop shortly before the line, then a right turn, is lawful unless the light is a red arrow.
     arrow = (now == LightState.ARROW_STOP) | (then == LightState.ARROW_STOP)
-    line = bank.light_line[scene.index]
+    line = bank.light_line[context.index]
     is_red &= ~((line[LightRow.RIGHT] > 0) & (memory.pause < PAUSE_STEPS) & ~arrow)
     ran = (crossed & is_red & (line[LightRow.ARC] < NEVER_M)).any() & on_route
 
     begins = crossed & ~on_route
     age = jnp.where(begins, jnp.where(is_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
-    # What is still open when the log ends is judged then.
-    due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (scene.step >= last))
+    # What is still open when the log ends is evaluated then.
+    due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (context.step >= last))
     fit = jnp.where(due, line[LightRow.EXIT_COS] * me[2] + line[LightRow.EXIT_SIN] * me[3], -2.0)
     ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()
     age = jnp.where(due, 0, age)
-    stands = (scene.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
+    stands = (context.history[-1, MOTION_SPEED] < _PAUSE_MPS) & (before_m >= 0.0) & (before_m < _PAUSE_M)
     pause = jnp.where(stands, 0, jnp.minimum(memory.pause.astype(jnp.int32) + 1, PAUSE_STEPS + 1))
     return ran, LightMemory(pause.astype(jnp.int8), age.astype(jnp.int8))
 

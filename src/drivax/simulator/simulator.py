@@ -20,7 +20,16 @@ from drivax.simulator.situation import forget_strand, measure, surroundings
 from drivax.simulator.starts import LogStart, Start
 from drivax.simulator.together import is_driven
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
-from drivax.simulator.types import Beginning, Frame, Scene, SimState, Situation, Task, Traffic, Transition
+from drivax.simulator.types import (
+    AgentContext,
+    Beginning,
+    Frame,
+    SimState,
+    Situation,
+    Task,
+    Traffic,
+    Transition,
+)
 
 
 @dataclass(frozen=True)
@@ -39,27 +48,27 @@ class Simulator:
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> SimState:
         """The state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws a start other than the log's."""
-        scene = self.scene(bank, index, step, slot, key)
-        return self._begin(bank, scene, alone(scene))
+        context = self.context(bank, index, step, slot, key)
+        return self._begin(bank, context, alone(context))
 
-    def _begin(self, bank: ScenarioBank, scene: Scene, cast: Scene) -> SimState:
-        """The state in which an episode begins at a scene."""
-        now = self.frame(bank, scene, cast, 0)
-        # Overlaps at the start are ignored until they part, as if everyone had just appeared; so nobody's fault is
-        # judged, for which alone a frame before this one would be needed.
+    def _begin(self, bank: ScenarioBank, context: AgentContext, cast: AgentContext) -> SimState:
+        """The state in which an episode begins at a context."""
+        now = self.frame(bank, context, cast, 0)
+        # Overlaps at the start are ignored until they part, as if all agents had just appeared; so no fault is
+        # evaluated, for which alone a frame before this one would be needed.
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
-        lights = remember_lights(bank, scene)
-        found, contacts, lights = measure(bank, scene, now, now, contacts, lights, self.task.reads)
-        episode, step = self.task.episode_start(), found.scene.step
-        return SimState(found.scene, found.facts, contacts, nothing_crossed(lights), episode, step)
+        lights = remember_lights(bank, context)
+        found, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
+        episode, step = self.task.episode_start(), found.context.step
+        return SimState(found.context, found.facts, contacts, nothing_crossed(lights), episode, step)
 
-    def scene(
+    def context(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
-    ) -> Scene:
-        """A moment as a scene: what offline sampling and resets start from; logged unless ``start`` says otherwise."""
+    ) -> AgentContext:
+        """Return what an episode or a sample starts from; logged unless ``start`` says otherwise."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
         history, route_m = LogStart().begin(bank, index, step, slot)
-        scene = Scene(
+        context = AgentContext(
             index=index,
             step=step,
             slot=slot,
@@ -70,26 +79,28 @@ class Simulator:
             traffic=self.traffic.start(bank, index, step),
         )
         if isinstance(self.start, LogStart):
-            return scene
-        agents = self.traffic.agents(bank, scene, 0)
+            return context
+        agents = self.traffic.agents(bank, context, 0)
         history, route_m = self.start.begin(bank, index, step, slot, agents, key)
         action = self.task.first_action(history, bank.length_m(index, slot))
-        return replace(scene, history=history, route_m=route_m, action=action)
+        return replace(context, history=history, route_m=route_m, action=action)
 
     def beginning(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> Beginning:
-        """The :meth:`scene` of an episode that begins, and what its motion so far implies about stop lines."""
-        scene = self.scene(bank, index, step, slot, key)
-        return Beginning(scene, remember_lights(bank, scene))
+        """The :meth:`context` of an episode that begins, and what its motion so far implies about stop lines."""
+        context = self.context(bank, index, step, slot, key)
+        return Beginning(context, remember_lights(bank, context))
 
-    def frame(self, bank: ScenarioBank, scene: Scene, cast: Scene, back: int) -> Frame:
-        """Everyone ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
-        return frame_of(bank, scene.index, scene.step, self.traffic.agents(bank, scene, back), cast, back)
+    def frame(self, bank: ScenarioBank, context: AgentContext, cast: AgentContext, back: int) -> Frame:
+        """All agents ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
+        return frame_of(
+            bank, context.index, context.step, self.traffic.agents(bank, context, back), cast, back
+        )
 
-    def now(self, bank: ScenarioBank, scene: Scene) -> Frame:
-        """Everyone now, around one driven agent."""
-        return self.frame(bank, scene, alone(scene), 0)
+    def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
+        """All agents now, around one driven agent."""
+        return self.frame(bank, context, alone(context), 0)
 
     def step(
         self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
@@ -110,8 +121,8 @@ class Simulator:
 
         They begin as logged: a noisy start knows of one driven agent only.
         """
-        scenes = jax.vmap(lambda slot: self.scene(bank, index, step, slot))(slots)
-        return jax.vmap(lambda scene: self._begin(bank, scene, scenes))(scenes)
+        contexts = jax.vmap(lambda slot: self.context(bank, index, step, slot))(slots)
+        return jax.vmap(lambda context: self._begin(bank, context, contexts))(contexts)
 
     def step_together(
         self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
@@ -123,13 +134,13 @@ class Simulator:
             states: The stack of their states. One whose slot is beyond the moving agents fills up the stack: it is on
                 no road, and is never rewarded nor over; its facts mean nothing.
             actions: An action each.
-            over: ``[K]`` whose episode has ended at an earlier step: they drive on as they are told, and are neither
-                rewarded nor judged any more. Nobody's by default, which is right for tasks that drive to the end.
+            over: ``[K]`` whose episode has ended at an earlier step: they drive on by their actions, and are neither
+                rewarded nor evaluated any more. None by default, which is right for tasks that drive to the end.
         """
-        first = jax.tree.map(lambda leaf: leaf[0], states.scene)
-        seen = self.frame(bank, first, states.scene, 0)
+        first = jax.tree.map(lambda leaf: leaf[0], states.context)
+        seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
-        moved = jax.vmap(lambda s, a: self._drive_on(bank, s.scene, a, None, traffic))(states, actions)
+        moved = jax.vmap(lambda s, a: self._drive_on(bank, s.context, a, None, traffic))(states, actions)
         after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))(
             states, moved, actions
         )
@@ -143,28 +154,30 @@ class Simulator:
 
     def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
         """The observation of each of K agents of one scenario, stacked."""
-        return jax.vmap(lambda scene: self.observe(bank, scene, states.scene))(states.scene)
+        return jax.vmap(lambda context: self.observe(bank, context, states.context))(states.context)
 
-    def situation(self, bank: ScenarioBank, state: SimState, cast: Scene | None = None) -> Situation:
+    def situation(self, bank: ScenarioBank, state: SimState, cast: AgentContext | None = None) -> Situation:
         """The state's facts with the surroundings that they were measured in; for planners.
 
         Args:
             bank: The scenarios.
             state: The state.
-            cast: Scenes of all driven agents of the scenario, stacked; the agent alone by default.
+            cast: Contexts of all driven agents of the scenario, stacked; the agent alone by default.
         """
-        cast = alone(state.scene) if cast is None else cast
-        around = surroundings(bank, state.scene, self.frame(bank, state.scene, cast, 0))
-        return Situation(state.scene, state.facts, around)
+        cast = alone(state.context) if cast is None else cast
+        around = surroundings(bank, state.context, self.frame(bank, state.context, cast, 0))
+        return Situation(state.context, state.facts, around)
 
-    def observe(self, bank: ScenarioBank, scene: Scene, cast: Scene | None = None) -> Mapping[str, Any]:
-        """The task's observation of a scene, live or replayed."""
-        cast = alone(scene) if cast is None else cast
+    def observe(
+        self, bank: ScenarioBank, context: AgentContext, cast: AgentContext | None = None
+    ) -> Mapping[str, Any]:
+        """The task's observation of a context, live or replayed."""
+        cast = alone(context) if cast is None else cast
 
         def frames(back: int) -> Frame:
-            return self.frame(bank, scene, cast, back)
+            return self.frame(bank, context, cast, back)
 
-        return self.task.observe(bank, scene, frames, frames(0))
+        return self.task.observe(bank, context, frames, frames(0))
 
     def step_or_begin(
         self,
@@ -188,19 +201,19 @@ class Simulator:
             over: Whether it is over.
             fresh: The :meth:`beginning` that it has then; looked at only where ``over``, so that a batch needs to
                 compute it there only (:func:`simulator.sparse.map_where`).
-            seen: ``now(bank, state.scene)``, from who has it at hand, so that it is not computed again.
+            seen: ``now(bank, state.context)``, from who has it at hand, so that it is not computed again.
         """
-        seen = self.now(bank, state.scene) if seen is None else seen
-        moved = self._move(bank, state.scene, seen, action, None)
-        scene = jax.tree.map(partial(jnp.where, over), fresh.scene, moved)
+        seen = self.now(bank, state.context) if seen is None else seen
+        moved = self._move(bank, state.context, seen, action, None)
+        context = jax.tree.map(partial(jnp.where, over), fresh.context, moved)
         before = replace(
             state,
             facts=forget_strand(state.facts, over),
             contacts=jnp.where(over, jnp.int8(Contact.ABSENT), state.contacts),
             lights=jax.tree.map(partial(jnp.where, over), fresh.lights, state.lights),
-            start=jnp.where(over, fresh.scene.step, state.start),
+            start=jnp.where(over, fresh.context.step, state.start),
         )
-        after, transition = self._settle(bank, before, scene, alone(scene), seen, action)
+        after, transition = self._settle(bank, before, context, alone(context), seen, action)
         first = self.task.episode_start()
         episode = jax.tree.map(lambda new, old: jnp.where(over, new, old), first, after.episode)
         lights = jax.tree.map(partial(jnp.where, over), nothing_crossed(after.lights), after.lights)
@@ -211,44 +224,50 @@ class Simulator:
     def _drive(
         self, bank: ScenarioBank, state: SimState, action: Array, motion: Array | None
     ) -> tuple[SimState, Transition]:
-        seen = self.now(bank, state.scene)
-        moved = self._move(bank, state.scene, seen, action, motion)
+        seen = self.now(bank, state.context)
+        moved = self._move(bank, state.context, seen, action, motion)
         return self._settle(bank, state, moved, alone(moved), seen, action)
 
     def _move(
-        self, bank: ScenarioBank, scene: Scene, seen: Frame, action: Array, motion: Array | None
-    ) -> Scene:
-        """Everyone moves one step on from a frame; nothing is measured yet."""
-        traffic = self.traffic.advance(bank, scene, seen)
-        return self._drive_on(bank, scene, action, motion, traffic)
+        self, bank: ScenarioBank, context: AgentContext, seen: Frame, action: Array, motion: Array | None
+    ) -> AgentContext:
+        """All agents move one step on from a frame; nothing is measured yet."""
+        traffic = self.traffic.advance(bank, context, seen)
+        return self._drive_on(bank, context, action, motion, traffic)
 
     def _drive_on(
-        self, bank: ScenarioBank, scene: Scene, action: Array, motion: Array | None, traffic: Any
-    ) -> Scene:
+        self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any
+    ) -> AgentContext:
         """The agent moves one step, in traffic that has moved."""
         if motion is None:
-            action = self.task.actuated(scene.history[-1], action, scene.action)
-            motion = self.task.motion(scene.history[-1], action, bank.length_m(scene.index, scene.slot))
+            action = self.task.actuated(context.history[-1], action, context.action)
+            motion = self.task.motion(context.history[-1], action, bank.length_m(context.index, context.slot))
         return replace(
-            scene,
-            step=scene.step + 1,
-            history=jnp.concatenate([scene.history[1:], motion[None]]),
+            context,
+            step=context.step + 1,
+            history=jnp.concatenate([context.history[1:], motion[None]]),
             action=action,
             traffic=traffic,
         )
 
     def _settle(
-        self, bank: ScenarioBank, before: SimState, moved: Scene, cast: Scene, seen: Frame, action: Array
+        self,
+        bank: ScenarioBank,
+        before: SimState,
+        moved: AgentContext,
+        cast: AgentContext,
+        seen: Frame,
+        action: Array,
     ) -> tuple[SimState, Transition]:
-        """Measures an agent after everyone has moved on from a frame, and turns the step into a transition."""
+        """Measures an agent after all agents have moved on from a frame, and turns the step into a transition."""
         now = self.frame(bank, moved, cast, 0)
         found, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )
-        terminated, truncated = self.task.ended(bank, found.scene, found.facts)
+        terminated, truncated = self.task.ended(bank, found.context, found.facts)
         terms = self.task.reward(before.facts, found.facts, found.surroundings)
-        final = terminated | truncated | (found.scene.step >= bank.steps - 1)
+        final = terminated | truncated | (found.context.step >= bank.steps - 1)
         episode = self.task.episode_add(before.episode, found, before.start, final)
-        after = SimState(found.scene, found.facts, contacts, lights, episode, before.start)
+        after = SimState(found.context, found.facts, contacts, lights, episode, before.start)
         reward = sum(terms.values(), start=jnp.zeros(()))
         return after, Transition(before, after, action, reward, terms, terminated, truncated)

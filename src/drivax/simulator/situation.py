@@ -1,4 +1,4 @@
-"""Measure once: from a scene and everyone's frame to the facts that metrics, rewards and planners share."""
+"""Measure once: from a context and the frame to the facts that metrics, rewards and planners share."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, wrap
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.passages import lane_passage
 from drivax.scenario.bank.queries import (
@@ -28,23 +27,23 @@ from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import (
     STOPPED_MPS,
     Contact,
+    classify_contacts,
     first_contacts,
-    judge_contacts,
     nearest_gap,
     next_contacts,
     overlaps,
     time_to_collision,
 )
-from drivax.simulator.lights import judge_lights
+from drivax.simulator.lights import check_lights
 from drivax.simulator.types import (
     FACTS,
     MOTION_HEADING,
     MOTION_SPEED,
     ON_REQUEST,
+    AgentContext,
     Facts,
     Frame,
     LightMemory,
-    Scene,
     Situation,
     Surroundings,
 )
@@ -59,36 +58,32 @@ _PASSAGES = frozenset({"strand", "lane_changed", "merged"})
 
 
 def measure(
-    bank: ScenarioBank, scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], lights: LightMemory,
-    reads: frozenset[str] = FACTS, strand: Any = None,
+    bank: ScenarioBank, context: AgentContext, frame: Frame, previous: Frame,
+    contacts: Int[Array, " S"], lights: LightMemory, reads: frozenset[str] = FACTS, strand: Any = None,
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
-    """Measures the driven agent of a scene.
+    """Measure the driven agent.
 
-    Args:
-        bank: The scenarios.
-        scene: The scene, with the ``route_m`` and ``z`` of the step before.
-        frame: Everyone now.
-        previous: Everyone one step ago.
-        contacts: Contact codes of the step before.
-        lights: What is remembered about stop lines.
-        reads: Names of the facts that are wanted; the others are None, and what only they need is not computed.
-        strand: The fact of that name of the step before; None where an episode begins.
+    ``context`` has the ``route_m`` and ``z`` of the step before, ``contacts`` and ``lights`` too,
+    ``frame`` and ``previous`` are all agents now and one step ago, and ``strand`` is the fact of that name of the step
+    before (None where an episode starts). Facts that ``reads`` does not name are None, and what only they need is not
+    computed.
 
     Returns:
-        The situation (its scene's ``route_m`` and ``z`` brought up to date), new contact codes, new light memory.
+        The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
     """
-    around = surroundings(bank, scene, frame)
-    lanes, route, me, ground = around.lanes, around.route, frame.box[scene.slot], _ground(bank, scene, frame)
-    beyond, left_map, offroad = _off_the_road(bank, scene.index, me, ground, lanes)
-    z = jnp.where(lanes.near, lanes.z + bank.height_m(scene.index, scene.slot) / 2, frame.z[scene.slot])
-    scene = replace(scene, route_m=jnp.maximum(scene.route_m, route.along_m), z=z)
-    codes, fault, kind, ttc = _touch(scene, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
-    routed = ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
+    around = surroundings(bank, context, frame)
+    lanes, route, me = around.lanes, around.route, frame.box[context.slot]
+    ground = _ground(bank, context, frame)
+    beyond, left_map, offroad = _off_the_road(bank, context.index, me, ground, lanes)
+    z = jnp.where(lanes.near, lanes.z + bank.height_m(context.index, context.slot) / 2, frame.z[context.slot])
+    context = replace(context, route_m=jnp.maximum(context.route_m, route.along_m), z=z)
+    codes, fault, kind, ttc = _touch(context, frame, previous, contacts, lanes.leaving_lane | offroad, reads)
+    routed = ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
     red, on_route = jnp.zeros((), bool), routed & (route.distance_m <= _ON_ROUTE_M)
     if "red_light" in reads:
-        red, lights = judge_lights(bank, scene, me, ground, on_route, lights)
-    now, logged = scene.history[-1], bank.agents[scene.index, scene.step, scene.slot]
-    acceleration, jerk, lateral = _rates(scene.history)
+        red, lights = check_lights(bank, context, me, ground, on_route, lights)
+    now, logged = context.history[-1], bank.agents[context.index, context.step, context.slot]
+    acceleration, jerk, lateral = _rates(context.history)
     facts = Facts(
         collision=((codes == Contact.HIT) | (codes == Contact.AT_FAULT)).any(),
         at_fault=fault,
@@ -106,18 +101,18 @@ def measure(
         ignored=(codes == Contact.IGNORED).sum().astype(jnp.int16),
         wrong_way=lanes.wrong_way,
         straddling=lanes.straddling,
-        moved_m=_moved(scene),
-        progress_m=scene.route_m,
+        moved_m=_moved(context),
+        progress_m=context.route_m,
         route_deviation_m=route.distance_m,
         off_route=~lanes.on_corridor & routed,
         log_divergence_m=norm(now[:2] - logged[AgentColumn.XY]),
-        goal_distance_m=norm(now[:2] - bank.goal[scene.index]),
+        goal_distance_m=norm(now[:2] - bank.goal[context.index]),
         lateral_acceleration_mps2=lateral,
         acceleration_mps2=acceleration,
         jerk_mps3=jerk,
-        **_requested(bank, scene, frame, codes, reads, strand),
+        **_requested(bank, context, frame, codes, reads, strand),
     )
-    return Situation(scene, _kept(facts, reads), around), codes, lights
+    return Situation(context, _kept(facts, reads), around), codes, lights
 
 
 def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
@@ -129,51 +124,51 @@ def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
     return jax.tree_util.tree_map_with_path(forget, facts)
 
 
-def surroundings(bank: ScenarioBank, scene: Scene, frame: Frame) -> Surroundings:
-    """Everyone now, the lanes around the driven agent, and where it is on its route."""
-    me = frame.box[scene.slot]
-    ground = _ground(bank, scene, frame)
-    lanes = around_lanes(bank, scene.index, me[:2], me[2:4], corners(me), ground)
-    ahead_m = 1.5 * _moved(scene) + 2.0
-    return Surroundings(frame, lanes, project_on_route(bank, scene.index, me[:2], scene.route_m, ahead_m))
+def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Surroundings:
+    """All agents now, the lanes around the driven agent, and where it is on its route."""
+    me = frame.box[context.slot]
+    ground = _ground(bank, context, frame)
+    lanes = around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
+    ahead_m = 1.5 * _moved(context) + 2.0
+    return Surroundings(frame, lanes, project_on_route(bank, context.index, me[:2], context.route_m, ahead_m))
 
 
-def _ground(bank: ScenarioBank, scene: Scene, frame: Frame) -> Float[Array, ""]:
+def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Float[Array, ""]:
     """Height of the ground under the driven agent, m."""
-    return frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
+    return frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
 
 
-def _moved(scene: Scene) -> Float[Array, ""]:
+def _moved(context: AgentContext) -> Float[Array, ""]:
     """How far the driven agent has come in the last step, m."""
-    return norm(scene.history[-1, :2] - scene.history[-2, :2])
+    return norm(context.history[-1, :2] - context.history[-2, :2])
 
 
 def _touch(
-    scene: Scene, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
+    context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
     reads: frozenset[str],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
-    """New contact codes, whether a contact that begins now is the agent's fault, its type, and time to collision.
+    """New contact codes, whether a contact that starts now is the agent's fault, its type, and time to collision.
 
     What ``reads`` does not ask for is zero, and codes stay as they are where it asks for nothing here.
     """
     fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
         return contacts, fault.any(), kind, ttc
-    touching = overlaps(frame, scene.slot)
+    touching = overlaps(frame, context.slot)
     if reads & _FAULTS:
         fresh = first_contacts(contacts, touching)
-        speed = jnp.maximum(scene.history[-1, MOTION_SPEED], scene.history[-2, MOTION_SPEED])
+        speed = jnp.maximum(context.history[-1, MOTION_SPEED], context.history[-2, MOTION_SPEED])
         others_speed = jnp.maximum(_speed(frame), jnp.where(previous.valid, _speed(previous), 0.0))
-        fault, kind = judge_contacts(frame, scene.slot, fresh, speed, others_speed, unlawful)
+        fault, kind = classify_contacts(frame, context.slot, fresh, speed, others_speed, unlawful)
     codes = next_contacts(contacts, touching, frame.valid, fault)
     if "ttc_s" in reads:
-        ttc = time_to_collision(frame, scene.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT))
+        ttc = time_to_collision(frame, context.slot, (codes == Contact.IGNORED) | (codes == Contact.HIT))
     return codes, fault.any(), kind, ttc
 
 
 def _requested(
     bank: ScenarioBank,
-    scene: Scene,
+    context: AgentContext,
     frame: Frame,
     codes: Int[Array, " S"],
     reads: frozenset[str],
@@ -186,31 +181,31 @@ def _requested(
         "gap_m": zero, "lag_m": zero, "strand": none, "lane_changed": no, "merged": no
     }  # fmt: skip
     if "gap_m" in reads:
-        found["gap_m"] = nearest_gap(frame, scene.slot, codes == Contact.IGNORED)
+        found["gap_m"] = nearest_gap(frame, context.slot, codes == Contact.IGNORED)
     if "lag_m" in reads:
-        me, logged = frame.box[scene.slot], bank.agents[scene.index, scene.step, scene.slot]
+        me, logged = frame.box[context.slot], bank.agents[context.index, context.step, context.slot]
         found["lag_m"] = jnp.sum((logged[AgentColumn.XY] - me[:2]) * me[2:4])
     if reads & _PASSAGES:
-        ground, me = _ground(bank, scene, frame), frame.box[scene.slot]
+        ground, me = _ground(bank, context, frame), frame.box[context.slot]
         if strand is None:
-            # Whoever is changing lanes as the episode begins has come from where it was 1.5 s ago.
-            x, y, psi = scene.history[0, : MOTION_HEADING + 1]
+            # An agent that is changing lanes as the episode begins has come from where it was 1.5 s ago.
+            x, y, psi = context.history[0, : MOTION_HEADING + 1]
             heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
-            strand = lane_passage(bank, scene.index, jnp.stack([x, y]), heading, ground, -1).strand
-        passage = lane_passage(bank, scene.index, me[:2], me[2:4], ground, strand)
+            strand = lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
+        passage = lane_passage(bank, context.index, me[:2], me[2:4], ground, strand)
         found |= {"strand": passage.strand, "lane_changed": passage.changed, "merged": passage.merged}
     return found
 
 
 def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
-    """The facts that are wanted; None in place of the others."""
-    # The next passage is judged from the strand of this one.
-    wanted = reads | ({"strand"} if reads & _PASSAGES else frozenset())
+    """The facts that are requested; None in place of the others."""
+    # The next passage is evaluated from the strand of this one.
+    desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
     def keep(path: tuple[Any, ...], fact: Array) -> Array | None:
-        return fact if path[0].name in wanted else None
+        return fact if path[0].name in desired else None
 
-    return facts if wanted >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
+    return facts if desired >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
 
 
 def _off_the_road(
@@ -226,9 +221,7 @@ def _speed(frame: Frame) -> Float[Array, " S"]:
     return norm(frame.velocity)
 
 
-def _rates(
-    history: Float[Array, "16 4"],
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _rates(history: Float[Array, "16 4"]) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)

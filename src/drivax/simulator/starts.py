@@ -28,7 +28,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.traffic.log import alone, frame_of, logged_history
-from drivax.simulator.types import HISTORY, MOTION_SPEED, Scene
+from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext
 
 #: What 1 means for acceleration (m/s2) and curvature (1/m) in the published description, which is in action units.
 _ACCELERATION, _CURVATURE = 6.0, 0.3
@@ -106,7 +106,7 @@ class NoisyStart:
         """
         if key is None:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
-        # Only steps at which the log has the agent can be driven anew.
+        # Only steps at which the log has the agent can be driven again.
         back = jnp.arange(1, self.steps + 1)
         known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0) & (
             back <= step
@@ -163,8 +163,8 @@ def _acceptable(
 ) -> Bool[Array, ""]:
     """Whether an agent with this history touches none of the others and is on the road at ``step``."""
     zero, z = jnp.zeros(()), bank.agents[index, step, slot, AgentColumn.Z]
-    scene = Scene(index, step, slot, history, jnp.zeros(2), zero, z, ())
-    frame = frame_of(bank, index, step, agents, alone(scene), 0)
+    context = AgentContext(index, step, slot, history, jnp.zeros(2), zero, z, ())
+    frame = frame_of(bank, index, step, agents, alone(context), 0)
     box, ground = frame.box[slot], z - bank.height_m(index, slot) / 2
     points = corners(box)
     near = around_lanes(bank, index, box[:2], box[2:4], points, ground).points_near

@@ -12,14 +12,14 @@ from drivax.scenario.bank.queries import LaneHits, RouteHit
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 
-#: Rows of recent motion that a scene carries: the 15-sample comfort window needs one more speed than accelerations.
+#: Rows of recent motion that a context carries: the 15-sample comfort window needs one more speed than accelerations.
 HISTORY = 16
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
 
 
 @record
-class Scene:
-    """All that an observation depends on beside the bank; what a replay stores.
+class AgentContext:
+    """All that an observation depends on in addition to the bank; what a replay buffer stores.
 
     Attributes:
         index: Row of the bank.
@@ -44,7 +44,7 @@ class Scene:
 
 @record
 class Frame:
-    """Everyone at one step: in each of the S slots a moving or a parked agent, or nobody; and the L lights.
+    """All agents at one step: in each of the S slots a moving or a parked agent, or none; and the L lights.
 
     Attributes:
         box: x, y, cos, sin, length, width.
@@ -127,9 +127,9 @@ class Surroundings:
 
 @record
 class Situation:
-    """A scene, measured."""
+    """A context, measured."""
 
-    scene: Scene
+    context: AgentContext
     facts: Facts
     surroundings: Surroundings
 
@@ -140,7 +140,7 @@ class LightMemory:
 
     Attributes:
         pause: Steps since the agent last stood before the line; saturates.
-        crossed: Steps since it crossed the line off its route, until that is judged: positive where the light was red,
+        crossed: Steps since it crossed the line off its route, until evaluation: positive where the light was red,
             negative where not, 0 for none.
     """
 
@@ -150,9 +150,9 @@ class LightMemory:
 
 @record
 class Beginning:
-    """How an episode begins: its scene, and the memory of stop lines that led there."""
+    """How an episode begins: its context, and the memory of stop lines that led there."""
 
-    scene: Scene
+    context: AgentContext
     lights: LightMemory
 
 
@@ -161,7 +161,7 @@ class SimState:
     """State of one driven agent in one scenario.
 
     Attributes:
-        scene: What observations depend on.
+        context: What observations depend on.
         facts: The last measurement.
         contacts: Code per slot (``simulator.contact.Contact``).
         lights: What is remembered about each stop line.
@@ -169,7 +169,7 @@ class SimState:
         start: Step at which the episode began.
     """
 
-    scene: Scene
+    context: AgentContext
     facts: Facts
     contacts: Int[Array, "*batch S"]
     lights: LightMemory
@@ -201,7 +201,7 @@ class Transition:
 
 @runtime_checkable
 class Traffic(Protocol):
-    """How everyone who is not driven moves; ``name`` is what tables call it.
+    """How agents that are not driven moves; ``name`` is what tables call it.
 
     A model that needs something precomputed also has ``prepare(bank) -> bank``, which evaluation calls.
     """
@@ -215,11 +215,11 @@ class Traffic(Protocol):
         """Traffic state at a step of the log."""
         ...
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> Any:
-        """Traffic state one step later, given everyone's present frame."""
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Any:
+        """Traffic state one step later, given the present frame."""
         ...
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of ``bank.agents`` for the moving slots ``back`` steps ago."""
         ...
 
@@ -249,8 +249,10 @@ class Task(Protocol):
         """What counts as the last action when an episode begins; its size is that of every action."""
         ...
 
-    def observe(self, bank: ScenarioBank, scene: Scene, agents: Any, frame: Frame) -> Mapping[str, Any]:
-        """Observation of a scene."""
+    def observe(
+        self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
+    ) -> Mapping[str, Any]:
+        """Observation of a context."""
         ...
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
@@ -258,7 +260,7 @@ class Task(Protocol):
         ...
 
     def ended(
-        self, bank: ScenarioBank, scene: Scene, facts: Facts
+        self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Whether the episode is terminated, and whether it is truncated."""
         ...
@@ -268,7 +270,7 @@ class Task(Protocol):
         ...
 
     def episode_add(
-        self, episode: Any, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+        self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Any:
-        """Accumulators after the step that led to ``found``, in an episode that began at step ``start``."""
+        """Accumulators after the step that led to ``situation``, in an episode that began at step ``start``."""
         ...

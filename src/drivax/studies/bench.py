@@ -22,18 +22,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
-from drivax.metrics.selection import Wanted
+from drivax.metrics.selection import MetricNames
 from drivax.planners.idm import IdmPlanner
-from drivax.scenario.bank.exhaustive import without_grid
 from drivax.scenario.bank.queries import around_lanes, left_of_edges, project_on_route
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
@@ -118,7 +117,7 @@ def bench_metrics(bank: ScenarioBank, config: BenchConfig | None = None) -> dict
     """
     config = config or BenchConfig()
 
-    def program(metrics: Wanted, batch: int) -> Program:
+    def program(metrics: MetricNames, batch: int) -> Program:
         task = replace(config.task, metrics=metrics)
         return compiled(bank, replace(config, batch=batch, task=task))
 
@@ -204,7 +203,7 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
             cure="give a multiple",
         )
     traffic = find_traffic(config.traffic)
-    return Simulator(config.task, traffic), spread(prepared(traffic, bank))
+    return Simulator(config.task, traffic), spread(prepare_bank(traffic, bank))
 
 
 def spread(bank: ScenarioBank) -> ScenarioBank:
@@ -271,7 +270,7 @@ def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, state
     def one(state: SimState) -> _Driven:
         situation = simulator.situation(bank, state)
         action, _ = driver.act((), bank, state, situation, None, jax.random.key(0))
-        return action, simulator.observe(bank, state.scene), situation.surroundings.frame
+        return action, simulator.observe(bank, state.context), situation.surroundings.frame
 
     return jax.vmap(one)(states)
 
@@ -287,33 +286,46 @@ def _carry(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states
 Part = Callable[[ScenarioBank, SimState], Any]
 
 
+def without_grid(bank: ScenarioBank) -> ScenarioBank:
+    """The same bank with a grid of one cell, which is read whole: every query measures every segment once."""
+    n = len(bank)
+    return replace(
+        bank,
+        grid_edge=jnp.stack([jnp.zeros_like(bank.grid_edge[:, 0]), bank.grid_edge[:, -1]], axis=1),
+        grid_lane=jnp.stack([jnp.zeros_like(bank.grid_lane[:, 0]), bank.grid_lane[:, -1]], axis=1),
+        grid_side=jnp.zeros((n, 1), bank.grid_side.dtype),
+    )
+
+
 def _parts(simulator: Simulator) -> Mapping[str, Part]:
     """Parts of a step, unbatched; each alone, so what they share is counted in each."""
 
     def frame(bank: ScenarioBank, state: SimState) -> Any:
-        return simulator.frame(bank, state.scene, alone(state.scene), 0)
+        return simulator.frame(bank, state.context, alone(state.context), 0)
 
     def box(bank: ScenarioBank, state: SimState) -> Array:
-        x, y, heading, _ = state.scene.history[-1]
-        size = bank.agent_box[state.scene.index, state.scene.slot]
+        x, y, heading, _ = state.context.history[-1]
+        size = bank.agent_box[state.context.index, state.context.slot]
         return jnp.stack([x, y, jnp.cos(heading), jnp.sin(heading), size[0], size[1]])
 
     def ground(bank: ScenarioBank, state: SimState) -> Array:
-        return state.scene.z - bank.height_m(state.scene.index, state.scene.slot) / 2
+        return state.context.z - bank.height_m(state.context.index, state.context.slot) / 2
 
     def edges(bank: ScenarioBank, state: SimState) -> Any:
         me = box(bank, state)
-        return left_of_edges(bank, state.scene.index, me[:2], corners(me), ground(bank, state))
+        return left_of_edges(bank, state.context.index, me[:2], corners(me), ground(bank, state))
 
     def lanes(bank: ScenarioBank, state: SimState) -> Any:
         me = box(bank, state)
-        return around_lanes(bank, state.scene.index, me[:2], me[2:4], corners(me), ground(bank, state))
+        return around_lanes(bank, state.context.index, me[:2], me[2:4], corners(me), ground(bank, state))
 
     def route(bank: ScenarioBank, state: SimState) -> Any:
-        return project_on_route(bank, state.scene.index, state.scene.history[-1, :2], state.scene.route_m)
+        return project_on_route(
+            bank, state.context.index, state.context.history[-1, :2], state.context.route_m
+        )
 
     def ttc(bank: ScenarioBank, state: SimState) -> Any:
-        return time_to_collision(frame(bank, state), state.scene.slot, state.contacts == Contact.IGNORED)
+        return time_to_collision(frame(bank, state), state.context.slot, state.contacts == Contact.IGNORED)
 
     def metrics(bank: ScenarioBank, state: SimState) -> Any:
         found = simulator.situation(
@@ -322,17 +334,17 @@ def _parts(simulator: Simulator) -> Mapping[str, Part]:
         return episode_add(state.episode, found, state.start, jnp.zeros((), bool))
 
     return {
-        "dynamics": lambda bank, state: bicycle(state.scene.history[-1], jnp.ones(()), jnp.full((), 0.1)),
+        "dynamics": lambda bank, state: bicycle(state.context.history[-1], jnp.ones(()), jnp.full((), 0.1)),
         "agents": frame,
-        "contacts": lambda bank, state: overlaps(frame(bank, state), state.scene.slot),
+        "contacts": lambda bank, state: overlaps(frame(bank, state), state.context.slot),
         "ttc": ttc,
         "edges": edges,
         "lanes": lanes,
         "route": route,
         "metrics": metrics,
-        "observation": lambda bank, state: simulator.observe(bank, state.scene),
-        "reset": lambda bank, state: simulator.reset(bank, state.scene.index),
-        "step": lambda bank, state: simulator.step(bank, state, state.scene.action),
+        "observation": lambda bank, state: simulator.observe(bank, state.context),
+        "reset": lambda bank, state: simulator.reset(bank, state.context.index),
+        "step": lambda bank, state: simulator.step(bank, state, state.context.action),
     }
 
 
@@ -364,9 +376,9 @@ def _time_part(config: BenchConfig, part: Part, bank: ScenarioBank, states: SimS
 
 def _shifted(state: SimState, by: Array) -> SimState:
     """The same state, which the compiler cannot know: ``by`` is far too small to move anything."""
-    scene = state.scene
-    moved = replace(scene, history=scene.history + by, index=scene.index + by.astype(jnp.int32))
-    return replace(state, scene=moved)
+    context = state.context
+    moved = replace(context, history=context.history + by, index=context.index + by.astype(jnp.int32))
+    return replace(state, context=moved)
 
 
 def _cost(part: Part, bank: ScenarioBank, states: SimState) -> dict[str, float]:

@@ -13,24 +13,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from drivax.curation.arms import AGENTS, weighted
+from drivax.curation.arms import ARMS, weighted
 from drivax.curation.controls import event_kinds
-from drivax.curation.methods import Wanted, curate, refuse_stale
+from drivax.curation.logged import score_steps
+from drivax.curation.methods import Request, check_current, curate
 from drivax.curation.rarity import ExpertActions
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
-from drivax.curation.scoring import score_steps
 from drivax.curation.subset import top_rows
-from drivax.curation.weights import draws_of
+from drivax.curation.weights import draw_statistics
 from drivax.errors import UsageError
-from drivax.evaluation.stored import read_evaluation
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import write_text
 from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
-from drivax.learning.folders import hashes
-from drivax.learning.loop import train, usable_steps
-from drivax.learning.validation import rank
-from drivax.report.pages.criticality import criticality_html
-from drivax.report.pages.viewer import write_player
+from drivax.learning.loop import hashes, train, usable_steps
+from drivax.learning.training_log import rank
+from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.longtail_drives import (
     MEAN_Q,
@@ -91,7 +89,7 @@ def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
     """
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     if not out.exists():
-        rest = [name for name in config.agents if AGENTS[name].method != "oracle"]
+        rest = [name for name in config.agents if ARMS[name].method != "oracle"]
         if len(rest) < len(config.agents) and not event_kinds(data[0]).any():
             raise UsageError(
                 "has no labelled events, which the oracle and its lot learn from",
@@ -111,14 +109,14 @@ def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
 def score(config: LongtailConfig, sets: Sets, out: Path, say: Say) -> dict[str, ScoreTable]:
     """The tables of all methods that the agents ask for, of the training set; read where they are there already."""
     data, tables = ScenarioSet.open(sets.train), {}
-    for method in dict.fromkeys(AGENTS[agent].method for agent in config.agents):
+    for method in dict.fromkeys(ARMS[agent].method for agent in config.agents):
         file = out / SCORES / f"{method}.npz"
         own = config.scouts if method == "ensemble" else None
         if not file.is_file():
             say(f"scoring by {method}")
-            write_scores(curate(method, Wanted(data, config=own)), file)
+            write_scores(curate(method, Request(data, config=own)), file)
         tables[method] = read_scores(file, data)
-        refuse_stale(tables[method], own, file)
+        check_current(tables[method], own, file)
     return tables
 
 
@@ -153,7 +151,7 @@ def _weighted(job: Job) -> WeightedSet:
     def table(method: str) -> ScoreTable:
         return read_scores(job.out / SCORES / f"{method}.npz", data)
 
-    return weighted(AGENTS[job.agent], data, table, job.config.weights, job.usable, job.seed)
+    return weighted(ARMS[job.agent], data, table, job.config.weights, job.usable, job.seed)
 
 
 def _make(job: Job) -> float:
@@ -244,7 +242,7 @@ def _show(results: Mapping[str, Any], data: ScenarioSet, tables: Mapping[str, Sc
         out / CRITICAL,
         overwrite=True,
         title="most critical drives",
-        beside=[criticality_html(table, row) for row, table in tops.items()],
+        details=[criticality_html(table, row) for row, table in tops.items()],
     )
 
 
@@ -285,7 +283,7 @@ def findings(
     rare, labels, share = rare_rows(config, test), clusters(test), ordinary_share(sets)
     drives = {name: driven(config, out, name) for name in (*config.agents, BY_MEAN_Q)}
     for name in REFERENCES:
-        drove = read_evaluation(out / DRIVES / name).metrics
+        drove = EpisodeTable.read(out / DRIVES / name).metrics
         drives[name] = {metric: drove[metric][None] for metric in METRICS}
     by_mean_q = drives[BY_MEAN_Q]
     return {
@@ -301,8 +299,8 @@ def findings(
         "rates": {name: rates(drives[name], labels, rare, share) for name in (*REFERENCES, *config.agents)},
         "draws": {
             name: asdict(
-                draws_of(
-                    weighted(AGENTS[name], data, tables.__getitem__, config.weights, usable).weights, usable
+                draw_statistics(
+                    weighted(ARMS[name], data, tables.__getitem__, config.weights, usable).weights, usable
                 )
             )
             for name in config.agents

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.controls import event_kinds
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.methods import Request, curate
 from drivax.errors import UsageError
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.run_evaluation import EvaluationConfig, run_evaluation
-from drivax.evaluation.stored import read_evaluation
 from drivax.learning.policies import load_policy
 from drivax.planners.catalogue import make_planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -60,7 +60,7 @@ def rare_rows(config: LongtailConfig, test: ScenarioSet) -> Bool[np.ndarray, " n
     labelled = event_kinds(test) > 0
     if labelled.any():
         return labelled
-    scores = curate("kinematic", Wanted(test)).scenarios
+    scores = curate("kinematic", Request(test)).scenarios
     return scores >= np.quantile(scores, 1.0 - config.rare)
 
 
@@ -131,7 +131,7 @@ def step_by_mean_q(run: Path) -> int:
 
 def driven(config: LongtailConfig, out: Path, agent: str) -> dict[str, Float[np.ndarray, "seed scenario"]]:
     """What the agents of one name did in the test, by metric, in the order of the test set."""
-    tables = [read_evaluation(drive_of(out, agent, seed)) for seed in range(config.seeds)]
+    tables = [EpisodeTable.read(drive_of(out, agent, seed)) for seed in range(config.seeds)]
     return {name: np.stack([table.metrics[name] for table in tables]) for name in tables[0].metrics}
 
 

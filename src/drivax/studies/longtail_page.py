@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.curation.scores import ScoreTable
-from drivax.report.pages.inspection import histogram
-from drivax.report.pages.page import page, publish
+from drivax.files import write_text
+from drivax.report.charts.distributions import histogram
+from drivax.report.pages.page import page
 from drivax.studies.longtail_plan import FIRST
 from drivax.studies.longtail_rankings import RELATED, UNRELATED
 from drivax.studies.longtail_results import METRICS
@@ -68,7 +69,7 @@ def write_page(
         _section("Scores", _scores(scored)),
         _section("Actions of the experts", _action_map(actions)),
     ]
-    publish(out, page("The long-tail study", _lead(results), sections, _STYLE))
+    write_text(out, page("The long-tail study", _lead(results), sections, _STYLE))
 
 
 def _lead(results: Mapping[str, Any]) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax import settings
-from drivax.curation.arms import AGENTS
-from drivax.curation.ensemble import ScoutsConfig
+from drivax.curation.arms import ARMS
+from drivax.curation.ensemble import EnsembleConfig
 from drivax.curation.weights import WeightConfig
 from drivax.errors import UsageError, did_you_mean
 from drivax.learning.config import TrainConfig
@@ -34,7 +34,7 @@ class LongtailConfig:
     """What is compared, and under which budget.
 
     Attributes:
-        agents: Names of :data:`~drivax.curation.arms.AGENTS`; ``baseline`` and ``bc`` among them.
+        agents: Names of :data:`~drivax.curation.arms.ARMS`; ``baseline`` and ``bc`` among them.
         seeds: Trainings of each.
         total_steps: Recorded steps that each learns from; null: as its preset says.
         training: More settings of every training, as on a command line: ``[--algorithm.batch, "128"]``.
@@ -48,21 +48,21 @@ class LongtailConfig:
         rare: Share of the test scenarios that count as rare, by the kinematic heuristic, where none are labelled.
     """
 
-    agents: tuple[str, ...] = tuple(AGENTS)
+    agents: tuple[str, ...] = tuple(ARMS)
     seeds: int = 5
     total_steps: int | None = None
     training: tuple[str, ...] = ()
     validations: int = 8
     weights: WeightConfig = field(default_factory=WeightConfig)
-    scouts: ScoutsConfig = field(default_factory=ScoutsConfig)
+    scouts: EnsembleConfig = field(default_factory=EnsembleConfig)
     progress: float = 0.8
     flat: float = 0.03
     rare: float = 0.2
 
     def __post_init__(self) -> None:
         for name in self.agents:
-            if name not in AGENTS:
-                raise UsageError(f"there is no agent {name!r}", cure=did_you_mean(name, list(AGENTS)))
+            if name not in ARMS:
+                raise UsageError(f"there is no agent {name!r}", cure=did_you_mean(name, list(ARMS)))
         if missing := [name for name in FIRST if name not in self.agents]:
             raise UsageError(f"a study without {missing[0]}", cure="everything is compared with it; add it")
         if self.seeds < 2 or self.validations < 4:
@@ -72,7 +72,7 @@ class LongtailConfig:
 
     def train_config(self, agent: str, seed: int) -> TrainConfig:
         """The training of one agent with one seed."""
-        config = settings.load(TrainConfig, AGENTS[agent].preset, self.training)
+        config = settings.load(TrainConfig, ARMS[agent].preset, self.training)
         config = replace(config, seed=seed, total_steps=self.total_steps or config.total_steps)
         every = max(config.iterations // self.validations, 1)
         # All of the baseline's stay, those of interruptions too: the one with the highest mean Q is driven.

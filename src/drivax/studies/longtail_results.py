@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from drivax.curation.arms import CURATED, control_of
-from drivax.stats.seeds import Crossed, agents_interval, crossed_difference, crossed_mean, log_ratio
+from drivax.stats.seeds import Crossed, crossed_difference, crossed_mean, log_ratio, seeds_interval
 from drivax.stats.significance import holm
 
 Values = Float[np.ndarray, "seed scenario"]
@@ -21,7 +21,7 @@ Rows = Bool[np.ndarray, " scenario"]
 Counts = Float[np.ndarray, " scenario"]
 Verdict = Literal["supported", "contradicted", "undecided"]
 #: Against the baseline, against a lot, in common and in rare scenarios, in other failures, between methods.
-Group = Literal["baseline", "lot", "where", "failures", "methods"]
+ClaimGroup = Literal["baseline", "lot", "where", "failures", "methods"]
 
 #: What is reported of every agent, and whether more of it is better.
 METRICS = {
@@ -98,7 +98,7 @@ class Claim:
     words: str
     one: str
     other: str
-    group: Group
+    group: ClaimGroup
     metric: str = "collision"
     rows: str = "ordinary"
     change: float | None = None
@@ -325,7 +325,7 @@ def rates(
 
 def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict[str, float | int | None]:
     """Mean, interval within what all of these metrics lie in, and how many scenarios it is of."""
-    found = agents_interval(values, labels, weights, share=True).as_dict()
+    found = seeds_interval(values, labels, weights, share=True).as_dict()
     return {"scenarios" if name == "n" else name: value for name, value in found.items()}
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.signal import lfilter
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import LENGTH, WIDTH, corners, passage
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 
@@ -55,8 +55,9 @@ class SensorConfig:
 class NoiseConfig:
     """Errors of recorded poses and speeds of the others: standard deviations, and correlations over one step.
 
-    The defaults are the level of vehicle tracks in WOMD recordings, as ``benchmarks/perception_noise.py`` measures
-    it; Argoverse 2 is smoother. Speeds tremble more than positions, because trackers differentiate.
+    The defaults are the level of vehicle tracks in WOMD recordings, measured by
+    ``experiments/world/perception_noise.py``; Argoverse 2 is smoother. Speeds are noisier than positions, because
+    trackers differentiate.
 
     Attributes:
         level: Factor on all standard deviations; 0 switches noise off.

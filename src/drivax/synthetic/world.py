@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Event, Light, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, Flag
 from drivax.synthetic.domains import DOMAINS, Domain

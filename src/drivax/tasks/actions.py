@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 from drivax.simulator.dynamics import bicycle, command_between, displace, displacement, follow
 

@@ -18,7 +18,7 @@ from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.schema import LightState
 from drivax.simulator.ahead import ahead
 from drivax.simulator.idm import IdmParameters
-from drivax.simulator.types import MOTION_SPEED, Scene
+from drivax.simulator.types import MOTION_SPEED, AgentContext
 from drivax.tasks import features
 from drivax.tasks.view import POSITION_M, SPEED_MPS, Frames, View
 
@@ -34,14 +34,14 @@ _SLOWEST_MPS = 1.0
 
 
 def relative_velocity(
-    bank: ScenarioBank, scene: Scene, frames: Frames
+    bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 2"], Bool[Array, " K"]]:
     """Return the velocity of the eight nearest agents relative to ego, ego frame, in units of 15 m/s.
 
     Rows are in the order of the group ``agents``.
     """
-    now, view, ego = frames(0), View.of(scene), scene.history[-1]
-    there = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    now, view, ego = frames(0), View.of(context), context.history[-1]
+    there = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     distance = jnp.where(there, norm(now.box[:, :2] - view.xy), jnp.inf)
     rank = jnp.arange(_OTHERS)
     order = jnp.argsort(distance)[jnp.minimum(rank, len(distance) - 1)]
@@ -49,49 +49,51 @@ def relative_velocity(
     return (view.vector(now.velocity[order]) - own) / SPEED_MPS, there[order] & (rank < len(distance))
 
 
-def lane_curvature(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+def lane_curvature(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Return the curvature of ego's lane in units of 0.1 1/m (left positive), and whether ego is on a lane.
 
     The lane piece within 2.5 m and 60 degrees that fits position and heading best counts; a metre weighs as much as 15
     degrees. Needs no route. Levels of bridges are not distinguished.
     """
-    view = View.of(scene)
-    rows, layer = bank.road[scene.index], bank.road_at[scene.index, 2]
+    view = View.of(context)
+    rows, layer = bank.road[context.index], bank.road_at[context.index, 2]
     middle, direction = view.point(rows[:, RoadColumn.XY]), view.vector(rows[:, RoadColumn.DIRECTION])
     half = rows[:, RoadColumn.LENGTH] / 2
     along = jnp.clip(-jnp.sum(middle * direction, axis=-1), -half, half)
     apart = norm(middle + along[:, None] * direction)
     fits = (layer == RoadLayer.LANE) & (apart < 2.5) & (direction[:, 0] > 0.5)
     best = first_smallest(jnp.where(fits, apart**2 + (4.0 * direction[:, 1]) ** 2, 1e9))
-    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[scene.index, best]), 0.0)
+    curvature = jnp.where(fits[best], features.shown_curvature(bank.road_curvature[context.index, best]), 0.0)
     return jnp.stack([curvature, fits[best].astype(jnp.float32)])
 
 
 def recommended_speed(
-    bank: ScenarioBank, scene: Scene, frames: Frames
+    bank: ScenarioBank, context: AgentContext, frames: Frames
 ) -> tuple[Float[Array, "K 1"], Bool[Array, " K"]]:
     """Return the recommended speed at ten route points 5 m apart, ``clip(30 - 25 |k|, 5, 30)`` m/s, in 15 m/s."""
     offsets = _STEP_M * jnp.arange(1, _POINTS + 1)
-    _, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    curvature = features.route_curvature(bank, scene.index, scene.route_m + offsets)
-    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(bank, scene)
+    _, there = route_ahead(bank, context.index, context.route_m, offsets)
+    curvature = features.route_curvature(bank, context.index, context.route_m + offsets)
+    return features.recommended_speed(curvature)[:, None] / SPEED_MPS, there & features.has_route(
+        bank, context
+    )
 
 
-def time_gap(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 2"]:
+def time_gap(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 2"]:
     """Return the time gap to the leader's bumper over 10 s, at most 1, and whether there is a leader.
 
     The leader is the nearest agent with its centre in a strip of 3 m width straight ahead of ego. Speeds below 1 m/s
     count as 1 m/s. Without a leader the first number is 1.
     """
-    now, view = frames(0), View.of(scene)
+    now, view = frames(0), View.of(context)
     place = view.point(now.box[:, :2])
-    others = now.valid & (jnp.arange(len(now.valid)) != scene.slot)
+    others = now.valid & (jnp.arange(len(now.valid)) != context.slot)
     leading = others & (place[:, 0] > 0) & (jnp.abs(place[:, 1]) < _STRIPE_M)
-    half = bank.length_m(scene.index, scene.slot) / 2
+    half = bank.length_m(context.index, context.slot) / 2
     gap = jnp.where(
         leading, jnp.maximum(place[:, 0] - half - _reach(view.vector(now.box[:, 2:4]), now.box), 0.0), jnp.inf
     )
-    time = jnp.min(gap) / jnp.maximum(scene.history[-1, 3], _SLOWEST_MPS)
+    time = jnp.min(gap) / jnp.maximum(context.history[-1, 3], _SLOWEST_MPS)
     share = jnp.minimum(time / _LONGEST_S, 1.0)
     return jnp.stack([share, leading.any().astype(jnp.float32)])
 
@@ -101,15 +103,15 @@ def _reach(direction: Float[Array, "S 2"], box: Float[Array, "S 6"]) -> Float[Ar
     return (jnp.abs(direction[:, 0]) * box[:, 4] + jnp.abs(direction[:, 1]) * box[:, 5]) / 2
 
 
-def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 6"]:
+def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 6"]:
     """Return the inputs of a car-following driver along the route, and the IDM acceleration.
 
     Gap to the leader or a light to stop at (at most 90 m, in 50 m); approach speed and speed of the leader (15 m/s);
     whether there is one; the speed that limit and curves ahead allow (15 m/s); the acceleration of the Intelligent
     Driver Model with default parameters (6 m/s2). Without a leader both speeds are 0.
     """
-    speed = scene.history[-1, MOTION_SPEED]
-    seen = ahead(bank, scene, frames(0), _IDM.min_gap_m)
+    speed = context.history[-1, MOTION_SPEED]
+    seen = ahead(bank, context, frames(0), _IDM.min_gap_m)
     leads = seen.gap < _FARTHEST_M
     speeds = jnp.stack([speed - seen.leader, seen.leader]) * leads
     return jnp.concatenate(
@@ -119,7 +121,7 @@ def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Arr
             jnp.stack(
                 [
                     leads.astype(jnp.float32),
-                    seen.wanted / SPEED_MPS,
+                    seen.desired / SPEED_MPS,
                     seen.acceleration(speed, _IDM) / _HARDEST_MPS2,
                 ]
             ),
@@ -127,16 +129,16 @@ def car_following(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Arr
     )
 
 
-def stop_line(bank: ScenarioBank, scene: Scene, frames: Frames) -> Float[Array, " 3"]:
+def stop_line(bank: ScenarioBank, context: AgentContext, frames: Frames) -> Float[Array, " 3"]:
     """Return the next stop line on the route: distance from the front bumper in 50 m, whether red, whether any.
 
     Lines beyond 50 m or behind the bumper do not count; the distance is then 1.
     """
-    ahead = bank.light_line[scene.index, LightRow.ARC] - scene.route_m
-    gap = ahead - bank.length_m(scene.index, scene.slot) / 2
+    ahead = bank.light_line[context.index, LightRow.ARC] - context.route_m
+    gap = ahead - bank.length_m(context.index, context.slot) / 2
     state = frames(0).lights
-    real = bank.light_line[scene.index, LightRow.ARC] < NEVER_M
-    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, scene)
+    real = bank.light_line[context.index, LightRow.ARC] < NEVER_M
+    there = real & (state >= 0) & (gap > 0.0) & (gap < POSITION_M) & features.has_route(bank, context)
     nearest = jnp.argmin(jnp.where(there, gap, jnp.inf))
     red = (state == LightState.STOP) | (state == LightState.ARROW_STOP)
     distance = jnp.where(there.any(), gap[nearest] / POSITION_M, 1.0)

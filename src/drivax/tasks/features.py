@@ -17,7 +17,7 @@ from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import Flag
-from drivax.simulator.types import Scene
+from drivax.simulator.types import AgentContext
 from drivax.tasks.view import PIECE_M, POSITION_M
 
 #: Unit of curvature, 1/m: a turn of 10 m radius is 1.
@@ -148,9 +148,9 @@ def shown_curvature(curvature: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.clip(curvature / CURVATURE_PM, -_MOST_CURVED, _MOST_CURVED)
 
 
-def has_route(bank: ScenarioBank, scene: Scene) -> Bool[Array, ""]:
+def has_route(bank: ScenarioBank, context: AgentContext) -> Bool[Array, ""]:
     """Whether the driven agent has a route on lanes; without one the bank holds the log's path, which is privileged."""
-    return ((bank.flags[scene.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (scene.slot == 0)
+    return ((bank.flags[context.index] & jnp.uint32(int(Flag.ROUTE))) != 0) & (context.slot == 0)
 
 
 def route_curvature(

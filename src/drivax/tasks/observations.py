@@ -20,7 +20,7 @@ from drivax.scenario.bank.columns import LightRow, RoadColumn, RoadLayer, RouteC
 from drivax.scenario.bank.queries import route_ahead
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import DT_S, LightState
-from drivax.simulator.types import HISTORY, Scene
+from drivax.simulator.types import HISTORY, AgentContext
 from drivax.tasks.features import (
     COLUMNS,
     Features,
@@ -47,7 +47,7 @@ GROUPS = tuple(COLUMNS)
 
 
 #: Features ``[F]`` or rows of them ``[..., F]``, or a pair of rows and a mask over them.
-Feature = Callable[[ScenarioBank, Scene, Frames], Any]
+Feature = Callable[[ScenarioBank, AgentContext, Frames], Any]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class OwnGroup:
     """A user's observation group.
 
     Attributes:
-        feature: From bank, scene and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
+        feature: From bank, context and frames to ``[..., F]`` float32 in about [-1, 1], or to a pair of those and a
             boolean mask ``[...]`` of the valid rows; ``testing.check_feature`` checks it.
         name: Name of the group; the function's own by default.
     """
@@ -68,9 +68,9 @@ class OwnGroup:
         if self.name.endswith("_mask"):
             raise ValueError(f"a group cannot be named {self.name!r}: the suffix is reserved for masks")
 
-    def observe(self, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
+    def observe(self, bank: ScenarioBank, context: AgentContext, frames: Frames) -> Observation:
         """Return the group, and its mask if it has one."""
-        rows = self.feature(bank, scene, frames)
+        rows = self.feature(bank, context, frames)
         return _masked(self.name, *rows) if isinstance(rows, tuple) else {self.name: rows}
 
 
@@ -160,13 +160,15 @@ PRESETS = MappingProxyType(
 )
 
 
-def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames: Frames) -> Observation:
+def observe(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, frames: Frames
+) -> Observation:
     """Return the observation of a context.
 
     Args:
         config: Groups, sizes and features.
         bank: The scenarios.
-        scene: The context of the observing agent.
+        context: The context of the observing agent.
         frames: Frame of all agents some steps ago.
 
     Returns:
@@ -174,20 +176,20 @@ def observe(config: ObservationConfig, bank: ScenarioBank, scene: Scene, frames:
         action; ``agents [agents, steps, 12]`` with ``agents_mask [agents, steps]``, ``road [road, 10]``,
         ``lights [lights, 7]``, ``route [route, 5]``, each with ``*_mask``; and the user's groups.
     """
-    view, features = View.of(scene), config.features
+    view, features = View.of(context), config.features
     if config.perception.of_agents:
-        frames = perceived(config.perception, bank, scene, frames)
-    result = _ego(config, bank, scene, view)
+        frames = perceived(config.perception, bank, context, frames)
+    result = _ego(config, bank, context, view)
     if features.agents:
-        result |= _agents(config, bank, scene, view, frames)
+        result |= _agents(config, bank, context, view, frames)
     if config.road and features.road:
-        result |= _shown_road(config, bank, scene, view)
+        result |= _shown_road(config, bank, context, view)
     if features.lights:
-        result |= _lights(config, bank, scene, view, frames(0).lights)
+        result |= _lights(config, bank, context, view, frames(0).lights)
     if features.route:
-        result |= _route(config, bank, scene, view)
+        result |= _route(config, bank, context, view)
     for group in config.own:
-        result |= group.observe(bank, scene, frames)
+        result |= group.observe(bank, context, frames)
     return result
 
 
@@ -195,10 +197,10 @@ def _masked(name: str, rows: Float[Array, "... F"], mask: Bool[Array, ...]) -> O
     return {name: jnp.where(mask[..., None], rows, 0.0), f"{name}_mask": mask}
 
 
-def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    past = scene.history[HISTORY - config.steps :]
+def _ego(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    past = context.history[HISTORY - config.steps :]
     turned = view.vector(jnp.stack([jnp.cos(past[:, 2]), jnp.sin(past[:, 2])], axis=-1))
-    size = bank.agent_box[scene.index, scene.slot, SizeColumn.FOOTPRINT] / SIZE_M
+    size = bank.agent_box[context.index, context.slot, SizeColumn.FOOTPRINT] / SIZE_M
     moving = {
         "position": lambda: view.point(past[:, :2]) / POSITION_M,
         "heading": lambda: turned[:, ::-1],
@@ -208,8 +210,8 @@ def _ego(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View
     static = {
         "length": lambda: size[:1],
         "width": lambda: size[1:],
-        "height": lambda: bank.agent_box[scene.index, scene.slot, SizeColumn.HEIGHT][..., None] / SIZE_M,
-        "last_action": lambda: scene.action,
+        "height": lambda: bank.agent_box[context.index, context.slot, SizeColumn.HEIGHT][..., None] / SIZE_M,
+        "last_action": lambda: context.action,
     }
     result = {}
     for name, parts in (("ego", moving), ("ego_static", static)):
@@ -226,11 +228,11 @@ def _nearest(distance: Float[Array, " S"], count: int) -> Int[Array, " K"]:
 
 
 def _agents(
-    config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, frames: Frames
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, frames: Frames
 ) -> Observation:
     now, chosen_features = frames(0), config.features.agents
     slots = now.valid.shape[0]
-    seen = now.valid & (jnp.arange(slots) != scene.slot)
+    seen = now.valid & (jnp.arange(slots) != context.slot)
     dx, dy = now.box[:, 0] - view.xy[0], now.box[:, 1] - view.xy[1]
     distance = jnp.where(seen, dx * dx + dy * dy, jnp.inf)
     chosen = _nearest(distance, config.agents)
@@ -238,7 +240,7 @@ def _agents(
 
     def row(back: int) -> tuple[Float[Array, "K F"], Bool[Array, " K"]]:
         frame = now if back == 0 else frames(back)
-        box, x = frame.box[chosen], scene.history[HISTORY - 1 - back]
+        box, x = frame.box[chosen], context.history[HISTORY - 1 - back]
 
         def relative() -> Float[Array, "K 2"]:
             own = x[3] * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
@@ -260,7 +262,7 @@ def _agents(
     parts = {
         "length": lambda: size[:, :1],
         "width": lambda: size[:, 1:],
-        "height": lambda: bank.agent_box[scene.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
+        "height": lambda: bank.agent_box[context.index, chosen, SizeColumn.HEIGHT][..., None] / SIZE_M,
         "type": lambda: (now.kind[chosen, None] == jnp.arange(1, 5)).astype(jnp.float32),
     }
     static = joined(chosen_features, parts, (config.agents,))
@@ -268,24 +270,26 @@ def _agents(
     return _masked("agents", jnp.concatenate([moving, static], axis=-1), mask)
 
 
-def _shown_road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+def _shown_road(
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View
+) -> Observation:
     """Return the road group: pieces cut, with noise, in the selected columns."""
     selected, noisy = config.features.road, config.perception.noise_m > 0
     pieces = replace(config, road=config.road // config.road_cut, road_cut=1)
-    group = _road(pieces, bank, scene, view)
+    group = _road(pieces, bank, context, view)
     if config.road_cut == 1 and selected == Features().road and not noisy:
         return group
     rows, mask = group["road"], group["road_mask"]
     if config.road_cut > 1:
         rows, mask = cut_rows(rows, config.road_cut), jnp.repeat(mask, config.road_cut)
     if noisy:
-        rows = rows.at[:, :2].add(moved_road(config.perception, bank, scene, config.road) / POSITION_M)
+        rows = rows.at[:, :2].add(moved_road(config.perception, bank, context, config.road) / POSITION_M)
     columns = columns_of("road", selected) + ([rows.shape[-1] - 1] if "curvature" in selected else [])
     return _masked("road", jnp.stack([rows[:, column] for column in columns], axis=-1), mask)
 
 
-def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
-    x, y, layer = bank.road_at[scene.index]
+def _road(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
+    x, y, layer = bank.road_at[context.index]
     dx, dy = x - view.xy[0], y - view.xy[1]
     ahead, left = dx * view.cos + dy * view.sin, dy * view.cos - dx * view.sin
     inside = (ahead < config.road_ahead_m) & (ahead > -config.road_behind_m)
@@ -301,7 +305,7 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
     running = running_count(inside)
     place = jnp.where(inside, running - 1, config.road)
     take = jnp.zeros(config.road, jnp.int32).at[place].set(jnp.arange(len(inside)), mode="drop")
-    rows = bank.road[scene.index, take]
+    rows = bank.road[context.index, take]
     parts = [view.point(rows[:, RoadColumn.XY]) / POSITION_M, view.vector(rows[:, RoadColumn.DIRECTION])]
     types = (
         rows[:, RoadColumn.LAYER, None] == jnp.asarray([RoadLayer.LANE, RoadLayer.EDGE, RoadLayer.AREA])
@@ -314,7 +318,7 @@ def _road(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: Vie
         (limit > 0).astype(jnp.float32),
     ]
     if "curvature" in config.features.road:
-        parts.append(shown_curvature(bank.road_curvature[scene.index, take])[:, None])
+        parts.append(shown_curvature(bank.road_curvature[context.index, take])[:, None])
     return _masked("road", jnp.concatenate(parts, axis=-1), jnp.arange(config.road) < running[-1])
 
 
@@ -336,9 +340,9 @@ def running_count(inside: Bool[Array, " K"]) -> Int[Array, " K"]:
 
 
 def _lights(
-    config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View, state: Int[Array, " L"]
+    config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View, state: Int[Array, " L"]
 ) -> Observation:
-    line = bank.light_line[scene.index]
+    line = bank.light_line[context.index]
     dx, dy = line[LightRow.X] - view.xy[0], line[LightRow.Y] - view.xy[1]
     # Lights whose line is well behind are passed. Those on the route come first, then the nearest.
     seen = (state >= 0) & (dx * line[LightRow.COS] + dy * line[LightRow.SIN] > -_PASSED_M)
@@ -350,7 +354,7 @@ def _lights(
     def position() -> Float[Array, "K 2"]:
         middle = view.point(line[LightRow.XY, chosen].T)
         if perception.noise_m > 0:
-            middle = middle + moved_lights(perception, bank, scene, state.shape[0])[chosen]
+            middle = middle + moved_lights(perception, bank, context, state.shape[0])[chosen]
         return middle / POSITION_M
 
     parts = {
@@ -369,16 +373,16 @@ def _colour(state: Int[Array, " K"]) -> Float[Array, "K 4"]:
     return jnp.stack([~(green | yellow | red), green, yellow, red], axis=-1).astype(jnp.float32)
 
 
-def _route(config: ObservationConfig, bank: ScenarioBank, scene: Scene, view: View) -> Observation:
+def _route(config: ObservationConfig, bank: ScenarioBank, context: AgentContext, view: View) -> Observation:
     offsets = jnp.arange(1, config.route + 1) * config.route_step_m
-    rows, there = route_ahead(bank, scene.index, scene.route_m, offsets)
-    there &= has_route(bank, scene)
+    rows, there = route_ahead(bank, context.index, context.route_m, offsets)
+    there &= has_route(bank, context)
     limit = rows[:, RouteColumn.LIMIT, None]
 
     def curvature() -> Float[Array, "K 1"]:
-        return route_curvature(bank, scene.index, scene.route_m + offsets)[:, None]
+        return route_curvature(bank, context.index, context.route_m + offsets)[:, None]
 
-    goal = bank.goal[scene.index]
+    goal = bank.goal[context.index]
     parts = {
         "position": lambda: view.point(rows[:, RouteColumn.XY]) / POSITION_M,
         "heading": lambda: view.vector(rows[:, RouteColumn.HEADING])[:, ::-1],

@@ -20,14 +20,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drivax.geometry.angles import rotate
 from drivax.geometry.boxes import corners, passage
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, rotate
 from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import AgentKind
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 #: What the key of a step is folded with, by what is drawn from it.
 _DROPPED, _MOVED, _DROPPED_LIGHTS, _MOVED_LIGHTS, _MOVED_ROAD = range(5)
@@ -75,14 +74,14 @@ class Perception:
 
 
 def perceived(
-    config: Perception, bank: ScenarioBank, scene: Scene, frames: Callable[[int], Frame]
+    config: Perception, bank: ScenarioBank, context: AgentContext, frames: Callable[[int], Frame]
 ) -> Callable[[int], Frame]:
     """Return the frames as ego perceived them; ego itself is exact.
 
     Args:
         config: The errors.
         bank: The scenarios.
-        scene: The context of ego.
+        context: The context of ego.
         frames: True frame of all agents some steps ago.
 
     Returns:
@@ -91,19 +90,19 @@ def perceived(
 
     @cache
     def seen(back: int) -> Frame:
-        return _sensed(config, bank, scene, frames(back), back)
+        return _sensed(config, bank, context, frames(back), back)
 
     return seen
 
 
-def _sensed(config: Perception, bank: ScenarioBank, scene: Scene, frame: Frame, back: int) -> Frame:
-    eye, slots = scene.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
-    others, seen, place = slots != scene.slot, frame.valid, frame.box[:, :2]
+def _sensed(config: Perception, bank: ScenarioBank, context: AgentContext, frame: Frame, back: int) -> Frame:
+    eye, slots = context.history[HISTORY - 1 - back], jnp.arange(frame.valid.shape[0])
+    others, seen, place = slots != context.slot, frame.valid, frame.box[:, :2]
     distance = norm(place - eye[:2])
-    key = _key(config, bank, scene, back)
+    key = _key(config, bank, context, back)
     seen &= _reported(config, jax.random.fold_in(key, _DROPPED), distance)
     if config.occlusion:
-        level = jnp.abs(frame.z - frame.z[scene.slot]) <= LEVEL_M
+        level = jnp.abs(frame.z - frame.z[context.slot]) <= LEVEL_M
         slim = (frame.kind == AgentKind.PEDESTRIAN) | (frame.kind == AgentKind.CYCLIST)
         seen &= in_view(eye[:2], frame.box, frame.valid & others & level & ~slim)
     if config.noise_m > 0:
@@ -114,8 +113,8 @@ def _sensed(config: Perception, bank: ScenarioBank, scene: Scene, frame: Frame, 
     box = jnp.concatenate([place, frame.box[:, 2:]], axis=-1)
     lights = frame.lights
     if config.of_lights:
-        line = bank.light_line[scene.index, LightRow.XY]
-        lights = jnp.where(lights_seen(config, bank, scene, norm(line.T - eye[:2]), back), lights, -1)
+        line = bank.light_line[context.index, LightRow.XY]
+        lights = jnp.where(lights_seen(config, bank, context, norm(line.T - eye[:2]), back), lights, -1)
     return replace(frame, box=box, valid=jnp.where(others, seen, frame.valid), lights=lights)
 
 
@@ -143,26 +142,34 @@ def in_view(
 
 
 def lights_seen(
-    config: Perception, bank: ScenarioBank, scene: Scene, distance_m: Float[Array, " L"], back: int = 0
+    config: Perception,
+    bank: ScenarioBank,
+    context: AgentContext,
+    distance_m: Float[Array, " L"],
+    back: int = 0,
 ) -> Bool[Array, " L"]:
     """Return which stop lines were seen ``back`` steps ago, at these distances."""
-    key = jax.random.fold_in(_key(config, bank, scene, back), _DROPPED_LIGHTS)
+    key = jax.random.fold_in(_key(config, bank, context, back), _DROPPED_LIGHTS)
     return _reported(config, key, distance_m)
 
 
-def moved_lights(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
+def moved_lights(
+    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+) -> Float[Array, "count 2"]:
     """Return position errors of lights in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_LIGHTS), count)
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_LIGHTS), count)
 
 
-def moved_road(config: Perception, bank: ScenarioBank, scene: Scene, count: int) -> Float[Array, "count 2"]:
+def moved_road(
+    config: Perception, bank: ScenarioBank, context: AgentContext, count: int
+) -> Float[Array, "count 2"]:
     """Return position errors of road pieces in the ego frame, m."""
-    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, scene), _MOVED_ROAD), count)
+    return config.noise_m * _each(jax.random.fold_in(_key(config, bank, context), _MOVED_ROAD), count)
 
 
-def _key(config: Perception, bank: ScenarioBank, scene: Scene, back: int = 0) -> Array:
+def _key(config: Perception, bank: ScenarioBank, context: AgentContext, back: int = 0) -> Array:
     key = jax.random.key(config.seed)
-    for number in (bank.identity[scene.index], scene.step - back + HISTORY, scene.slot):
+    for number in (bank.identity[context.index], context.step - back + HISTORY, context.slot):
         key = jax.random.fold_in(key, number)
     return key
 

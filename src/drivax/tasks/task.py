@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.metrics.episode import Episode, episode_add, episode_start
-from drivax.metrics.selection import Wanted, selected
+from drivax.metrics.selection import MetricNames, select_metrics
 from drivax.scenario.bank.scenario_bank import ScenarioBank
-from drivax.simulator.types import Facts, Frame, Scene, Situation, Surroundings
+from drivax.simulator.types import AgentContext, Facts, Frame, Situation, Surroundings
 from drivax.tasks.actions import ActionSpace, Physical
 from drivax.tasks.observations import Observation, ObservationConfig, observe
 from drivax.tasks.rewards import RewardConfig
@@ -39,16 +39,16 @@ class Task:
     rewards: RewardConfig = field(default_factory=RewardConfig)
     ends: tuple[Failure, ...] = ("collision", "offroad", "red_light")
     to_the_end: bool = False
-    metrics: Wanted = "full"
+    metrics: MetricNames = "full"
 
     def __post_init__(self) -> None:
-        selected(self.metrics)
+        select_metrics(self.metrics)
 
     @property
     def reads(self) -> frozenset[str]:
         """Facts that rewards, terminations and metrics read."""
         ends = frozenset() if self.to_the_end else frozenset({*self.ends, "left_map"})
-        return selected(self.metrics).reads | self.rewards.reads | ends
+        return select_metrics(self.metrics).reads | self.rewards.reads | ends
 
     def motion(
         self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
@@ -67,20 +67,20 @@ class Task:
         return self.actions.first(history, length)
 
     def observe(
-        self, bank: ScenarioBank, scene: Scene, agents: Callable[[int], Frame], frame: Frame
+        self, bank: ScenarioBank, context: AgentContext, agents: Callable[[int], Frame], frame: Frame
     ) -> Observation:
         """Return the observation of a context; ``agents`` returns the frame of all agents some steps ago."""
-        return observe(self.observation, bank, scene, lambda back: agents(back) if back else frame)
+        return observe(self.observation, bank, context, lambda back: agents(back) if back else frame)
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
         """Return weighted reward terms by name."""
         return self.rewards.weigh(before, now, around)
 
     def ended(
-        self, bank: ScenarioBank, scene: Scene, facts: Facts
+        self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return terminated (by a failure) and truncated (at the end of log or map)."""
-        log_ends, terminated = scene.step >= bank.steps - 1, jnp.zeros((), bool)
+        log_ends, terminated = context.step >= bank.steps - 1, jnp.zeros((), bool)
         if self.to_the_end:
             return terminated, log_ends
         for name in self.ends:
@@ -92,7 +92,7 @@ class Task:
         return episode_start(self.metrics)
 
     def episode_add(
-        self, episode: Any, found: Situation, start: Int[Array, ""], final: Bool[Array, ""]
+        self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Episode:
-        """Return the accumulators after the step to ``found``."""
-        return episode_add(episode, found, start, final)
+        """Return the accumulators after the step to ``situation``."""
+        return episode_add(episode, situation, start, final)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drivax.geometry.angles import rotate
+from drivax.geometry.vectors import rotate
 from drivax.scenario.record import record
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 
 #: Units of positions, speeds, sizes and lengths of road pieces.
 POSITION_M, SPEED_MPS, SIZE_M, PIECE_M = 50.0, 15.0, 5.0, 10.0
@@ -26,9 +26,9 @@ class View:
     sin: Float[Array, ""]
 
     @classmethod
-    def of(cls, scene: Scene) -> View:
+    def of(cls, context: AgentContext) -> View:
         """Return the frame of the driven agent now."""
-        now = scene.history[-1]
+        now = context.history[-1]
         return cls(now[:2], jnp.cos(now[2]), jnp.sin(now[2]))
 
     def point(self, xy: Float[Array, "... 2"]) -> Float[Array, "... 2"]:

@@ -121,7 +121,7 @@ def _check_planner(
     def act(planner: Any, bank: ScenarioBank, key: Any) -> Any:
         state = simulator.reset(bank, 0)
         carry = planner.init(bank, state, key)
-        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.scene)
+        situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.context)
         return planner.act(carry, bank, state, situation, seen, key)[0]
 
     keys = jax.random.key(0), jax.random.key(1)

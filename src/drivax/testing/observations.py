@@ -12,7 +12,7 @@ from drivax.plugins import find_named
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.traffic.log import alone
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 from drivax.tasks.observations import Feature, OwnGroup
 from drivax.tasks.task import Task
 from drivax.testing import worlds
@@ -49,9 +49,9 @@ def check_feature(feature: Feature | str) -> None:
     what = f"observation feature {group.name!r}"
     simulator = Simulator(Task())
 
-    def seen(bank: ScenarioBank, scene: Scene) -> Any:
+    def seen(bank: ScenarioBank, context: AgentContext) -> Any:
         def frames(back: int) -> Frame:
-            return simulator.frame(bank, scene, alone(scene), back)
+            return simulator.frame(bank, context, alone(context), back)
 
         _check_form(what, function(bank, scene, frames))
         return group.observe(bank, scene, frames)
@@ -81,8 +81,8 @@ def check_feature(feature: Feature | str) -> None:
         ),
     )
     for change, cause, cure in variants:
-        check_same(what, results, program(change(bank), scenes), cause, cure)
-    present = np.asarray(scenes.step) == _NOW
+        check_same(what, results, program(change(bank), contexts), cause, cure)
+    present = np.asarray(contexts.step) == _NOW
     now, later = (
         jax.tree.map(lambda leaf: leaf[present], result)
         for result in (results, program(worlds.other_future(bank, _NOW), scenes))

@@ -107,7 +107,7 @@ def _driven(simulator: Simulator, planner: Planner) -> Callable[..., Array]:
 def _act(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, state: SimState, carry: Any
 ) -> tuple[Array, Any]:
-    situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.scene)
+    situation, seen = simulator.situation(bank, state), simulator.observe(bank, state.context)
     return planner.act(carry, bank, state, situation, seen, jax.random.key(5))
 
 
@@ -118,7 +118,12 @@ def _check_forms(what: str, simulator: Simulator, planner: Planner, bank: Scenar
         state = simulator.reset(bank, 0)
         carry = planner.init(bank, state, jax.random.key(3))
         action, after = _act(simulator, planner, bank, state, carry)
-        return state.scene.action, action, jax.tree.map(jnp.asarray, carry), jax.tree.map(jnp.asarray, after)
+        return (
+            state.context.action,
+            action,
+            jax.tree.map(jnp.asarray, carry),
+            jax.tree.map(jnp.asarray, after),
+        )
 
     expected, action, before, after = forms(what, once, bank)
     expect(

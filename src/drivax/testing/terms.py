@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivax.metrics.catalogue import Metric
-from drivax.metrics.outcomes import Ending
+from drivax.metrics.catalogue import EpisodeEnd, Metric
 from drivax.metrics.scores import Value
 from drivax.metrics.steps import Moment
 from drivax.plugins import find_named
@@ -86,7 +85,7 @@ def check_metric(metric: Metric | str) -> None:
             defined = jnp.broadcast_to(jnp.asarray(defined, bool), number.shape)
             return jnp.where(defined, number.astype(jnp.float32), 0.0), defined
 
-        _check_moments(what, value, check_scalar if not step.late else _check_rows)
+        _check_moments(what, value, check_scalar if not step.delayed else _check_rows)
         _check_reads(what, value, step.reads)
     if spec.compute is not None:
         _check_computed(what, spec)
@@ -143,7 +142,7 @@ def _check_computed(what: str, metric: Metric) -> None:
     grid = jnp.linspace(0.0, 1.0, 12)
 
     def value(row: Any, number: Any, defined: Any) -> Any:
-        ending = Ending(bank, row, jnp.asarray(10), jnp.asarray(80))
+        ending = EpisodeEnd(bank, row, jnp.asarray(10), jnp.asarray(80))
         given = Value(number, defined)
         return compute(ending, given, dict.fromkeys(metric.inputs, given))
 

@@ -14,9 +14,10 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import alone, logged_history
-from drivax.simulator.types import Scene, Traffic
+from drivax.simulator.types import AgentContext, Traffic
 from drivax.tasks.observations import View
 from drivax.tasks.task import Task
 from drivax.testing import worlds
@@ -62,7 +63,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     """
     traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
     what = f"traffic {traffic.name!r}"
-    bank = prepared(traffic, worlds.worlds())
+    bank = prepare_bank(traffic, worlds.worlds())
     _check_state(what, traffic, bank)
     index, program = jnp.arange(len(bank)), Program(what, _driven(traffic), (None, 0))
     seen: _Seen = program.check_pure(bank, index)
@@ -100,7 +101,7 @@ def check_traffic(traffic: Traffic | str) -> None:
         "the order of agents changes",
         "let no motion depend on the slot",
     )
-    turned = program(prepared(traffic, worlds.worlds(ANGLE)), index)
+    turned = program(prepare_bank(traffic, worlds.worlds(ANGLE)), index)
     check_turned(what, _from_ego(seen), _from_ego(turned))
 
 
@@ -109,16 +110,16 @@ def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
     simulator = Simulator(Task(), traffic)
 
     def drive(bank: ScenarioBank, index: Any) -> _Seen:
-        def step(scene: Scene, _: None) -> tuple[Scene, _Seen]:
-            frame = simulator.frame(bank, scene, alone(scene), 0)
+        def step(context: AgentContext, _: None) -> tuple[AgentContext, _Seen]:
+            frame = simulator.frame(bank, context, alone(context), 0)
             moved = replace(
-                scene,
-                step=scene.step + 1,
-                history=logged_history(bank, index, scene.step + 1, 0),
-                traffic=traffic.advance(bank, scene, frame),
+                context,
+                step=context.step + 1,
+                history=logged_history(bank, index, context.step + 1, 0),
+                traffic=traffic.advance(bank, context, frame),
             )
-            rows, remembered = traffic.agents(bank, scene, 0), traffic.agents(bank, moved, 1)
-            return moved, _Seen(rows, remembered, View.of(scene))
+            rows, remembered = traffic.agents(bank, context, 0), traffic.agents(bank, moved, 1)
+            return moved, _Seen(rows, remembered, View.of(context))
 
         return jax.lax.scan(step, simulator.scene(bank, index, _START), None, _STEPS)[1]
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, as_words
 from drivax.scenario.build.assemble import assemble
@@ -115,7 +115,7 @@ def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Si
     scene = replace(scene, history=jnp.concatenate([shifted, moved], axis=-1))
     now, previous = (simulator.frame(bank, scene, alone(scene), back) for back in (0, 1))
     apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
-    return measure(bank, scene, now, previous, apart, remember_lights(bank, scene), FACTS | ON_REQUEST)[0]
+    return measure(bank, context, now, previous, apart, remember_lights(bank, context), FACTS | ON_REQUEST)[0]
 
 
 def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:

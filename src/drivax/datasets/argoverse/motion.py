@@ -25,7 +25,7 @@ from drivax.datasets.ground import lift
 from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind, Flag
 

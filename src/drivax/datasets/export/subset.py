@@ -16,7 +16,7 @@ from drivax.datasets.export.gpudrive import gpudrive_scene
 from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.errors import UsageError
 from drivax.files import PartialFolder, sync_and_close, write_json
-from drivax.scenario.select.choice import chosen
+from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
 #: What an export in another format says about itself.
@@ -33,7 +33,7 @@ class Export:
 
     Attributes:
         format: ``set`` (a scenario set again), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
-        filters: Conditions that all must hold (``scenario.select.filters``).
+        filters: Conditions that all must hold (``scenario.select.selection``).
         ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None for all.
         limit: At most so many scenarios, the first of those selected.
         paths: Form of ``path_samples`` in tf.Examples, a name in ``export_tfexample.PATHS``.
@@ -99,7 +99,7 @@ def export(
     options.check()
     opened = ScenarioSet.open(set_path)
     names = () if options.ids is None else (options.ids,)
-    rows = chosen(opened, options.filters, names, options.limit)
+    rows = select_scenarios(opened, options.filters, names, options.limit)
     if options.format == "set":
         return write_part(opened, rows, out, options.overwrite, progress)
     write = {"tfexample": _write_examples, "gpudrive": _write_scenes}[options.format]

@@ -16,7 +16,7 @@ from jaxtyping import Float64, Int64
 from drivax.datasets.nuplan.geopackage import Database
 from drivax.datasets.readings import box_centre
 from drivax.errors import DataError
-from drivax.geometry.angles import rotate, wrap
+from drivax.geometry.vectors import rotate, wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import CURRENT_STEP, STEPS, AgentKind, LightState
 

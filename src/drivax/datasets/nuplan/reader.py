@@ -16,8 +16,7 @@ from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, fin
 from drivax.datasets.places import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
-from drivax.scenario.build.assemble import STRIDE
-from drivax.scenario.recording import Light, MapFeature, Recording
+from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording
 from drivax.scenario.schema import CURRENT_STEP, STEPS
 
 FORMAT = "nuplan"

@@ -16,7 +16,7 @@ from drivax.datasets.areas import Area, road_edges
 from drivax.datasets.nuscenes.cropping import Box
 from drivax.datasets.readings import load_json
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LINE_KINDS, RoadKind
 

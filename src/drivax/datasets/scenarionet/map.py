@@ -22,7 +22,7 @@ from drivax.datasets.scenarionet.values import (  # fmt: skip
     text,
 )
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lanes import WIDTHS_M
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKind

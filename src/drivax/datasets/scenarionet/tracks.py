@@ -10,7 +10,7 @@ import numpy as np
 from drivax.datasets import readings
 from drivax.datasets.scenarionet.values import SKIP, Names, count_rows, floats, mapping
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 

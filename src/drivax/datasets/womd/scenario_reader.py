@@ -18,7 +18,7 @@ from drivax.datasets.womd.messages import parse, scenario_class
 from drivax.datasets.womd.tf_example import agent_kind
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
 from drivax.scenario.schema import LANE_KINDS, RoadKind
 

@@ -16,7 +16,7 @@ import numpy as np
 from drivax.datasets import readings
 from drivax.datasets.womd.messages import example_class, parse
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Light, MapFeature, Tracks
 from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, AgentKind, RoadKind
 

@@ -1,4 +1,4 @@
-"""Everyone at constant velocity: where others will be, when ego would meet them, and whose fault that would be."""
+"""All agents at constant velocity: where others will be, when ego would meet them, and whose fault that would be."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivax.geometry.vectors import norm
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
-from drivax.simulator.contact import judge_contacts
+from drivax.simulator.contact import classify_contacts
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, MOTION_X, MOTION_Y, Frame
 
 #: Looks into the next five seconds at who comes near.
@@ -28,7 +28,7 @@ class Forecast:
         box: Their boxes now.
         velocity: m/s.
         kind: ``scenario.schema.AgentKind``.
-        valid: Whether there is somebody.
+        valid: Whether the agent is there.
     """
 
     box: Float[Array, "K 6"]
@@ -41,10 +41,10 @@ class Forecast:
         cls, frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
         most: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Those who come nearest to a way within five seconds.
+        """Those that come nearest to a way within five seconds.
 
         Args:
-            frame: Everyone now.
+            frame: All agents now.
             slot: Ego.
             ignored: Who does not count.
             way: Points that ego may come to.
@@ -98,9 +98,9 @@ def fault_times(
     motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
     unlawful: Bool[Array, " T"],
 ) -> Float[Array, " K"]:  # fmt: skip
-    """When each of the others is hit by ego's fault, s; infinite for those who are not.
+    """When each of the others is hit by ego's fault, s; infinite for those that are not.
 
-    Fault is decided at the first overlap, by the rule that judges episodes (``simulator.contact.judge_contacts``).
+    Fault is decided at the first overlap, by the rule of the metric (``simulator.contact.classify_contacts``).
 
     Args:
         motion: The drive.
@@ -123,7 +123,7 @@ def fault_times(
             both, jnp.zeros((2, 2)), two, two == 0.0, jnp.stack([kind, kind]), jnp.zeros(0, jnp.int32)
         )
         fresh = jnp.arange(2) == 1
-        return judge_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
+        return classify_contacts(frame, jnp.zeros((), jnp.int32), fresh, speed, two + other, several)[0][1]
 
     pairs = jnp.stack([me, moved], axis=1)
     fault = jax.vmap(at_fault)(pairs, others.kind, motion[step, MOTION_SPEED], speeds, unlawful[step])

@@ -1,4 +1,4 @@
-"""PDM-Closed: 15 proposals along the route, each driven in thought, judged as nuPlan judges, and the best one driven.
+"""PDM-Closed: simulates 15 proposals along the route, scores them as nuPlan does, and drives the best one.
 
 Source: Dauner, Hallgarten, Geiger and Chitta, "Parting with Misconceptions about Learning-based Vehicle Motion
 Planning" (CoRL 2023), and the numbers of its published implementation; where this one departs from it is written in
@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import LENGTH, WIDTH
+from drivax.geometry.vectors import wrap
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unrolled
@@ -42,7 +42,7 @@ PUBLISHED_DRIVER = IdmParameters(
     exponent=10.0,
     max_braking_mps2=3.0,
 )
-#: Every so many points of the route are compared with where others will be.
+#: Stride of the route points that are compared with forecasts.
 _SPARSE = 5
 
 
@@ -56,12 +56,12 @@ class PdmConfig:
         fallback_mps: Limit where none is known.
         driver: The IDM of the proposals.
         steps: How far they are unrolled, steps of 0.1 s.
-        leader_every: Steps after which a proposal looks for its leader anew.
+        leader_every: Steps after which a proposal looks for its leader again.
         radius_m: Others further away are not looked at.
         agents: How many others are looked at: of those within the radius the ones that come nearest to the route. The
             publication looks at the nearest 50 vehicles, 25 pedestrians, 10 cyclists and 50 other things.
         tracking: How proposals are driven.
-        scoring: How they are judged.
+        scoring: How they are evaluated.
         brake: The emergency brake.
     """
 
@@ -108,7 +108,7 @@ class Weighed:
 
     Attributes:
         cars: As they would be driven, step by step.
-        judgement: How each is judged.
+        judgement: How each is evaluated.
         score: In [0, 1].
     """
 
@@ -130,13 +130,13 @@ class PdmPlanner:
     replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Memory:
-        """Nobody touched yet; acceleration and steering as the motion of the last half second has them."""
-        scene = state.scene
-        before, now = scene.history[-1 - _PAST], scene.history[-1]
+        """No agent touched yet; acceleration and steering as the motion of the last half second has them."""
+        context = state.context
+        before, now = context.history[-1 - _PAST], context.history[-1]
         moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _PAST * DT_S
         turned = wrap(now[MOTION_HEADING] - before[MOTION_HEADING])
         curvature = jnp.where(moved_m > _STILL_M, turned / jnp.maximum(moved_m, _STILL_M), 0.0)
-        steering = jnp.arctan(curvature * self._wheelbase(bank.length_m(scene.index, scene.slot)))
+        steering = jnp.arctan(curvature * self._wheelbase(bank.length_m(context.index, context.slot)))
         most = self.config.tracking.most_steering
         return Memory(
             touched=jnp.zeros(bank.agent_box.shape[1], bool),
@@ -154,8 +154,8 @@ class PdmPlanner:
         key: Array,
     ) -> tuple[Float[Array, " D"], Memory]:
         """The first step of the best proposal, or the brake."""
-        scene = situation.scene
-        motion, length = scene.history[-1], situation.surroundings.frame.box[scene.slot, LENGTH]
+        context = situation.context
+        motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
         carry = self._touching(carry, situation)
         weighed = self.weigh(carry, bank, situation)
         best = jnp.argmax(weighed.score)
@@ -166,35 +166,34 @@ class PdmPlanner:
         steering = jnp.where(brakes, 0.0, weighed.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
-        action = self.actions.actuated(motion, action, scene.action)
         return action, Memory(carry.touched, acceleration, steering)
 
     def weigh(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> Weighed:
-        """All proposals, driven and judged."""
-        config, scene, around = self.config, situation.scene, situation.surroundings
-        frame, motion = around.frame, scene.history[-1]
-        me = frame.box[scene.slot]
+        """All proposals, driven and evaluated."""
+        config, context, around = self.config, situation.context, situation.surroundings
+        frame, motion = around.frame, context.history[-1]
+        me = frame.box[context.slot]
         size, speed = me[LENGTH : WIDTH + 1], motion[MOTION_SPEED]
-        lines = Lines.beside_route(bank, scene.index, around.route.along_m, config.offsets_m, me)
+        lines = Lines.beside_route(bank, context.index, around.route.along_m, config.offsets_m, me)
         way = lines.points[0, ::_SPARSE, :2]
-        others = Forecast.of(frame, scene.slot, carry.touched, way, config.agents, config.radius_m)
-        # Each stage is written out: XLA would compute it anew in every operation that uses it.
+        others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
+        # Each stage is written out: XLA would compute it again in every operation that uses it.
         lines, others = jax.lax.optimization_barrier((lines, others))
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
-        wanted = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
-        stop_m = stop_line_m(bank, scene, frame)
+        desired = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
+        stop_m = stop_line_m(bank, context, frame)
         driver = (config.driver, config.steps, config.leader_every)
-        proposals = unrolled(lines, others, size, speed, wanted, stop_m, driver)
+        proposals = unrolled(lines, others, size, speed, desired, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
         wheelbase = self._wheelbase(size[0])
         car = Car(motion, carry.acceleration, carry.steering)
         cars = jax.vmap(lambda one: tracked(car, one, wheelbase, config.tracking))(reference)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
-        ground_z = frame.z[scene.slot] - bank.height_m(scene.index, scene.slot) / 2
+        ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
-        ground = grounds(bank, scene.index, cars.motion, size, z, on_route, every)
+        ground = grounds(bank, context.index, cars.motion, size, z, on_route, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
@@ -205,7 +204,7 @@ class PdmPlanner:
         return Weighed(cars, judgement, scores(judgement, config.scoring))
 
     def _touching(self, carry: Memory, situation: Situation) -> Memory:
-        frame, slot = situation.surroundings.frame, situation.scene.slot
+        frame, slot = situation.surroundings.frame, situation.context.slot
         return Memory(carry.touched | overlaps(frame, slot), carry.acceleration, carry.steering)
 
     def _wheelbase(self, length_m: Float[Array, ""]) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""How PDM-Closed judges a proposal: gates that multiply a weighted mean of progress, time to collision and comfort.
+"""How PDM-Closed evaluates a proposal: gates that multiply a weighted mean of progress, time to collision and comfort.
 
 Source: Dauner et al. 2023 and the numbers of its published implementation, which follows nuPlan's closed-loop metrics.
 """
@@ -11,9 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import LENGTH, corners
-from drivax.geometry.vectors import norm
+from drivax.geometry.vectors import norm, wrap
 from drivax.metrics.comfort import (
     JERK_MAGNITUDE_MPS3,
     JERK_MPS3,
@@ -21,7 +20,7 @@ from drivax.metrics.comfort import (
     LONGITUDINAL_MPS2,
     YAW_ACCELERATION_RPS2,
     YAW_RATE_RPS,
-    filter_operator,
+    savgol_matrix,
 )
 from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
@@ -84,7 +83,7 @@ class Judgement:
         collision, road, direction: Gates: 1 passed, 0 failed.
         progress_m: Along the route.
         ttc, comfort: 1 kept, 0 not.
-        fault_s: When ego first hits somebody by its own fault, infinite where it does not.
+        fault_s: When ego first hits another agent by its own fault, infinite where it does not.
     """
 
     collision: Float[Array, "*batch"]
@@ -155,7 +154,7 @@ def judged(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""], size: Float[Array, " 2"],
     others: Forecast, ground: Ground, progress_m: Float[Array, ""], config: ScoringConfig,
 ) -> Judgement:  # fmt: skip
-    """Judges one drive.
+    """Evaluate one drive.
 
     Args:
         motion: The drive.
@@ -217,10 +216,10 @@ def _foreseen(
     motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
     config: ScoringConfig,
 ) -> Bool[Array, ""]:  # fmt: skip
-    """Whether some step foresees a collision with somebody who is not behind ego at that step.
+    """Whether some step foresees a collision with another agent that is not behind ego at that step.
 
     The first step that foresees one decides for each of the others. Sources do not say where intersections are, so
-    everywhere counts as one: those beside ego count too.
+    everywhere counts as one: those next to ego count too.
     """
     steps = jnp.arange(motion.shape[0])
     sees = (soon_s <= config.ttc_s) & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
@@ -254,7 +253,7 @@ def is_comfortable(
     magnitude = jnp.sqrt(acceleration**2 + lateral**2 + 1e-12)
 
     def within(signal: Array, window: int, order: int, derivative: int, least: float, most: float) -> Array:
-        operator = jnp.asarray(filter_operator(steps, window, order, derivative), jnp.float32)
+        operator = jnp.asarray(savgol_matrix(steps, window, order, derivative), jnp.float32)
         smooth = operator @ signal / DT_S**derivative
         return ((smooth >= least) & (smooth <= most)).all()
 

@@ -1,4 +1,4 @@
-"""What plots show of a drive: speed, accelerations, jerk, yaw rate and curvature of its path, and the commands."""
+"""Signals of the plots: speed, accelerations, jerk, yaw rate and curvature of a path, and the commands."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.metrics.comfort import (
     JERK_MPS3,
     LATERAL_MPS2,
     LONGITUDINAL_MPS2,
     WINDOW,
     YAW_RATE_RPS,
-    filter_operator,
+    savgol_matrix,
 )
 from drivax.scenario.schema import DT_S
 
 Array = np.ndarray[Any, Any]
-#: Below this speed a path has no curvature to speak of: headings jitter more than the car moves.
+#: Below this speed a path has no curvature: headings jitter more than the car moves.
 _CURVED_MPS = 0.5
 
 
@@ -29,10 +29,9 @@ class Signal:
     """One plot.
 
     Attributes:
-        name: Of the signal.
-        title: Words above the plot.
-        unit: Of its values.
-        step: Resolution with which it is packed.
+        name, title: Its name, and the words above the plot.
+        unit: Unit of its values.
+        step: Resolution of the packed values.
         limits: Comfort limits, low and high; empty without.
     """
 
@@ -51,7 +50,7 @@ SIGNALS = (
     Signal("yaw_rate", "yaw rate", "rad/s", 0.001, (-YAW_RATE_RPS, YAW_RATE_RPS)),
     Signal("lateral", "lateral acceleration", "m/s²", 0.01, (-LATERAL_MPS2, LATERAL_MPS2)),
 )
-#: The commands, which are not read off the path: the first two numbers of an action.
+#: Commands: the first two numbers of an action.
 COMMANDS = (
     Signal("lengthwise", "command lengthwise", "1 is the most", 0.001),
     Signal("sideways", "command sideways", "1 is the most", 0.001),
@@ -60,38 +59,35 @@ COMMANDED = len(COMMANDS)
 
 
 def signals(ego: Float[Array, "step 4"]) -> dict[str, Float[Array, " step"]]:
-    """The signals of a path, differentiated and filtered as the comfort metrics do.
+    """Return the signals of a path by name, differentiated and filtered like the comfort metrics.
 
     Savitzky-Golay windows of nuPlan: accelerations 8/2, jerk and yaw rate 15/2 (``metrics.comfort``). Curvature is yaw
-    rate over speed. At most 7 steps from either end of the path a value is that of the first or last window's
-    polynomial.
+    rate over speed. The 7 steps at either end have values of the first or last window's polynomial. Values are NaN
+    outside of the last unbroken stretch of the path, at its first step, and, except for speed, throughout if it has
+    fewer than 16 steps.
 
     Args:
-        ego: Position [m], heading [rad], speed [m/s] at every step; NaN where the car is not there.
-
-    Returns:
-        Values by the name of the signal, NaN where there are none: outside of the last unbroken part of the path, at
-        the first step of it (nothing to differ from), and throughout where it has fewer than 16 steps, speed aside.
+        ego: Position [m], heading [rad], speed [m/s] at every step; NaN where the agent is absent.
     """
-    there = np.asarray(np.isfinite(ego).all(axis=1))
-    found = {one.name: np.full(len(ego), np.nan) for one in SIGNALS}
-    found["speed"][there] = ego[there, 3]
-    if not there.any():
-        return found
-    end = int(np.flatnonzero(there)[-1]) + 1
-    gaps = np.flatnonzero(~there[:end])
+    present = np.asarray(np.isfinite(ego).all(axis=1))
+    values = {signal.name: np.full(len(ego), np.nan) for signal in SIGNALS}
+    values["speed"][present] = ego[present, 3]
+    if not present.any():
+        return values
+    end = int(np.flatnonzero(present)[-1]) + 1
+    gaps = np.flatnonzero(~present[:end])
     first = int(gaps[-1]) + 1 if gaps.size else 0
     if end - first <= WINDOW:
-        return found
+        return values
     path, at = np.asarray(ego[first:end], np.float64), slice(first + 1, end)
     turned = np.asarray(wrap(np.diff(path[:, 2])))
     along, middle = np.diff(path[:, 3]) / DT_S, (path[1:, 3] + path[:-1, 3]) / 2
     samples = end - first - 1
-    smooth, slope = filter_operator(samples, 8, 2, 0), filter_operator(samples, WINDOW, 2, 1) / DT_S
+    smooth, slope = savgol_matrix(samples, 8, 2, 0), savgol_matrix(samples, WINDOW, 2, 1) / DT_S
     rate = slope @ np.cumsum(turned)
-    found["acceleration"][at] = smooth @ along
-    found["lateral"][at] = smooth @ (middle * turned / DT_S)
-    found["jerk"][at] = slope @ along
-    found["yaw_rate"][at] = rate
-    found["curvature"][at] = np.where(middle >= _CURVED_MPS, rate / np.maximum(middle, _CURVED_MPS), np.nan)
-    return found
+    values["acceleration"][at] = smooth @ along
+    values["lateral"][at] = smooth @ (middle * turned / DT_S)
+    values["jerk"][at] = slope @ along
+    values["yaw_rate"][at] = rate
+    values["curvature"][at] = np.where(middle >= _CURVED_MPS, rate / np.maximum(middle, _CURVED_MPS), np.nan)
+    return values

@@ -1,1 +1,5 @@
-"""Self-contained HTML pages."""
+"""Self-contained HTML pages: report, comparison, contents of sets, viewer."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

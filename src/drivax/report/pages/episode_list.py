@@ -1,4 +1,4 @@
-"""All episodes of a report as a list in the page: worst first, to be sorted and sieved by metric, outcome and tag."""
+"""All episodes of a report as a list in the page: worst first, sorted and filtered by metric, outcome and tag."""
 
 from __future__ import annotations
 
@@ -7,24 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from drivax.evaluation.results import RATES
-from drivax.evaluation.stored import ScenarioKey, comparable
-from drivax.evaluation.tables import UNKNOWN
-from drivax.report.breakdowns import Tags
-from drivax.report.comparison import metric_names
-from drivax.report.episode_selection import outcome, worst_first
-from drivax.report.glossary import CODES, note, ordered
-from drivax.report.loaded_runs import Evaluation
+from drivax.evaluation.episode_table import RATES, ScenarioKey
+from drivax.evaluation.pairing import comparable
+from drivax.evaluation.tables import CODES, UNKNOWN, metric_label, metric_names, ordered
+from drivax.report.episodes import outcome, worst_first
 from drivax.report.pages.page import data_element
+from drivax.report.runs import Evaluation
+from drivax.report.table_files import Tags
 
 #: Tags with more values than this (ids, places) are not offered as a choice.
 MOST_VALUES = 24
-#: Columns of the list, as far as a run has them; by everything else it can be sieved and sorted.
+#: Columns of the list, as far as a run has them; all other metrics filter and sort it.
 _SHOWN = (
     "vmax_score", "at_fault_collision", "collision", "offroad", "red_light", "progress_ratio", "min_ttc", "comfortable",
 )  # fmt: skip
 
-EPISODE_LIST = """<form class=sieve id=sieve onsubmit="return false">
+EPISODE_LIST = """<form class=filters id=filters onsubmit="return false">
 <label>planner <select name=run></select></label>
 <label>outcome <select name=outcome></select></label>
 <label>failed <select name=failed></select></label>
@@ -35,23 +33,23 @@ EPISODE_LIST = """<form class=sieve id=sieve onsubmit="return false">
 <span id=tags></span>
 <label>scenario <input name=words type=search placeholder="part of its id"></label>
 <button type=button name=all>all</button></form>
-<p id=found role=status></p>
+<p id=count role=status></p>
 <div class="scroll list" tabindex=0 role=region aria-label="list of episodes"><table class=episodes><thead><tr id=heads>
 </tr></thead><tbody id=rows></tbody></table></div><button type=button id=more hidden>more</button>"""
 
 
 def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
-    """The data of the list as a script element.
+    """Return the data of the list as a script element.
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
-    metric with four significant digits, null where undefined, rows worst first, ``runs[].errors`` by row the step and
-    the words of a crash; ``tags`` holds for each tag its words and for each scenario the number of its word, which is
+    metric with four significant digits, null where undefined, rows worst first; ``runs[].errors`` by row the step and
+    the error of a crash; ``tags`` holds for each tag its values and for each scenario the index of its value, which is
     ``unknown`` where it has none.
 
     Args:
         runs: Evaluations, the policy last.
         tags: The tags of scenarios.
-        played: The scenarios that the player holds, and their place there.
+        played: The scenarios in the player, and their place there.
     """
     names = ordered(metric_names(runs))
     names += [name for name in metric_names(runs) if name in CODES]
@@ -71,9 +69,9 @@ def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[Scenari
 
 
 def _metric(name: str, runs: Sequence[Evaluation]) -> dict[str, Any]:
-    entry = note(name, runs)
-    bad = {"up": 0, "down": 1, "none": None}[entry.better] if name in RATES else None
-    return {"name": name, "label": entry.label, "better": entry.better, "unit": entry.unit, "bad": bad}
+    label = metric_label(name, runs)
+    bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
+    return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
 
 
 def _run(
@@ -81,18 +79,19 @@ def _run(
 ) -> dict[str, Any]:
     rows = worst_first(run, [other for other in runs if other is not run])
     outcomes = [outcome(run, row) for row in rows]
-    words = list(dict.fromkeys(outcomes))
-    scenarios = run.scenarios
+    distinct = list(dict.fromkeys(outcomes))
+    keys = run.scenarios
+    scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
     return {
         "name": run.name,
         "playable": comparable(run, runs[-1]),
-        "scenario": [place[scenarios[row]] for row in rows],
-        "outcomes": words,
-        "outcome": [words.index(word) for word in outcomes],
+        "scenario": [place[key] for key in scenarios],
+        "outcomes": distinct,
+        "outcome": [distinct.index(words) for words in outcomes],
         "errors": {
-            str(place): run.crashes[scenarios[row]]
-            for place, row in enumerate(rows)
-            if scenarios[row] in run.crashes
+            str(row): (crashes[key].step, crashes[key].error)
+            for row, key in enumerate(scenarios)
+            if key in crashes
         },
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
@@ -101,21 +100,21 @@ def _run(
 def _column(values: Any, rows: Sequence[int]) -> list[float | None]:
     if values is None:
         return [None] * len(rows)
-    return [None if np.isnan(value) else _short(value) for value in np.asarray(values)[rows]]
+    return [None if np.isnan(value) else _rounded(value) for value in np.asarray(values)[rows]]
 
 
-def _short(value: float) -> float:
-    """Four significant digits; whole numbers as such, which are shorter."""
-    short = float(f"{value:.4g}")
-    return int(short) if short.is_integer() else short
+def _rounded(value: float) -> float:
+    """Return four significant digits; whole numbers as such, which are shorter."""
+    rounded = float(f"{value:.4g}")
+    return int(rounded) if rounded.is_integer() else rounded
 
 
 def _tags(tagged: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-    found = []
-    for name in dict.fromkeys(name for words in tagged for name in words):
-        said = [one.get(name, UNKNOWN) for one in tagged]
-        words = sorted(set(said))
-        if 1 < len(words) <= MOST_VALUES:
-            number = {word: place for place, word in enumerate(words)}
-            found.append({"name": name, "words": words, "of": [number[word] for word in said]})
-    return found
+    columns = []
+    for name in dict.fromkeys(name for tags in tagged for name in tags):
+        values = [tags.get(name, UNKNOWN) for tags in tagged]
+        distinct = sorted(set(values))
+        if 1 < len(distinct) <= MOST_VALUES:
+            number = {value: place for place, value in enumerate(distinct)}
+            columns.append({"name": name, "words": distinct, "of": [number[value] for value in values]})
+    return columns

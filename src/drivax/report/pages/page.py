@@ -1,19 +1,38 @@
-"""The frame of every page: one HTML file that carries its styles, scripts and data, written whole or not at all."""
+"""The frame of every page: one HTML file that carries its styles, scripts and data; and the player as HTML."""
 
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import metadata, resources
-from pathlib import Path
 from string import Template
 from typing import Any
 
-from drivax.errors import UsageError
-from drivax.report.pictures.palette import THEMES
+from drivax.report.charts.motion import COMMANDS, SIGNALS
+from drivax.report.pictures.drawing import EVENT_WORDS, GOAL_M, LIGHTS, STOP_M, WIDTHS
+from drivax.report.pictures.palette import LEGEND, STROKES, THEMES
+from drivax.table import Cell, Column, Table
+
+KEYS = (
+    ("space", "play or pause"), ("← →", "one step"), ("Home End", "first and last step"), ("[ ]", "speed"),
+    ("+ −", "zoom"), ("f", "follow or whole episode"), ("n p", "next and previous episode"),
+)  # fmt: skip
+_CONTROLS = """<div class=controls>
+<button type=button data-control=back aria-label="one step back" title="one step back (←)">◂</button>
+<button type=button data-control=play aria-label="play" title="play or pause (space)">▶</button>
+<button type=button data-control=forward aria-label="one step on" title="one step on (→)">▸</button>
+<div class=track><div class=ticks data-control=ticks></div>
+<input type=range min=0 max=90 value=0 step=1 data-control=scrub aria-label="time"></div>
+<span class=clock data-control=clock></span>
+<select data-control=speed aria-label="speed" title="speed ([ and ])">
+<option value=0.25>¼×</option><option value=0.5>½×</option><option value=1 selected>1×</option>
+<option value=2>2×</option><option value=4>4×</option></select>
+<button type=button data-control=follow aria-pressed=true title="follow the ego (f)">follow</button>
+<button type=button data-control=fit aria-pressed=false title="show the whole episode (f)">whole</button>
+<button type=button data-control=wider aria-label="zoom out" title="zoom out (−)">−</button>
+<button type=button data-control=closer aria-label="zoom in" title="zoom in (+)">+</button>
+</div>"""
 
 
 def page(
@@ -24,20 +43,20 @@ def page(
     data: Iterable[str] = (),
     scripts: Iterable[str] = (),
 ) -> str:
-    """A whole page.
+    """Return a whole page.
 
     Args:
         title: Its heading, as plain text.
         lead: HTML below the heading.
         sections: HTML of its parts; empty ones are left out.
-        style: CSS beside that of all pages.
+        style: CSS in addition to that of all pages.
         data: Script elements that hold data.
         scripts: Programs, in order.
     """
     return Template(asset("report.html.template")).substitute(
         title=escape(title),
         version=escape(metadata.version("drivax")),
-        style=colours() + asset("player.css") + style,
+        style=_colours() + asset("player.css") + style,
         lead=lead,
         sections="\n".join(filter(None, sections)),
         data="\n".join(data),
@@ -46,17 +65,16 @@ def page(
 
 
 def data_element(value: Any, **attributes: str) -> str:
-    """A script element that holds JSON and cannot be ended by it."""
+    """Return a script element that holds JSON, with every ``<`` escaped."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     named = "".join(f' {name}="{escape(words)}"' for name, words in attributes.items())
     return f'<script type="application/json"{named}>{text}</script>'
 
 
-def colours() -> str:
-    """The palette as CSS variables, light and dark."""
-    light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
-                   for name in ("light", "dark"))  # fmt: skip
-    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
+def facts_html(headings: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> str:
+    """Return a table of texts: a label and the facts about it in each row."""
+    columns = tuple(Column(heading, label=not place) for place, heading in enumerate(headings))
+    return Table("facts", columns, tuple((Cell(label), *map(Cell, facts)) for label, facts in rows)).html()
 
 
 def asset(name: str) -> str:
@@ -64,28 +82,51 @@ def asset(name: str) -> str:
     return resources.files("drivax.report.pages").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def refuse_page(out: Path, overwrite: bool) -> None:
-    """Refuses a page that may not be written, before any work is done.
-
-    Raises:
-        UsageError: ``out`` is a folder, or exists and ``overwrite`` is not given.
-    """
-    if out.is_dir() or (out.exists() and not overwrite):
-        cure = "name a file in it" if out.is_dir() else "choose another name or pass --overwrite"
-        raise UsageError("exists already", file=out, cure=cure)
+def _colours() -> str:
+    """Return the palette as CSS variables, light and dark."""
+    light, dark = ("".join(f"--{key}:{value};" for key, value in THEMES[name].items() if key != "ink")
+                   for name in ("light", "dark"))  # fmt: skip
+    return f":root{{{light}}}\n@media (prefers-color-scheme: dark){{:root{{{dark}}}}}\n"
 
 
-def publish(out: Path, text: str) -> None:
-    """Write beside the target, make it durable, then rename: never half a page under its name."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-        Path(name).replace(out)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+def player_html() -> str:
+    """Return stage, controls, legend, keys and plots."""
+    legend = "".join(_legend_item(name, words) for name, words in LEGEND)
+    keys = " ".join(f"<kbd>{escape(key)}</kbd> {escape(words)}" for key, words in KEYS)
+    return (
+        f"<div id=stage></div>{_CONTROLS}<ul class=legend>{legend}</ul><p><small>{keys}</small></p>"
+        "<noscript><p>The player needs JavaScript, which this page carries with it.</p></noscript>"
+        "<h3>Motion and commands</h3><div id=plots class=charts></div><p><small>From the recorded motion, with the "
+        "filters of the comfort metrics; dashed lines are nuPlan's limits, crosses the first failures. Commands are "
+        "the executed ones: acceleration (or metres ahead) and steering (or metres to the left), as shares of the "
+        "maximum of the action space.</small></p>"
+    )
+
+
+def player_data(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return script elements with styles, signals and packed episodes (``report.pictures.player_data``)."""
+    style = {
+        "themes": {name: dict(theme) for name, theme in THEMES.items()},
+        "widths": dict(WIDTHS),
+        "radii": {"stop": STOP_M, "goal": GOAL_M},
+        "lights": LIGHTS,
+        "events": dict(EVENT_WORDS),
+        "signals": [
+            {"words": signal.title, "unit": signal.unit, "step": signal.step, "limits": signal.limits}
+            for signal in (*SIGNALS, *COMMANDS)
+        ],
+        "strokes": [[stroke.colour, stroke.dash, stroke.key] for stroke in STROKES],
+    }
+    packed = (data_element(episode, **{"class": "episode"}) for episode in episodes)
+    return [data_element(style, id="style"), *packed]
+
+
+def player_scripts() -> list[str]:
+    """Return the programs of plots and player; the plots listen to the player, so they come first."""
+    return [asset("plots.js"), asset("player.js")]
+
+
+def _legend_item(name: str, words: str) -> str:
+    sign = "✕" if name == "mark" else ""
+    fill = "" if name in ("log", "route", "mark", "goal") else f' style="background:var(--{name})"'
+    return f'<li><i class="k-{name}"{fill}>{sign}</i>{escape(words)}</li>'

@@ -1,4 +1,4 @@
-"""One self-contained HTML page from run folders: tables with intervals, all episodes, drives side by side, curves."""
+"""One self-contained HTML page from run folders: tables with intervals, all episodes, rollouts, learning curves."""
 
 from __future__ import annotations
 
@@ -12,25 +12,34 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.stored import ScenarioKey, comparable, mismatch
-from drivax.evaluation.tables import CONFIDENCE, summarise
-from drivax.report.breakdowns import Tags, collision_section, strata_section, transfer_section
+from drivax.evaluation.episode_table import ScenarioKey
+from drivax.evaluation.pairing import comparable, mismatch
+from drivax.evaluation.tables import (
+    COLLISION_KINDS,
+    CONFIDENCE,
+    collisions_table,
+    differences_table,
+    headline,
+    metric_label,
+    metric_names,
+    ordered,
+    planners_table,
+    summarise,
+)
+from drivax.files import check_output, write_text
 from drivax.report.charts.curves import curve_sections
 from drivax.report.charts.distributions import distribution_charts
-from drivax.report.comparison import metric_names
-from drivax.report.episode_selection import Choice, choose
-from drivax.report.episodes import DrivenSet, drives_of
-from drivax.report.glossary import headline, ordered
-from drivax.report.html_tables import bounds, difference_table, explanations, number, percent, planner_table
-from drivax.report.loaded_runs import Evaluation, Training, read_runs
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, rollouts_of
 from drivax.report.pages.episode_list import EPISODE_LIST, episode_data
-from drivax.report.pages.page import asset, page, publish, refuse_page
-from drivax.report.pages.player import player_data, player_html, player_scripts
-from drivax.report.pictures.episode import pack_episode
+from drivax.report.pages.page import asset, facts_html, page, player_data, player_html, player_scripts
+from drivax.report.pictures.player_data import pack_episode
+from drivax.report.runs import Evaluation, Training, read_runs
+from drivax.report.table_files import Tags, strata_tables, transfer_tables
+from drivax.table import bounds, number, suffix
 
 EPISODES = 12
-#: A chosen episode and its data for the player.
-Packed = Sequence[tuple[Choice, Mapping[str, Any]]]
+#: Selected episodes and their data for the player.
+Packed = Sequence[tuple[EpisodeGroup, Mapping[str, Any]]]
 
 
 def write_report(
@@ -40,54 +49,51 @@ def write_report(
     episodes: int = EPISODES,
     overwrite: bool = False,
 ) -> Path:
-    """Write a report of evaluation and training runs; the last evaluation is the policy in question.
+    """Write a report of evaluation and training runs to the HTML file ``out``; the last evaluation is the policy.
 
     Args:
         runs: Run folders of ``drivax evaluate`` and ``drivax train``, in the order of the tables.
-        out: The HTML file to write; it appears when it is complete.
-        data: The scenario set that was driven, where it is not at the place that the policy's run names.
-        episodes: How many drives to show; 0 leaves out drives and tags and needs no scenario set.
+        out: The file; it appears when it is complete.
+        data: The scenario set of the evaluation, where it has moved.
+        episodes: Number of playable episodes; 0 leaves out rollouts and tags and needs no scenario set.
         overwrite: Replace an existing file.
 
-    Returns:
-        ``out``.
-
     Raises:
-        DataError: A run folder or the scenario set is missing, damaged, or not the one that was driven.
+        DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
         UsageError: ``out`` exists, or the arguments make no sense.
     """
-    refuse_page(out, overwrite)
+    check_output(out, overwrite)
     if episodes < 0:
         raise UsageError(f"cannot show {episodes} episodes", cure="give 0 or more")
     evaluations, trainings = read_runs(runs)
     packed: Packed = ()
     tags: Tags = {}
     if evaluations and episodes:
-        packed, tags = _from_the_set(evaluations, data, episodes)
-    publish(out, _page(evaluations, trainings, packed, tags))
+        packed, tags = _from_set(evaluations, data, episodes)
+    write_text(out, _page(evaluations, trainings, packed, tags))
     return out
 
 
-def _from_the_set(runs: Sequence[Evaluation], data: Path | None, count: int) -> tuple[Packed, Tags]:
-    """The chosen episodes with their data for the player, and the tags of all scenarios of the policy's set."""
-    driven = DrivenSet(runs[-1], data)
+def _from_set(runs: Sequence[Evaluation], data: Path | None, count: int) -> tuple[Packed, Tags]:
+    """Return the selected episodes with their data for the player, and the tags of all scenarios."""
+    scenarios = EvaluatedSet(runs[-1], data)
     packed = []
-    for choice in choose(runs, count):
-        scenario = driven.scenario((choice.dataset, choice.scenario_id))
-        title = f"{choice.scenario_id}: {choice.outcome}"
-        packed.append((choice, pack_episode(scenario, drives_of(runs, choice, scenario), title)))
-    return packed, driven.tags()
+    for group in choose(runs, count):
+        scenario = scenarios.scenario(group.key)
+        title = f"{group.scenario_id}: {group.outcome}"
+        packed.append((group, pack_episode(scenario, rollouts_of(runs, group, scenario), title)))
+    return packed, scenarios.tags()
 
 
 def _page(runs: Sequence[Evaluation], trainings: Sequence[Training], packed: Packed, tags: Tags) -> str:
     sections, data, scripts = [], [], []
     if runs:
-        sections += [_results(runs), _differences(runs), transfer_section(runs), collision_section(runs)]
-        sections += [strata_section(runs, tags), _distributions(runs), _episodes(runs, packed)]
-        played: dict[ScenarioKey, int] = {
-            (choice.dataset, choice.scenario_id): place for place, (choice, _) in enumerate(packed)
-        }
-        data += player_data([episode for _, episode in packed]) if packed else []
+        sections = [
+            _results(runs), _differences(runs), _transfer(runs), _collisions(runs),
+            _strata(runs, tags), _distributions(runs), _episodes(runs, packed),
+        ]  # fmt: skip
+        played: dict[ScenarioKey, int] = {group.key: place for place, (group, _) in enumerate(packed)}
+        data = player_data([episode for _, episode in packed]) if packed else []
         data.append(episode_data(runs, tags, played))
         scripts += [*(player_scripts() if packed else ()), asset("episode_table.js")]
     if trainings:
@@ -101,21 +107,19 @@ def _page(runs: Sequence[Evaluation], trainings: Sequence[Training], packed: Pac
 
 def _lead(runs: Sequence[Evaluation]) -> str:
     if not runs:
-        return "<p class=lead>Training runs only; evaluate one to see how it drives.</p>"
+        return "<p class=lead>Training runs only; evaluate a policy to see how it drives.</p>"
     policy = runs[-1]
     path = Path(str(policy.data.get("path", "its scenario set")))
-    where = escape(str(policy.data.get("name") or path.name))
-    words = {"success": "succeeds in", "accuracy": "drives without failure in"}
-    found = {name: summarise(policy, name) for name in words}
-    name = next((name for name in words if found[name].mean is not None), None)
-    if name is None:
-        return f"<p class=lead><b>{escape(policy.name)}</b> drove {policy.episodes} episodes of {where}.</p>"
-    interval = found[name]
-    share = number(interval.mean, "rate") + percent("rate")
-    return (
-        f"<p class=lead><b>{escape(policy.name)}</b> {words[name]} <b>{share}</b> ({bounds(interval, 'rate')}) of "
-        f"{interval.n} {'episode' if interval.n == 1 else 'episodes'} of {where}, {escape(policy.traffic)} traffic.</p>"
-    )
+    name, where = escape(policy.name), escape(str(policy.data.get("name") or path.name))
+    for metric, words in (("success", "succeeds in"), ("accuracy", "drives without failure in")):
+        interval = summarise(policy, metric)
+        if interval.mean is not None:
+            share = number(interval.mean, "rate") + suffix("rate")
+            return (
+                f"<p class=lead><b>{name}</b> {words} <b>{share}</b> ({bounds(interval, 'rate')}) of {interval.n} "
+                f"{'episode' if interval.n == 1 else 'episodes'} of {where}, {escape(policy.traffic)} traffic.</p>"
+            )
+    return f"<p class=lead><b>{name}</b>: {len(policy)} episodes of {where}.</p>"
 
 
 def _results(runs: Sequence[Evaluation]) -> str:
@@ -123,38 +127,39 @@ def _results(runs: Sequence[Evaluation]) -> str:
     first = _first(runs, names)
     rest = [name for name in ordered(names) if name not in first]
     more = (
-        f"<details><summary>{len(rest)} more metrics</summary>{planner_table(runs, rest)}</details>"
+        f"<details><summary>{len(rest)} more metrics</summary>{planners_table(runs, rest).html()}</details>"
         if rest
         else ""
     )
+    table = planners_table(runs, first).html() if first else ""
     return (
-        f"<section><h2>Results</h2>{_warning(runs)}{planner_table(runs, first) if first else ''}{more}<p><small>"
-        f"Mean, {CONFIDENCE:.0%} interval, and n, the number of episodes where the metric is defined; undefined "
-        "episodes are left out. The best mean is underlined, whether or not it is clearly best. A mean "
-        "leads to the episodes behind it. Intervals: Wilson's for rates (with the effective number of episodes "
-        "where some share a recording), a bootstrap over recordings otherwise.</small></p></section>"
+        f"<section><h2>Results</h2>{_warning(runs)}{table}{more}<p><small>Mean, {CONFIDENCE:.0%} interval, and n, the "
+        "number of episodes where the metric is defined; undefined episodes are left out. The best mean is "
+        "underlined, whether or not it is clearly best. Click a mean for its episodes. Intervals: Wilson's for rates "
+        "(with the effective number of episodes where some share a recording), a bootstrap over recordings "
+        "otherwise.</small></p></section>"
     )
 
 
 def _first(runs: Sequence[Evaluation], names: Sequence[str]) -> list[str]:
-    """The headline; with the crashes, where there were any."""
+    """Return the metrics of the first table: the headline, after crashes where there were any."""
     crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
     return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
 
 
 def _warning(runs: Sequence[Evaluation]) -> str:
-    """Which rows cannot be compared with the policy's, and why; empty where all can."""
+    """Return which rows cannot be compared with the policy's, and why; empty where all can."""
     policy = runs[-1]
     reasons = []
     for run in runs[:-1]:
-        driven, of = set(run.scenarios), set(policy.scenarios)
-        if found := mismatch(run, policy):
-            reasons.append(f"{run.name} and {policy.name} {found[0]}")
-        elif driven != of:
-            counts = f"{len(driven & of)} of {len(driven)} and {len(of)}"
+        scenarios, of = set(run.scenarios), set(policy.scenarios)
+        if unmatched := mismatch(run, policy):
+            reasons.append(f"{run.name} and {policy.name} {unmatched[0]}")
+        elif scenarios != of:
+            counts = f"{len(scenarios & of)} of {len(scenarios)} and {len(of)}"
             reasons.append(f"{run.name} and {policy.name} have {counts} scenarios in common")
-    told = "; ".join(map(escape, reasons))
-    return f"<p><b>Not all rows are comparable:</b> {told}.</p>" if told else ""
+    words = "; ".join(map(escape, reasons))
+    return f"<p><b>Not all rows are comparable:</b> {words}.</p>" if words else ""
 
 
 def _differences(runs: Sequence[Evaluation]) -> str:
@@ -162,30 +167,81 @@ def _differences(runs: Sequence[Evaluation]) -> str:
     names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
     if not others or not names:
         return ""
+    table = differences_table(policy, others, names).html()
     return (
-        f"<section><h2>{escape(policy.name)} against the others</h2>{difference_table(policy, others, names)}<p><small>"
-        "Mean of the differences, scenario by scenario, over those where both are defined (n pairs), with a "
-        f"{CONFIDENCE:.0%} bootstrap interval over recordings. “Better” and “worse” are said where the interval leaves "
-        "out zero; it is not widened for the number of comparisons. “All alike”: no "
-        "pair differs from the next, so that a bootstrap cannot tell how sure the mean is.</small></p></section>"
+        f"<section><h2>{escape(policy.name)} against the others</h2>{table}<p><small>Mean of the differences, scenario "
+        f"by scenario, over those where both are defined (n pairs), with a {CONFIDENCE:.0%} bootstrap interval over "
+        "recordings. “Better” and “worse”: the interval excludes zero; it is not widened for the number of "
+        "comparisons. “All equal”: no pair differs from the next, so that a bootstrap has no width."
+        "</small></p></section>"
+    )
+
+
+def _transfer(runs: Sequence[Evaluation]) -> str:
+    """Return the results by training and evaluation data; empty where all runs share one set."""
+    tables = "".join(
+        f"<h3>{escape(metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
+        for table in transfer_tables(runs)
+    )
+    return (
+        f"<section><h2>Transfer</h2>{tables}<p><small>Rows: planners and their training data (– where nothing was "
+        "trained, or the run does not say). Columns: evaluation data. Sets differ in difficulty: compare along a "
+        "column.</small></p></section>"
+        if tables
+        else ""
+    )
+
+
+def _collisions(runs: Sequence[Evaluation]) -> str:
+    """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
+    table = collisions_table(runs)
+    if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
+        return ""
+    meanings = "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(meaning[:1].upper() + meaning[1:])}.</dd></div>"
+        for name, meaning in COLLISION_KINDS.values()
+    )
+    total = ", ".join(
+        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
+        for run in runs
+        if "collision_type" in run.metrics
+    )
+    return (
+        f"<section><h2>Kinds of collision</h2><p>Episodes with a collision: {total}.</p>{table.html()}"
+        f"<dl class=metrics>{meanings}</dl><p><small>{escape(table.caption)} (Wilson's).</small></p></section>"
+    )
+
+
+def _strata(runs: Sequence[Evaluation], tags: Tags) -> str:
+    """Return the results by kind of scenario; empty without tags."""
+    tables = "".join(
+        f"<details{'' if place else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
+        f"{table.html()}</details>"
+        for place, table in enumerate(strata_tables(runs, tags))
+    )
+    return (
+        f"<section><h2>By kind of scenario</h2>{tables}<p><small>Tags describe the log. Small strata have wide "
+        "intervals; of many cells, some stand out by chance.</small></p></section>"
+        if tables
+        else ""
     )
 
 
 def _distributions(runs: Sequence[Evaluation]) -> str:
     charts = distribution_charts(runs)
     return (
-        f"<section><h2>Distributions</h2>{charts}<p><small>The height of a line at a value is the share of episodes "
-        "that lie at or below it; undefined ones are left out.</small></p></section>"
+        f"<section><h2>Distributions</h2>{charts}<p><small>The height of a line at a value is the share of episodes at "
+        "or below it; undefined ones are left out.</small></p></section>"
         if charts
         else ""
     )
 
 
 def _episodes(runs: Sequence[Evaluation], packed: Packed) -> str:
-    told = "▶ marks those that play below." if packed else "Drives and tags were left out of this page."
+    note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
     return (
         f"<section id=episodes><h2>Episodes</h2><p>All episodes, worst first: the gravest kind of failure, then the "
-        f"lowest score. A number in the tables above leads to the episodes behind it. {told}</p>{EPISODE_LIST}"
+        f"lowest score. Click a number in the tables above for its episodes. {note}</p>{EPISODE_LIST}"
         f"{_player(runs, packed)}</section>"
     )
 
@@ -195,21 +251,22 @@ def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
         return ""
     buttons = "".join(
         f"<button type=button data-episode aria-pressed=false>"
-        f'<span class="{"good" if choice.outcome == "success" else "bad"}">{escape(choice.outcome)}</span>'
-        f"<small>{escape(choice.scenario_id)}</small></button>"
-        for choice, _ in packed
+        f'<span class="{"good" if group.outcome == "success" else "bad"}">{escape(group.outcome)}</span>'
+        f"<small>{escape(group.scenario_id)}</small></button>"
+        for group, _ in packed
     )
+    policy = escape(runs[-1].name)
     shown = [run for run in runs if comparable(run, runs[-1])]
     caution = (
-        f"<p><b>Other agents are drawn as they moved around {escape(runs[-1].name)};</b> around the others they "
-        "reacted otherwise.</p>"
+        f"<p><b>Other agents are drawn as they moved around {policy};</b> around the others they reacted "
+        "differently.</p>"
         if len(shown) > 1 and runs[-1].traffic != "log"
         else ""
     )
     return (
-        f"<h3>Drives</h3><p>Chosen by rule: failures of {escape(runs[-1].name)} first, each kind in turn, then "
-        f"successes. All planners that are shown start from the same scene at the same time.</p>{caution}"
-        f"<div class=picker role=group aria-label=Drives>{buttons}</div><h3 data-control=title></h3>{player_html()}"
+        f"<h3>Rollouts</h3><p>Selected by rule: failures of {policy} first, each kind in turn, then successes. All "
+        f"planners start from the same state at the same time.</p>{caution}"
+        f"<div class=picker role=group aria-label=Rollouts>{buttons}</div><h3 data-control=title></h3>{player_html()}"
     )
 
 
@@ -219,34 +276,34 @@ def _meaning(runs: Sequence[Evaluation]) -> str:
     )
 
 
+def explanations(metrics: Sequence[str], runs: Sequence[Evaluation]) -> str:
+    """Return a list that explains each known metric in one line."""
+    labels = [label for metric in metrics if (label := metric_label(metric, runs)).explanation]
+    items = "".join(
+        f"<div><dt>{escape(label.heading)}</dt><dd>{escape(label.explanation)}</dd></div>" for label in labels
+    )
+    return f"<dl class=metrics>{items}</dl>"
+
+
 def _origin(runs: Sequence[Evaluation | Training]) -> str:
-    """Where the numbers come from: commands, data, versions and the whole of every ``run.json``."""
+    """Return where the numbers come from: commands, data, versions and every ``run.json``."""
     rows = []
     for run in runs:
-        about = run.about
         data = run.data if isinstance(run, Evaluation) else {}
-        versions = about.get("versions")
-        facts = {
-            "command": _words(about.get("command")),
-            "data": f"{data.get('path', '')} {str(data.get('hash') or '')[:12]}".strip(),
-            "versions": ", ".join(f"{k} {v}" for k, v in versions.items())
-            if isinstance(versions, dict)
-            else "",
-        }
-        cells = "".join(f"<td>{escape(text) or '–'}</td>" for text in facts.values())
-        rows.append(f"<tr><th scope=row>{escape(run.name)}</th>{cells}</tr>")
-    whole = "".join(
-        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.about), indent=1, ensure_ascii=False))}</pre>"
+        command, versions = run.info.get("command"), run.info.get("versions")
+        texts = (
+            " ".join(map(str, command)) if isinstance(command, list) else str(command or ""),
+            f"{data.get('path', '')} {str(data.get('hash') or '')[:12]}".strip(),
+            ", ".join(f"{k} {v}" for k, v in versions.items()) if isinstance(versions, dict) else "",
+        )
+        rows.append((run.name, [text or "–" for text in texts]))
+    settings = "".join(
+        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.info), indent=1, ensure_ascii=False))}</pre>"
         for run in runs
     )
-    head = "<thead><tr><th>run</th><th>command</th><th>data</th><th>versions</th></tr></thead>"
     return (
-        f"<section><h2>How this was made</h2><div class=scroll tabindex=0><table class=facts>{head}"
-        f"<tbody>{''.join(rows)}</tbody></table></div><details><summary>all settings</summary>{whole}</details>"
-        f"<p><small>drivax {escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run."
-        "</small></p></section>"
+        f"<section><h2>How this was made</h2>{facts_html(['run', 'command', 'data', 'versions'], rows)}"
+        f"<details><summary>all settings</summary>{settings}</details><p><small>drivax "
+        f"{escape(metadata.version('drivax'))}. Every number comes from the episodes.csv of its run.</small></p>"
+        "</section>"
     )
-
-
-def _words(command: Any) -> str:
-    return " ".join(map(str, command)) if isinstance(command, list) else str(command or "")

@@ -1,7 +1,7 @@
 """Colours of maps, agents and lights, the same in pictures and in the player.
 
-The hues are those of Okabe and Ito, Color Universal Design, 2008, told apart with any kind of colour vision; what
-matters has a shape of its own besides (the ego's arrow, crosses at failures, thick bars for red lights).
+The hues are those of Okabe and Ito, Color Universal Design, 2008, which differ with any kind of colour vision;
+important things also have a shape of their own (the ego's arrow, crosses at failures, thick bars for red lights).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 
 @dataclass(frozen=True)
 class Stroke:
-    """How a line of a chart is drawn.
+    """Style of a line in a chart.
 
     Attributes:
-        colour: Of the line.
-        dash: Lengths of dash and gap, as SVG has them; empty for an unbroken line.
+        colour: Its colour.
+        dash: Lengths of dash and gap, as SVG has them; empty for a solid line.
     """
 
     colour: str
@@ -32,24 +32,24 @@ class Stroke:
 
     @property
     def svg(self) -> str:
-        """Attributes of an element of SVG."""
+        """Attributes of an SVG element."""
         return f'stroke="{self.colour}"' + (f' stroke-dasharray="{self.dash}"' if self.dash else "")
 
     @property
     def key(self) -> str:
-        """CSS of the background of its key in a legend."""
+        """CSS background of its key in a legend."""
         if not self.dash:
             return self.colour
         on, off = map(int, self.dash.split())
         return f"repeating-linear-gradient(90deg,{self.colour} 0 {on}px,transparent {on}px {on + off}px)"
 
 
-#: Lines of charts, in order: where colours run out they come again dashed, then dotted.
+#: Lines of charts, in order: solid, then dashed, then dotted.
 STROKES = tuple(Stroke(colour, dash) for dash in ("", "6 3", "2 3") for colour in SERIES)
 
 
 def stroke(place: int) -> Stroke:
-    """How the line at a place is drawn."""
+    """Return the style of the line at a place."""
     return STROKES[place % len(STROKES)]
 
 
@@ -73,7 +73,7 @@ DARK = MappingProxyType(
 )  # fmt: skip
 THEMES = MappingProxyType({"light": LIGHT, "dark": DARK})
 
-#: What the legend lists: name of the colour and words.
+#: The legend: name of the colour and words.
 LEGEND = (
     ("ego", "ego"), ("log", "ego as logged"), ("route", "route"), ("goal", "goal"), ("vehicle", "vehicle"),
     ("parked", "standing still"), ("pedestrian", "pedestrian"), ("cyclist", "cyclist"), ("other", "other"),
@@ -82,41 +82,39 @@ LEGEND = (
 )  # fmt: skip
 
 
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return red, green and blue of a hex colour, 0 to 255."""
+    red, green, blue = (int(colour[at : at + 2], 16) for at in (1, 3, 5))
+    return red, green, blue
+
+
+_AGENTS = {
+    AgentKind.VEHICLE: "vehicle", AgentKind.PEDESTRIAN: "pedestrian", AgentKind.CYCLIST: "cyclist",
+    AgentKind.STATIC: "parked",
+}  # fmt: skip
+_LIGHTS = {
+    LightState.ARROW_STOP: "red", LightState.STOP: "red", LightState.FLASHING_STOP: "red",
+    LightState.ARROW_CAUTION: "amber", LightState.CAUTION: "amber", LightState.FLASHING_CAUTION: "amber",
+    LightState.ARROW_GO: "green", LightState.GO: "green",
+}  # fmt: skip
+_ROADS = {
+    RoadKind.LANE_UNDEFINED: "lane", RoadKind.LANE_FREEWAY: "lane", RoadKind.LANE_SURFACE: "lane",
+    RoadKind.LANE_BIKE: "bike", RoadKind.EDGE_UNKNOWN: "edge", RoadKind.EDGE_BOUNDARY: "edge",
+    RoadKind.EDGE_MEDIAN: "edge", RoadKind.CROSSWALK: "crosswalk", RoadKind.SPEED_BUMP: "crosswalk",
+    RoadKind.DRIVEWAY: "crosswalk",
+}  # fmt: skip
+
+
 def agent_colour(kind: int) -> str:
-    """Name of the colour of an agent of this kind."""
-    names = {
-        AgentKind.VEHICLE: "vehicle",
-        AgentKind.PEDESTRIAN: "pedestrian",
-        AgentKind.CYCLIST: "cyclist",
-        AgentKind.STATIC: "parked",
-    }
-    return names.get(AgentKind(kind), "other")
+    """Return the colour name of an agent of this kind."""
+    return _AGENTS.get(AgentKind(kind), "other")
 
 
 def light_colour(state: int) -> str:
-    """Name of the colour of a light in this state; a light that nobody observed has the unknown one."""
-    names = {
-        LightState.ARROW_STOP: "red",
-        LightState.STOP: "red",
-        LightState.FLASHING_STOP: "red",
-        LightState.ARROW_CAUTION: "amber",
-        LightState.CAUTION: "amber",
-        LightState.FLASHING_CAUTION: "amber",
-        LightState.ARROW_GO: "green",
-        LightState.GO: "green",
-    }
-    return names.get(LightState(state), "unknown")
+    """Return the colour name of a light in this state; an unobserved light has the unknown one."""
+    return _LIGHTS.get(LightState(state), "unknown")
 
 
 def road_layer(kind: int) -> str:
-    """Layer in which a map feature of this kind is drawn: lane, bike, line, edge, crosswalk or other."""
-    road = RoadKind(kind)
-    if road in (RoadKind.LANE_UNDEFINED, RoadKind.LANE_FREEWAY, RoadKind.LANE_SURFACE):
-        return "lane"
-    if road is RoadKind.LANE_BIKE:
-        return "bike"
-    if road in (RoadKind.EDGE_UNKNOWN, RoadKind.EDGE_BOUNDARY, RoadKind.EDGE_MEDIAN):
-        return "edge"
-    if road in (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP, RoadKind.DRIVEWAY):
-        return "crosswalk"
-    return "line"
+    """Return the layer of a map feature of this kind: lane, bike, line, edge or crosswalk."""
+    return _ROADS.get(RoadKind(kind), "line")

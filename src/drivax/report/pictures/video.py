@@ -1,28 +1,27 @@
-"""Drives as mp4 files: one planner each, or all of them side by side."""
+"""Rollouts as mp4 files: one planner each, or all of them side by side."""
 
 from __future__ import annotations
 
-import difflib
-import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivax.errors import UsageError
-from drivax.report.episode_selection import Choice, ranked
-from drivax.report.episodes import DrivenSet, drives_of
-from drivax.report.loaded_runs import Evaluation, read_runs
-from drivax.report.pictures.episode import Drive, as_driven
+from drivax.errors import UsageError, did_you_mean, missing_package
+from drivax.files import atomic_write, check_output
+from drivax.report.episodes import EpisodeGroup, EvaluatedSet, ranked, rollouts_of
+from drivax.report.pictures.drawing import Rollout, with_traffic_of
 from drivax.report.pictures.frames import Canvas, Picture, Scenery, draw_frame, legend_strip
-from drivax.report.pictures.palette import THEMES
+from drivax.report.pictures.palette import THEMES, rgb
+from drivax.report.runs import Evaluation, read_evaluations
 from drivax.scenario.schema import Scenario
 
 #: Side of a picture in pixels: of one planner alone, of several side by side.
-ALONE, BESIDE = 720, 480
+ALONE, SIDE_BY_SIDE = 720, 480
 #: Pictures in a row at most.
 _ACROSS = 3
 
@@ -37,73 +36,61 @@ def write_videos(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Write drives of evaluation runs as mp4 files, in real time at the scenario's own rate.
+    """Write episodes of evaluation runs as mp4 files, in real time; returns the files, worst episode first.
 
     Args:
-        runs: Run folders; the last evaluation is the policy, whose drives are ranked and, alone, drawn.
+        runs: Run folders; the last evaluation is the policy, whose episodes are ranked and, alone, drawn.
         out: Folder for the files; each appears when it is complete.
         which: ``worst:N``, ``all``, or the id of a scenario.
-        side_by_side: Draw every run that drove the scenario, in one picture.
-        data: The scenario set that was driven, where it has moved.
+        side_by_side: Draw every run with an episode of the scenario in one picture.
+        data: The scenario set of the evaluation, where it has moved.
         theme: ``light`` or ``dark``.
         overwrite: Replace existing files.
         progress: Called with (done, total) after every file.
 
-    Returns:
-        The files, in the order of the ranking.
-
     Raises:
-        DataError: A run folder or the scenario set is missing, damaged, or not the one that was driven.
-        UsageError: A file exists, there is no such scenario, or what writes videos is not installed.
+        DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
+        UsageError: A file exists, there is no such scenario, or a package for videos is not installed.
     """
-    evaluations, _ = read_runs(runs)
-    if not evaluations:
-        raise UsageError("no evaluation was given", cure="name run folders of drivax evaluate")
-    chosen = _chosen(evaluations, which)
+    evaluations = read_evaluations(runs)
+    groups = _selected(evaluations, which)
     if not side_by_side:
-        evaluations, chosen = evaluations[-1:], [_alone(choice) for choice in chosen]
-    files = _files(out, chosen, ranked=len(chosen) > 1 or which == "all" or which.startswith("worst:"))
+        evaluations = evaluations[-1:]
+        groups = [replace(group, rows=group.rows[-1:]) for group in groups]
+    files = _files(out, groups, ranked=len(groups) > 1 or which == "all" or which.startswith("worst:"))
     for file in files:
-        if file.exists() and not overwrite:
-            raise UsageError("exists already", file=file, cure="choose another folder or pass --overwrite")
-    driven = DrivenSet(evaluations[-1], data)
-    out.mkdir(parents=True, exist_ok=True)
-    for done, (file, choice) in enumerate(zip(files, chosen, strict=True), start=1):
-        scenario = driven.scenario((choice.dataset, choice.scenario_id))
-        drives = drives_of(evaluations, choice, scenario)
-        encode(file, frames(scenario, drives, theme), dt_s=float(scenario.dt_s))
+        check_output(file, overwrite)
+    scenarios = EvaluatedSet(evaluations[-1], data)
+    for done, (file, group) in enumerate(zip(files, groups, strict=True), start=1):
+        scenario = scenarios.scenario(group.key)
+        encode(file, frames(scenario, rollouts_of(evaluations, group, scenario), theme), float(scenario.dt_s))
         if progress is not None:
             progress(done, len(files))
     return files
 
 
-def _chosen(runs: Sequence[Evaluation], which: str) -> list[Choice]:
-    """What is asked for, worst first."""
-    choices = ranked(runs)
+def _selected(runs: Sequence[Evaluation], which: str) -> list[EpisodeGroup]:
+    """Return the requested episodes, worst first."""
+    groups = ranked(runs)
     if which == "all":
-        return choices
+        return groups
     if which.startswith("worst:"):
         count = which.removeprefix("worst:")
         if not count.isdecimal() or int(count) < 1:
             raise UsageError(
-                f"{which!r} is no selection", cure="write worst:N with N at least 1, as worst:20"
+                f"{which!r} is not a selection", cure="write worst:N with N at least 1, as worst:20"
             )
-        return choices[: int(count)]
-    found = [choice for choice in choices if choice.scenario_id == which]
-    if not found:
-        near = difflib.get_close_matches(which, [choice.scenario_id for choice in choices], n=1)
-        cure = f"did you mean {near[0]!r}?" if near else "write worst:N, all, or an id of its episodes.csv"
-        raise UsageError(f"no drive of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
-    return found
+        return groups[: int(count)]
+    if requested := [group for group in groups if group.scenario_id == which]:
+        return requested
+    near = did_you_mean(which, [group.scenario_id for group in groups])
+    cure = near if near.startswith("did") else "write worst:N, all, or an id of its episodes.csv"
+    raise UsageError(f"no episode of scenario {which!r} is stored", file=runs[-1].folder, cure=cure)
 
 
-def _alone(choice: Choice) -> Choice:
-    return Choice(choice.dataset, choice.scenario_id, choice.rows[-1:], choice.outcome)
-
-
-def _files(out: Path, chosen: Sequence[Choice], ranked: bool) -> list[Path]:
-    """Names of the files: the scenario's id, with its rank before it where there is a ranking."""
-    names = [re.sub(r"[^\w.+-]", "_", choice.scenario_id) for choice in chosen]
+def _files(out: Path, groups: Sequence[EpisodeGroup], ranked: bool) -> list[Path]:
+    """Return the names of the files: the scenario's id, after its rank in a ranking."""
+    names = [re.sub(r"[^\w.+-]", "_", group.scenario_id) for group in groups]
     digits = len(str(len(names)))
     return [
         out / (f"{place:0{digits}d}-{name}.mp4" if ranked else f"{name}.mp4")
@@ -111,35 +98,31 @@ def _files(out: Path, chosen: Sequence[Choice], ranked: bool) -> list[Path]:
     ]
 
 
-def frames(scenario: Scenario, drives: Sequence[Drive], theme: str = "light") -> Iterator[Picture]:
-    """Pictures of all drives at every step from where the first planner takes over, with the legend below.
-
-    Args:
-        scenario: The scenario.
-        drives: What each planner did.
-        theme: ``light`` or ``dark``.
-    """
-    side = ALONE if len(drives) == 1 else BESIDE
+def frames(scenario: Scenario, rollouts: Sequence[Rollout], theme: str = "light") -> Iterator[Picture]:
+    """Yield pictures of all rollouts at every step from the first takeover on, with the legend below."""
+    side = ALONE if len(rollouts) == 1 else SIDE_BY_SIDE
     canvas = Canvas(side, side, theme)
-    recorded = Scenery(canvas, scenario, drives)
+    recorded = Scenery(canvas, scenario, rollouts)
     sceneries = [
-        recorded if drive.others is None else Scenery(canvas, as_driven(scenario, drive), drives)
-        for drive in drives
+        recorded if rollout.others is None else Scenery(canvas, with_traffic_of(rollout, scenario), rollouts)
+        for rollout in rollouts
     ]
-    across = len(drives) if len(drives) <= _ACROSS else -(-len(drives) // (-(-len(drives) // _ACROSS)))
+    across = (
+        len(rollouts) if len(rollouts) <= _ACROSS else -(-len(rollouts) // (-(-len(rollouts) // _ACROSS)))
+    )
     legend = legend_strip(across * side, theme)
-    for step in range(min(drive.start for drive in drives), int(scenario.steps)):
+    for step in range(min(rollout.start for rollout in rollouts), int(scenario.steps)):
         panes = [
-            draw_frame(scenery, drive, step, float(scenario.dt_s))
-            for scenery, drive in zip(sceneries, drives, strict=True)
+            draw_frame(scenery, rollout, step, float(scenario.dt_s))
+            for scenery, rollout in zip(sceneries, rollouts, strict=True)
         ]
         for pane in panes if across > 1 else ():
-            pane[:, -1, :3] = np.array([int(THEMES[theme]["lane"][at : at + 2], 16) for at in (1, 3, 5)])
+            pane[:, -1, :3] = rgb(THEMES[theme]["lane"])
         yield np.concatenate((_tiled(panes, across), legend))
 
 
 def _tiled(panes: Sequence[Picture], across: int) -> Picture:
-    """Pictures of one size in rows, the last one filled up with empty ones."""
+    """Return pictures of one size in rows, the last row filled with empty ones."""
     missing = -len(panes) % across
     filled = [*panes, *(np.full_like(panes[0], panes[0][-1, -1]) for _ in range(missing))]
     rows = [np.concatenate(filled[at : at + across], axis=1) for at in range(0, len(filled), across)]
@@ -152,29 +135,27 @@ def encode(file: Path, pictures: Iterator[Picture], dt_s: float) -> None:
     Args:
         file: The mp4 file.
         pictures: At least one, all of one even width and height.
-        dt_s: Seconds from one to the next.
+        dt_s: Seconds between pictures.
 
     Raises:
         UsageError: PyAV is not installed.
     """
     try:
         import av
-    except ModuleNotFoundError as error:
-        raise UsageError("PyAV is not installed", cure="pip install 'drivax[show]'") from error
-    partial = file.with_name(f".{file.name}.partial-{os.getpid()}")
-    try:
-        with av.open(partial, "w", format="mp4", options={"movflags": "+faststart"}) as container:
-            stream: Any = None
-            for picture in pictures:
-                if stream is None:
-                    rate = Fraction(1 / dt_s).limit_denominator(20)
-                    stream = container.add_stream(
-                        "libx264", rate=rate, options={"preset": "veryfast", "crf": "23"}
-                    )
-                    stream.height, stream.width = picture.shape[:2]
-                    stream.pix_fmt = "yuv420p"
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgba")))
-            container.mux(stream.encode(None))
-        partial.replace(file)
-    finally:
-        partial.unlink(missing_ok=True)
+    except ImportError as error:
+        raise missing_package(error) or error from error
+    faststart = {"movflags": "+faststart"}
+    with (
+        atomic_write(file) as target,
+        av.open(target.name, "w", format="mp4", options=faststart) as container,
+    ):
+        stream: Any = None
+        for picture in pictures:
+            if stream is None:
+                rate = Fraction(1 / dt_s).limit_denominator(20)
+                options = {"preset": "veryfast", "crf": "23"}
+                stream = container.add_stream("libx264", rate=rate, options=options)
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgba")))
+        container.mux(stream.encode(None))

@@ -1,1 +1,5 @@
-"""Scenarios on the device: stacked arrays, and the map queries on them."""
+"""Stacked scenarios on the device, and queries of their maps."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,8 +1,7 @@
-"""From which lane to which a car passes: lane changes and merges, step by step.
+"""Lane changes and merges of a car, step by step.
 
-A car is on a strand of lanes (``scenario.build.lane_codes``) until its centre is 0.3 m nearer to the middle of
-another than
-the line between them, so that one that drives along the line does not change lanes with every step.
+A car stays on a strand of lanes (``scenario.bank.strands``) until its centre is 0.3 m beyond the line between the
+strand and another, so that a car that drives along the line does not change lanes at every step.
 """
 
 from __future__ import annotations
@@ -19,24 +18,23 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
 
-#: A passage counts once the centre is so far beyond the line between two lanes, m.
+#: Distance beyond the line between two lanes at which a passage counts, m.
 BEYOND_M = 0.3
-#: Lanes run side by side where their centres are so far apart, m; nearer ones fork or join there.
+#: Least distance between the centres of parallel lanes, m; nearer lanes fork or join.
 SIDE_BY_SIDE_M = 2.0
-#: Leaving a lane this near to where it ends or joins another is a merge, m.
+#: Largest distance to the end of a lane at which leaving it is a merge, m.
 MERGE_M = 100.0
 _FAR = 1e9
 
 
 @record
 class Passage:
-    """Where a car is among the strands of lanes now, and what brought it there.
+    """Strand of a car, and whether it changed lanes or merged at this step.
 
     Attributes:
-        strand: The strand it is on, -1 where no lane that runs its way is near.
-        changed: It came at this step from a strand that runs side by side with this one, the same way.
-        merged: It came at this step from a strand that ends, or joins this one, within 100 m: by a lane change or along
-            the lanes.
+        strand: Current strand, -1 without a near lane in its direction.
+        changed: The previous strand is parallel to this one, in the same direction.
+        merged: The previous strand ends, or joins this one, within 100 m.
     """
 
     strand: Int[Array, ""]
@@ -48,16 +46,7 @@ def lane_passage(
     bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
     z: Float[Array, ""], before: Any,
 ) -> Passage:  # fmt: skip
-    """The passage of one step.
-
-    Args:
-        bank: The scenarios.
-        index: Row of the bank.
-        xy: The car's centre, m.
-        heading: Cosine and sine of its heading.
-        z: Height of the ground, m.
-        before: The strand that it was on a step ago, -1 for none (then it is on that of the nearest lane).
-    """
+    """Return the passage of a step; ``z`` is the height of the ground, ``before`` the previous strand or -1."""
     lane, squared, side = aligned_lanes(bank, index, xy, heading, z)
     codes = bank.lane_codes[index]
     strand = jnp.where(lane >= 0, codes[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
@@ -68,10 +57,10 @@ def lane_passage(
     stays = kept & (root(own[held]) - root(squared[best]) <= 2 * BEYOND_M)
     now = jnp.where(stays, before, jnp.where(near, strand[best], -1))
     old, new = codes[lane[held]], codes[lane[best]]
-    beside = (new[StrandColumn.LEFT] == before) | (new[StrandColumn.RIGHT] == before)
-    beside = (beside | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & kept
+    adjacent = (new[StrandColumn.LEFT] == before) | (new[StrandColumn.RIGHT] == before)
+    adjacent = (adjacent | (old[StrandColumn.LEFT] == now) | (old[StrandColumn.RIGHT] == now)) & kept
     passed = (before >= 0) & (now >= 0) & (now != before)
-    changed = passed & beside & (jnp.abs(side[held] - side[best]) >= SIDE_BY_SIDE_M)
+    changed = passed & adjacent & (jnp.abs(side[held] - side[best]) >= SIDE_BY_SIDE_M)
     left = codes[before]
     ending = norm(xy - left[StrandColumn.END]) <= MERGE_M
     merged = passed & ending & (changed | (left[StrandColumn.ONTO] == now))

@@ -1,11 +1,13 @@
-"""The only map tests: pure functions of a pose, unbatched, for real and hypothetical poses alike.
+"""Map queries: pure, unbatched functions of a pose.
 
-Each looks up the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly inside them. What is
-beyond the cut-off of a test (edges 3 m from a point, lanes 4 m) never changes its result, so no result depends on the
-grid; ``tests/scenario/test_queries.py`` compares with brute force. Things more than 3 m above or below are ignored.
+A query reads the 3 x 3 grid cells around the pose as three contiguous runs and measures exactly inside them. Segments
+beyond the cut-off of a query (edges 3 m from a point, lanes 4 m) never change its result, so no result depends on the
+grid; ``tests/scenario/test_queries.py`` compares with brute force. Segments more than 3 m above or below are ignored.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,22 +15,95 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import root
 from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn
-from drivax.scenario.bank.nearby import edges_around, lanes_around, to_segments
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.bank.smallest import first_smallest
-from drivax.scenario.build.sides import NOT_DRIVABLE, SPLIT
+from drivax.scenario.build.grid import NOT_DRIVABLE, SPLIT
 from drivax.scenario.record import record
 
 EDGE_CUTOFF_M = 3.0
 LANE_CUTOFF_M = 4.0
 LEVEL_M = 3.0
-#: A corner may be this far beyond an edge before it counts as off the road (semantics, ``offroad``).
+#: Distance beyond an edge from which a corner counts as off the road (semantics, ``offroad``).
 OFFROAD_TOLERANCE_M = 0.3
-#: A lane's border is fuzzy by this much (semantics, ``lane_straddle``).
+#: Tolerance of lane borders (semantics, ``lane_straddle``).
 LANE_MARGIN_M = 0.2
-#: A car follows a lane whose centre is this near, m.
+#: Largest distance to the centre of a followed lane, m.
 _FOLLOWED_M = 2.5
 _FAR = 1e9
+_WINDOW = 40
+_WINDOW_BEHIND = 6
+
+
+def left_of_edges(
+    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
+    z: Float[Array, ""],
+) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
+    """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
+
+    At a vertex two segments are equally near; the segment whose line is further away decides. Points must lie within 5
+    m of ``centre``, whose cells are read.
+
+    Returns:
+        Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
+    """
+    rows, inside = edges_around(bank, index, centre)
+    squared, side = to_segments(rows, points)
+    squared = jnp.where(inside & _level(rows[EdgeRow.Z], z), squared, _FAR)
+    nearest = squared.min(axis=1)
+    tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
+    left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
+    right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
+    distance = root(nearest)
+    return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
+
+
+def edges_around(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]
+) -> tuple[Float[Array, "5 K"], Bool[Array, " K"]]:
+    """Road edges (:class:`EdgeRow`) in the 3 x 3 cells around a point, and the mask of valid ones."""
+    return _around(bank, bank.grid_edge, bank.edges, bank.edge_run, index, xy)
+
+
+def lanes_around(
+    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]
+) -> tuple[Float[Array, "8 K"], Bool[Array, " K"]]:
+    """Car lanes (:class:`LaneRow`) in the 3 x 3 cells around a point, and the mask of valid ones."""
+    return _around(bank, bank.grid_lane, bank.lanes, bank.lane_run, index, xy)
+
+
+def _around(
+    bank: ScenarioBank, start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int,
+    index: Int[Array, ""], xy: Float[Array, " 2"],
+) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
+    """Read three contiguous runs of fixed length; a grid of a single cell is read whole."""
+    grid = round((start.shape[1] - 1) ** 0.5)
+    if grid == 1:
+        return rows[index], jnp.arange(rows.shape[2]) < start[index, 1]
+    # Clamped so that the 3 x 3 block lies in the grid.
+    cell = jnp.floor((xy - bank.grid_origin[index]) / bank.cell_m).astype(jnp.int32)
+    cell = jnp.clip(cell, 1, grid - 2)
+    features, inside = [], []
+    for below in (-1, 0, 1):
+        first = (cell[1] + below) * grid + cell[0] - 1
+        bounds = jax.lax.dynamic_slice(start, (index, first), (1, 4))[0].astype(jnp.int32)
+        block = jax.lax.dynamic_slice(rows, (index, jnp.int32(0), bounds[0]), (1, rows.shape[1], run))[0]
+        features.append(block)
+        inside.append(jnp.arange(run) < bounds[3] - bounds[0])
+    # Read once: without the barrier XLA repeats the reads in every operation that uses them.
+    return jax.lax.optimization_barrier((jnp.concatenate(features, axis=1), jnp.concatenate(inside)))
+
+
+def to_segments(
+    rows: Float[Array, "F K"] | Sequence[Float[Array, " K"]], points: Float[Array, "P 2"]
+) -> tuple[Float[Array, "P K"], Float[Array, "P K"]]:
+    """Squared distance of each point to each segment, and signed distance to its line (positive: left of it)."""
+    ax, ay, bx, by = (rows[k] for k in (EdgeRow.X_A, EdgeRow.Y_A, EdgeRow.X_B, EdgeRow.Y_B))
+    ux, uy = bx - ax, by - ay
+    wx, wy = points[:, 0:1] - ax, points[:, 1:2] - ay
+    squared = jnp.maximum(ux * ux + uy * uy, 1e-9)
+    along = jnp.clip((wx * ux + wy * uy) / squared, 0.0, 1.0)
+    dx, dy = wx - along * ux, wy - along * uy
+    return dx * dx + dy * dy, (ux * wy - uy * wx) * jax.lax.rsqrt(squared)
 
 
 def _level(height: Float[Array, " K"], z: Float[Array, ""]) -> Bool[Array, " K"]:
@@ -47,44 +122,21 @@ def _runs_along(rows: Float[Array, "F K"], heading: Float[Array, " 2"]) -> Bool[
     return ux * heading[0] + uy * heading[1] > 0.0
 
 
-def left_of_edges(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
-    z: Float[Array, ""],
-) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
-    """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
-
-    At a vertex two segments are equally near; the one whose line is further away has the right side (the other one's
-    line passes through the wrong wedge). Points must lie within 5 m of ``centre``, whose cells are read.
-
-    Returns:
-        Signed distances, and whether an edge of this level lies within the cut-off (the distance is valid only then).
-    """
-    rows, inside = edges_around(bank, index, centre)
-    squared, side = to_segments(rows, points)
-    squared = jnp.where(inside & _level(rows[EdgeRow.Z], z), squared, _FAR)
-    nearest = squared.min(axis=1)
-    tied = squared <= (nearest + 1e-4 + 1e-4 * nearest)[:, None]
-    left = jnp.max(jnp.where(tied, side, -_FAR), axis=1)
-    right = jnp.max(jnp.where(tied, -side, -_FAR), axis=1)
-    distance = root(nearest)
-    return jnp.where(left >= right, distance, -distance), nearest <= EDGE_CUTOFF_M**2
-
-
 @record
 class LaneHits:
-    """What the lanes around a box say about it; booleans and distances of its centre unless said otherwise.
+    """Lanes around a box; values at its centre unless stated otherwise.
 
     Attributes:
-        near: A lane centre lies within the cut-off of the box's centre.
-        points_near: The same for each of the points (box corners).
-        on_corridor: Inside a lane of the route's corridor.
+        near: A lane centre lies within the cut-off.
+        points_near: The same for each corner.
+        on_corridor: Inside a lane of the corridor of the route.
         wrong_way: Inside a lane against its direction (more than 135 deg), and no other lane is nearer.
-        straddling: Some corner is outside every lane that runs ego's way.
-        leaving_lane: Some corner is outside the lane that the centre is in (nuPlan's several lanes, for fault).
-        limit: Speed limit of the lane, m/s; -1 where unknown.
-        lane: Index of the nearest lane that runs ego's way, -1 where none is near.
-        offset: Signed distance to its centre line, positive left of it, m.
-        z: Height of the nearest lane, of the query's own height where none is near.
+        straddling: Some corner is outside all lanes in the direction of the ego.
+        leaving_lane: Some corner is outside the lane of the centre (nuPlan's multiple lanes, for fault).
+        limit: Speed limit of the lane, m/s; -1 unknown.
+        lane: Nearest lane in the direction of the ego, -1 without one.
+        offset: Signed distance to its centre line, left positive, m.
+        z: Height of the nearest lane, or of the query without one.
     """
 
     near: Bool[Array, ""]
@@ -103,16 +155,7 @@ def around_lanes(
     bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], heading: Float[Array, " 2"],
     points: Float[Array, "P 2"], z: Float[Array, ""],
 ) -> LaneHits:  # fmt: skip
-    """Where a box lies among the lanes around it.
-
-    Args:
-        bank: The scenarios.
-        index: Row of the bank.
-        centre: Centre of the box, m.
-        heading: Cosine and sine of its heading.
-        points: Its corners.
-        z: Its height.
-    """
+    """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height."""
     rows, inside = lanes_around(bank, index, centre)
     inside = inside & _level(rows[LaneRow.Z], z)
     squared, side = to_segments(rows, jnp.concatenate([centre[None], points]))
@@ -155,9 +198,9 @@ def aligned_lanes(
     bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
     z: Float[Array, ""],
 ) -> tuple[Int[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:  # fmt: skip
-    """Segments of lanes around a point that run its way: lane, squared distance, signed distance to the line (left +).
+    """Lane segments around a point in its direction: lane, squared distance, signed distance to the line (left +).
 
-    Those that do not count have lane -1 and are very far away.
+    Others have lane -1 and a very large distance.
     """
     rows, inside = lanes_around(bank, index, xy)
     squared, side = to_segments(rows, xy[None])
@@ -172,7 +215,7 @@ def aligned_lanes(
 def lane_distance(
     bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], z: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Distance to the nearest lane centre, whichever way it runs, m; infinite where none is within the cut-off."""
+    """Distance to the nearest lane centre in any direction, m; infinite beyond the cut-off."""
     rows, inside = lanes_around(bank, index, xy)
     squared = to_segments(rows, xy[None])[0][0]
     nearest = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR).min()
@@ -184,8 +227,8 @@ def vertex_distances(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Distance to the nearest vertex of a road edge and of a lane centre, on any level, m.
 
-    What others measure who keep maps as points. Segments as stored are drawn with a vertex every ``spacing_m`` from
-    their beginning on, and one at their end. Exact within the cut-offs; beyond them it may be too large.
+    The measure of tools that keep maps as points: segments get a vertex every ``spacing_m`` from their beginning, and
+    one at their end. Exact within the cut-offs; beyond them it may be too large.
     """
     return (
         _nearest_vertex(*edges_around(bank, index, xy), xy, spacing_m),
@@ -210,7 +253,7 @@ def _nearest_vertex(
 def _outside_lanes(
     squared: Float[Array, "P K"], aligned: Bool[Array, " K"], half: Float[Array, " K"]
 ) -> Bool[Array, " P"]:
-    """Whether each point is outside every lane that runs ego's way."""
+    """Mask of points outside all lanes in the direction of the ego."""
     return ~(aligned & (squared <= (half + LANE_MARGIN_M) ** 2)).any(axis=1)
 
 
@@ -221,7 +264,7 @@ def _corner_lanes(
     heading: Float[Array, " 2"],
     z: Float[Array, ""],
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """For a corner that its box's own cells may not reach: whether a lane is near, and whether it is outside all."""
+    """Whether a lane is near to a corner of a long box, and whether the corner is outside all lanes."""
     rows, inside = lanes_around(bank, index, point)
     squared = to_segments(rows, point[None])[0]
     squared = jnp.where(inside & _level(rows[LaneRow.Z], z), squared, _FAR)
@@ -233,10 +276,10 @@ def offroad_distance(
     bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
     points_near_lane: Bool[Array, " P"], z: Float[Array, ""],
 ) -> Float[Array, " P"]:  # fmt: skip
-    """How far each point is beyond the nearest road edge, m: positive off the road, negative on it.
+    """Signed distance of points beyond the nearest road edge, m: positive off the road, negative on it.
 
-    Without an edge within the cut-off the stored side of the point's side cell decides, and without that the road
-    is where a lane centre is near; such points get plus or minus the cut-off.
+    Without an edge within the cut-off the stored side of the side cell decides, and if that is unknown, whether a lane
+    centre is near; the distance is then plus or minus the cut-off.
     """
     if bank.long_ego:
         look = jax.vmap(lambda p: left_of_edges(bank, index, p, p[None], z))
@@ -249,7 +292,7 @@ def offroad_distance(
 
 
 def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array, "P 2"]) -> Int[Array, " P"]:
-    """Code of the side cell of each point (``scenario.build.sides.packed``); 0 outside the grid."""
+    """Code of the side cell of each point (``scenario.build.grid.packed``); 0 outside the grid."""
     grid = round(bank.grid_side.shape[1] ** 0.5)
     fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
     inside = ((fine >= 0) & (fine < grid * SPLIT)).all(axis=1)
@@ -259,13 +302,13 @@ def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array,
 
 
 def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Bool[Array, ""]:
-    """Whether a point lies outside the box around all edges and lanes of the scenario."""
+    """Return whether a point lies outside the box of all edges and lanes."""
     box = bank.map_box[index]
     return ((xy < box[:2]).any() | (xy > box[2:]).any()) & is_mapped(bank, index)
 
 
 def is_mapped(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, ""]:
-    """Whether the scenario has any edge or lane, without which being off the road means nothing."""
+    """Return whether the scenario has any edge or lane."""
     return (bank.grid_edge[index, -1] > 0) | (bank.grid_lane[index, -1] > 0)
 
 
@@ -279,10 +322,6 @@ class RouteHit:
     heading: Float[Array, " 2"]
 
 
-_WINDOW = 40
-_WINDOW_BEHIND = 6
-
-
 def project_on_route(
     bank: ScenarioBank,
     index: Int[Array, ""],
@@ -291,14 +330,14 @@ def project_on_route(
     ahead_m: float | Float[Array, ""] = 33.0,
     route: int = 0,
 ) -> RouteHit:
-    """Projects a point on the route within a window from 6 m behind to ``ahead_m`` ahead of ``near_m``.
+    """Project a point on a route within a window from 6 m behind to ``ahead_m`` ahead of ``near_m``.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         xy: The point, m.
-        near_m: Arc length around which to look; the last known position along the route.
-        ahead_m: How far ahead to look; a car that moved little cannot have reached the other leg of a hairpin.
+        near_m: Last known arc length.
+        ahead_m: End of the window; it keeps a car off the other leg of a hairpin.
         route: 0 the route to the goal, 1 the log's own.
     """
     count = bank.routes.shape[2]
@@ -328,11 +367,11 @@ def route_ahead(
     bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""], offsets_m: Float[Array, " K"],
     route: int = 0,
 ) -> tuple[Float[Array, "K 7"], Bool[Array, " K"]]:  # fmt: skip
-    """Route rows at arc lengths ``along_m + offsets_m`` (linear between points) and which of them exist."""
+    """Points of a route (:class:`RouteColumn`) at arc lengths ``along_m + offsets_m``, and the mask of valid ones."""
     at = jnp.maximum(along_m + offsets_m, 0.0)
     last = bank.route_points[index, route] - 1
     low = jnp.clip(at.astype(jnp.int32), 0, bank.routes.shape[2] - 2)
-    # Lanes and limits are not numbers to blend.
+    # Limits and lanes are not interpolated.
     part = (at - low)[:, None] * (jnp.arange(bank.routes.shape[-1]) < RouteColumn.LIMIT)
     rows = bank.routes[index, route, low] * (1 - part) + bank.routes[index, route, low + 1] * part
     return rows, (along_m + offsets_m <= last.astype(jnp.float32)) & (last > 0)
@@ -345,10 +384,10 @@ def light_crossing(
     now: Float[Array, " 2"],
     z: Float[Array, ""],
 ) -> tuple[Bool[Array, " L"], Float[Array, " L"]]:
-    """Which stop lines a point crossed forwards between two steps, and its distance before each line now (m).
+    """Mask of the stop lines that a point crossed forwards between two steps, and its distance before each line, m.
 
-    A line is crossed when the signed distance along the lane's heading changes sign and the point passes through the
-    finite segment. The distance is infinite for lines of other lanes (more than 2 m beside the segment) and levels.
+    A line is crossed if the signed distance along the heading of its lane changes sign and the point passes through the
+    finite segment. The distance is infinite for lines of other levels and lanes (more than 2 m sideways).
     """
     line = bank.light_line[index]
     cos, sin, half = line[LightRow.COS], line[LightRow.SIN], line[LightRow.HALF]
@@ -369,13 +408,13 @@ def lane_course(
     bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
     z: Float[Array, ""],
 ) -> tuple[Float[Array, " 2"], Float[Array, ""], Bool[Array, ""]]:  # fmt: skip
-    """Where the lane leads that a car at a point would follow.
+    """Direction of the lane that a car at a pose follows.
 
-    Of the lanes within 2.5 m and 60 degrees it is the one that fits place and heading best, a metre weighing as
-    much as 15 degrees, so that a car which has begun to turn follows the turn.
+    It is the best lane within 2.5 m and 60 degrees, where a metre weighs as much as 15 degrees: a car that has started
+    to turn follows the turn.
 
     Returns:
-        Direction of that lane, the point's signed distance to it (positive left of it, m), and whether there is one.
+        Direction, signed distance of the point from the lane (left positive, m), and whether there is such a lane.
     """
     rows, inside = lanes_around(bank, index, xy)
     squared, side = to_segments(rows, xy[None])

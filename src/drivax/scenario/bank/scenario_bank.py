@@ -1,47 +1,153 @@
-"""The scenario bank: many scenarios stacked on the device, an argument of everything that simulates.
+"""The scenario bank: scenarios stacked on the device, an argument of all simulation.
 
-A bank is built from stored scenarios and trimmed to what the set really uses, so that padding costs nothing. It holds
-what a step reads, in the layout in which a step reads it: agents time-major (a frame is one contiguous read), map
-segments feature-major (a grid query is three contiguous reads per feature).
+Padding that no scenario uses is trimmed. The layout is that of the reads of a step: agents are time-major (a frame is a
+contiguous read), map segments are feature-major (a grid query is three contiguous reads per feature).
 """
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt, UInt32
 
-from drivax.errors import DataError
-from drivax.geometry.angles import wrap
+from drivax.errors import DataError, DrivaxError
+from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import RoadLayer, SizeColumn
-from drivax.scenario.bank.identity import identities
-from drivax.scenario.bank.sizes import Sizes, last_used
-from drivax.scenario.build.lane_codes import corridor_lanes, lane_codes
+from drivax.scenario.bank.strands import corridor_lanes, lane_codes
 from drivax.scenario.record import record, static
-from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, Flag, RoadKind, Scenario, among
+from drivax.scenario.schema import (
+    EDGE_KINDS,
+    LANE_KINDS,
+    POLYGON_KINDS,
+    Capacity,
+    Flag,
+    RoadKind,
+    Scenario,
+    among,
+)
 
+#: Sizes are multiples of this, so that banks of similar scenarios share programs.
+_MULTIPLE = 8
 #: Lane width where the source gives none, m.
 DEFAULT_LANE_WIDTH_M = 3.7
 #: Limits of a lane's class where the source gives none, m/s (semantics, ``speeding``).
 CLASS_LIMIT_MPS = {int(RoadKind.LANE_FREEWAY): 29.1, int(RoadKind.LANE_SURFACE): 13.4}
-
 #: Arc length of stop lines that are not on the route.
 NEVER_M = 1e6
 #: Steps in a word of ``parked_when``.
 WORD = 32
 
 
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the arrays of a bank; banks of the same sizes run the same compiled programs.
+
+    Attributes:
+        agents: Moving agents.
+        slots: Slots of a frame: moving and parked agents.
+        edges, lanes: Segments of road edges and of car lanes.
+        edge_run, lane_run: Longest run of a row of three grid cells.
+        graphs: Lanes of the graph.
+        road: Pieces of road to observe.
+        long_ego: Whether some ego is too long for a single grid query.
+    """
+
+    agents: int
+    slots: int
+    lights: int
+    edges: int
+    lanes: int
+    edge_run: int
+    lane_run: int
+    graphs: int
+    road: int
+    long_ego: bool
+
+    @classmethod
+    def whole(cls, capacity: Capacity) -> Sizes:
+        """Return the sizes of a capacity."""
+        return cls(
+            agents=capacity.agents,
+            slots=capacity.agents + capacity.parked,
+            lights=capacity.lights,
+            edges=capacity.segments,
+            lanes=capacity.segments,
+            edge_run=capacity.edge_run,
+            lane_run=capacity.lane_run,
+            graphs=capacity.lanes,
+            road=capacity.road_rows,
+            long_ego=False,
+        )
+
+    @classmethod
+    def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
+        """Return the sizes that scenarios of one capacity use.
+
+        Raises:
+            DrivaxError: There are no scenarios.
+        """
+        needed = [_needed(scenario) for scenario in scenarios]
+        if not needed:
+            raise DrivaxError("a bank needs at least one scenario", cure="check the set and its filters")
+        return cls(*(max(getattr(sizes, field.name) for sizes in needed) for field in fields(cls)))
+
+
+def last_used(mask: Any) -> np.ndarray[Any, Any]:
+    """Number of columns of ``mask [N, columns]`` up to the last true one, per row."""
+    return np.where(mask.any(1), mask.shape[1] - np.argmax(mask[:, ::-1], axis=1), 0)
+
+
+def _needed(scenario: Scenario) -> Sizes:
+    capacity, record = scenario.capacity, scenario.record
+    masks = {
+        "agents": record["agent_valid"].any(0), "parked": record["parked_valid"].any(0),
+        "lights": (record["light_state"] >= 0).any(0), "graphs": record["lane_length"] > 0,
+    }  # fmt: skip
+    ends = {name: int(last_used(np.asarray(mask)[None])[0]) for name, mask in masks.items()}
+    agents = max(1, _rounded(ends["agents"], capacity.agents))
+    slots = _rounded(ends["agents"] + ends["parked"], capacity.agents + capacity.parked)
+    _, edges, segments = (int(number) for number in record["segment_blocks"][:3])
+    half_m = float(np.hypot(*record["agent_size"][0, :2])) / 2
+    return Sizes(
+        agents=agents,
+        slots=max(slots, agents),
+        lights=max(1, _rounded(ends["lights"], capacity.lights)),
+        edges=edges,
+        lanes=segments - edges,
+        edge_run=_longest_run(record["grid_edge"], capacity.grid),
+        lane_run=_longest_run(record["grid_lane"], capacity.grid),
+        graphs=max(1, _rounded(ends["graphs"], capacity.lanes)),
+        road=max(1, int(record["road_rows"])),
+        # Edges count up to 3 m from a corner; the 3 x 3 block is exact within a cell less half a segment.
+        long_ego=half_m + 3.0 > capacity.cell_m - 2.0,
+    )
+
+
+def _rounded(count: int, most: int) -> int:
+    return min(most, -(-count // _MULTIPLE) * _MULTIPLE)
+
+
+def _longest_run(start: np.ndarray[Any, Any], grid: int) -> int:
+    """Longest run over three neighbouring cells of a grid row, rounded up to a multiple of 8."""
+    begin = start[:-1].reshape(grid, grid).astype(np.int64)
+    end = start[1:].reshape(grid, grid).astype(np.int64)
+    longest = max(int((end[:, 2:] - begin[:, :-2]).max()), 1)
+    return -(-longest // _MULTIPLE) * _MULTIPLE
+
+
 @record
 class ScenarioBank:
-    """Scenarios on the device. Sizes: N scenarios, T steps, A moving agents, S slots of a frame, G grid cells a side.
+    """Scenarios on the device: N scenarios, T steps, A moving agents, S slots of a frame.
 
-    In a frame the parked agents of a scenario come right behind its own moving ones, so that the slots of a frame are
-    as many as one scenario needs, not as the most moving and the most parked ones of different scenarios.
+    The slots of parked agents follow those of the moving agents of the same scenario, so that a frame has as many slots
+    as the largest scenario needs.
 
     Attributes:
         agents: Moving agents, :class:`AgentColumn`; slot 0 is ego.
@@ -52,24 +158,21 @@ class ScenarioBank:
         edges: Road-edge segments (drivable side on the left) sorted by grid cell, :class:`EdgeRow`.
         lanes: Car-lane segments sorted by grid cell, :class:`LaneRow`.
         lane_codes: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
-        grid_edge, grid_lane: Start of each cell's run in ``edges`` and ``lanes`` (row-major, plus the end).
-        grid_side: Sides of places beyond the cut-off of every edge, packed (``scenario.build.sides.packed``).
+        grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
+        grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
         routes: Points 1 m apart, :class:`RouteColumn`; route 0 leads to the goal, route 1 is the log's own.
         log_progress: Arc length of the logged ego along route 0.
-        log_ahead: Distance that the logged ego still drives.
+        log_ahead: Distance that the logged ego still drives, m.
         road: Pieces of road to observe, in order of rank, :class:`RoadColumn`.
         road_at: x, y and layer of the same pieces.
-        road_curvature: Turn of each piece per metre, left positive, 1/m.
+        road_curvature: Curvature of each piece, left positive, 1/m.
         flags: ``scenario.schema.Flag`` bits.
-        identity: What chance in a scenario follows from, whatever row it has (``scenario.bank.identity``).
-        extension: Where moving agents would go on beyond their last logged pose, 4 m apart along their lane: x, y.
-        paths: Paths of agents that react (``simulator.traffic.agent_paths.with_paths``), None where nobody does.
-        driver: Planner that drives others than ego (``planners.planner_traffic.with_driver``), None where nobody does.
-        given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
-        cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells in this bank (static).
-        long_ego: Whether some ego reaches further than the grid's guarantee from its centre (static).
-        trimmed: Whether padding that no scenario uses was cut (static).
+        identity: Seeds of the random numbers of a scenario (:func:`identities`).
+        extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
+        cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
+        long_ego: Whether some ego is too long for a single grid query.
+        trimmed: Whether unused padding was cut.
     """
 
     agents: Float[Array, "N T A 8"]
@@ -102,21 +205,18 @@ class ScenarioBank:
     lane_run: int = static()
     long_ego: bool = static()
     trimmed: bool = static()
-    paths: Any = None
-    given: Any = None
-    driver: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
 
     @property
     def steps(self) -> int:
-        """Steps T of a scenario."""
+        """Number of steps T."""
         return self.agents.shape[1]
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the bank takes on the device."""
+        """Bytes of the bank on the device."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
 
     def length_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
@@ -128,33 +228,29 @@ class ScenarioBank:
         return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
-        """Some of the scenarios as a bank; the driver is everyone's."""
-        return replace(jax.tree.map(lambda leaf: leaf[rows], replace(self, driver=None)), driver=self.driver)
+        """Select scenarios."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)
 
     @classmethod
     def from_scenarios(
         cls, scenarios: Iterable[Scenario], *, trim: bool | Sizes = True, allow_no_future: bool = False
     ) -> ScenarioBank:
-        """Stacks scenarios of one capacity.
+        """Stack scenarios of one capacity.
 
         Args:
-            scenarios: All of one capacity.
-            trim: Cut padding that no scenario of the bank uses; or cut to sizes, as :meth:`Sizes.used` of more
-                scenarios. Banks of the same sizes (those that are not cut are, if of one capacity) share compiled
-                programs; smaller ones are faster.
-            allow_no_future: Accept test splits.
+            scenarios: Scenarios of one capacity.
+            trim: Cut unused padding, or cut to given sizes. Banks of the same sizes share compiled programs; smaller
+                banks are faster.
+            allow_no_future: Accept scenarios of test splits.
 
         Raises:
-            DrivaxError: If there are none, or one has no future and ``allow_no_future`` is not set.
+            DrivaxError: There are no scenarios, their capacities differ, or one has no logged future.
         """
         kept = list(scenarios)
         for scenario in kept:
             if Flag.NO_FUTURE in scenario.has and not allow_no_future:
-                raise DataError(
-                    "has no logged future (a test split)",
-                    record=scenario.id,
-                    cure="leave it out (flag!=NO_FUTURE)",
-                )
+                problem = "has no logged future (a test split)"
+                raise DataError(problem, record=scenario.id, cure="leave it out (flag!=NO_FUTURE)")
         for scenario in kept:
             if scenario.capacity != kept[0].capacity:
                 raise DataError(
@@ -174,18 +270,28 @@ class ScenarioBank:
         )
 
 
+def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
+    """Return a number per scenario from its data set and id, independent of set, order and batch.
+
+    It is the first four bytes of BLAKE2b over data set, id and the number of earlier scenarios of the same name, so
+    that copies of a scenario differ.
+    """
+    seen: Counter[tuple[str, str]] = Counter()
+    numbers = []
+    for name in names:
+        text = "\0".join((*name, str(seen[name])))
+        numbers.append(int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "little"))
+        seen[name] += 1
+    return np.array(numbers, np.uint32)
+
+
 def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
     return np.stack([scenario.record[name] for scenario in scenarios])
 
 
 def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
-    arrays = _stack_agents(scenarios, sizes) | _stack_routes(scenarios)
-    return (
-        arrays
-        | _stack_lights(scenarios, sizes)
-        | _stack_road(scenarios, sizes)
-        | _stack_maps(scenarios, sizes)
-    )
+    arrays = _stack_agents(scenarios, sizes) | _stack_routes(scenarios) | _stack_lights(scenarios, sizes)
+    return arrays | _stack_road(scenarios, sizes) | _stack_maps(scenarios, sizes)
 
 
 def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
@@ -208,7 +314,7 @@ def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.n
         "agents": agents,
         "extension": _column(scenarios, "agent_extension")[:, :count],
         "flags": _column(scenarios, "flags"),
-        "identity": identities([(one.text("dataset"), one.id) for one in scenarios]),
+        "identity": identities([(scenario.text("dataset"), scenario.id) for scenario in scenarios]),
         **_stack_parked(scenarios, sizes.slots, last_used(valid.any(1)), box),
     }
 
@@ -216,7 +322,7 @@ def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.n
 def _stack_parked(
     scenarios: Sequence[Scenario], slots: int, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """Parked agents, each scenario's from its slot ``first`` on, and everyone's box."""
+    """Parked agents, from slot ``first`` of their scenario on, and the boxes of all agents."""
     valid, heading = _column(scenarios, "parked_valid"), _column(scenarios, "parked_heading")
     count = last_used(valid.any(1))
     scenario, place = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
@@ -237,7 +343,7 @@ def _stack_parked(
 
 
 def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
-    """Steps as bits of words, see ``ScenarioBank.parked_when``."""
+    """Pack steps into bits of words, as in ``ScenarioBank.parked_when``."""
     steps = when.shape[1]
     padded = np.pad(when, ((0, 0), (0, -steps % WORD), (0, 0)))
     bits = padded.reshape(len(when), -1, WORD, when.shape[2]).astype(np.uint32)
@@ -268,7 +374,7 @@ def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, An
 
 
 def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
-    """Distance that each ego log drives from every step to its end; gaps in it count for nothing."""
+    """Distance that each logged ego drives from every step on, without gaps of the log."""
     xy, valid = _column(scenarios, "agent_xy")[:, :, 0], _column(scenarios, "agent_valid")[:, :, 0]
     moved = np.hypot(*np.moveaxis(np.diff(xy, axis=1), -1, 0)) * (valid[:, 1:] & valid[:, :-1])
     ahead = np.cumsum(moved[:, ::-1], axis=1)[:, ::-1]
@@ -291,7 +397,7 @@ def _stack_lights(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.n
 
 
 def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Arc length along the route to the goal of the stop lines of its lanes, where it first comes nearest to each."""
+    """Arc length along the route to the goal where it is nearest to the stop lines of its lanes."""
     count = int(scenario.route_points[0])
     lanes = scenario.light_lane
     mine = np.flatnonzero((lanes >= 0) & np.isin(lanes, scenario.route_lane[0]))
@@ -309,7 +415,7 @@ def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[A
 def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
     blocks = _column(scenarios, "segment_blocks").astype(np.int64)
     edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
-    # A run is read whole, so every start must leave room for one behind it.
+    # Queries read whole runs, so a run must fit behind the last start.
     edges = np.full((len(scenarios), 5, sizes.edges + sizes.edge_run), 1e6, np.float32)
     lanes = np.full((len(scenarios), 8, sizes.lanes + sizes.lane_run), 1e6, np.float32)
     box = np.zeros((len(scenarios), 4), np.float32)

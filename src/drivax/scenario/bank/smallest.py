@@ -1,8 +1,7 @@
-"""Which of many numbers is the smallest, in one reduction that vectorises.
+"""``argmin`` as a single reduction that vectorises on CPUs.
 
-A number that says which it is takes the place of the low bits of every float. The obvious way, to look for the minimum
-and then for who equals it, is wrong under XLA: it may compute the values anew for the second reduction, rounded
-otherwise, and then nobody equals the minimum.
+The low bits of every float hold its index. Two reductions, for the minimum and for the index that equals it, are wrong
+under XLA: it may compute the values again for the second one with other rounding, and then none equals the minimum.
 """
 
 from __future__ import annotations
@@ -13,21 +12,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-#: Smaller differences from the least value do not count, so that no key is below the smallest normal float.
+#: Offset that keeps keys above the smallest normal float.
 _TINY = 1e-6
-#: Infinity with other low bits would be no number.
+#: Replaces infinity, which would become NaN with other low bits.
 _FAR = 1e30
 
 
 def numbered(values: Float[Array, "..."], number: Any, bits: int) -> Float[Array, "..."]:
-    """Positive floats with a number in place of their low bits, so that the smallest one says which it is.
+    """Replace the low bits of positive floats by a number below ``2**bits``.
 
-    They stay floats, whose minima vectorise; those of integers do not.
-
-    Args:
-        values: Of at least the smallest normal float: what is below may count as zero.
-        number: Of less than ``2**bits``.
-        bits: How many of the 23 bits after the point are given up.
+    Minima of floats vectorise; those of integers do not. Values below the smallest normal float may count as zero.
     """
     key = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(values).astype(jnp.float32), jnp.int32)
     return jax.lax.bitcast_convert_type(
@@ -36,20 +30,14 @@ def numbered(values: Float[Array, "..."], number: Any, bits: int) -> Float[Array
 
 
 def number_of(key: Float[Array, "..."], bits: int) -> Int[Array, "..."]:
-    """The number in a key of :func:`numbered`."""
+    """Return the number in a key of :func:`numbered`."""
     return jax.lax.bitcast_convert_type(key, jnp.int32) & ((1 << bits) - 1)
 
 
 def first_smallest(values: Float[Array, "..."], axis: int = -1, least: float = 0.0) -> Int[Array, "..."]:
-    """``argmin``, which XLA compares pair by pair on a CPU; of values that are all but alike the first.
+    """Return ``argmin`` of values of at least ``least``; of nearly equal values the first.
 
-    Of N values those are alike that differ by less than about ``N * 2**-23`` of what they are above ``least``, or by
-    less than 1e-6.
-
-    Args:
-        values: Of at least ``least``; infinite ones are the largest.
-        axis: Along which to look.
-        least: What no value is below.
+    N values are nearly equal if they differ by less than 1e-6 or about ``N * 2**-23`` of their distance from ``least``.
     """
     count = values.shape[axis]
     bits = (count - 1).bit_length()

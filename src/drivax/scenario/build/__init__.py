@@ -1,1 +1,5 @@
-"""From a recording to a scenario: lanes, routes, the segment grid and the checks on the way."""
+"""Steps from a recording to a scenario: tracks, lane graph, routes, map segments and grid."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,38 +1,30 @@
-"""From a recording to a scenario: checked, moved into the local frame, padded, indexed and routed.
-
-``assemble`` is the only way into the scenario format; readers and the built-in world produce recordings.
-"""
+"""Assembly of scenarios from recordings: checks, local frame, padding, map index and routes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.errors import DataError, UsageError
-from drivax.scenario.build.checks import check, step_seconds
+from drivax.errors import DataError
 from drivax.scenario.build.filling import EVENT_ACTORS, Parts, fill
-from drivax.scenario.build.grid import GridSegments, arrange
+from drivax.scenario.build.grid import GridSegments, arrange, cell_sides
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments, lane_graph, select
 from drivax.scenario.build.lights import place_lights, place_stops
 from drivax.scenario.build.roads import road_rows
 from drivax.scenario.build.routes import EgoLog, Intent, RouteSet, RouteStyle, find_routes
 from drivax.scenario.build.segments import RoadLines, cut, inside_box, path_distance, road_lines, thin_path
-from drivax.scenario.build.sides import cell_sides
 from drivax.scenario.build.tracks import LocalTracks, extend, local_tracks, place
-from drivax.scenario.recording import Recording
+from drivax.scenario.recording import Recording, check, step_seconds
 from drivax.scenario.schema import (
     CAPACITIES,
     CAR_LANE_KINDS,
-    CURRENT_STEP,
     EDGE_KINDS,
     LANE_KINDS,
     LINE_KINDS,
-    STEPS,
-    AgentKind,
     Capacity,
     Flag,
     RoadKind,
@@ -44,17 +36,16 @@ from drivax.scenario.select.tags import scenario_tags
 
 Array = np.ndarray[Any, Any]
 
-#: The map is cropped to the box of the ego's log, widened by this much.
+#: Margin of the map around the box of the ego's log.
 MARGIN_M = 100.0
-#: All lines of a map together are shorter than this; a whole city is cropped by its reader.
+#: Largest total length of map lines; readers crop the map of a city.
 MAP_M = 500_000.0
-#: Steps may differ from the median step by this much before a recording counts as jittered.
+#: Largest deviation from the median step without ``JITTERED_TIME``.
 JITTER_S = 0.002
-STRIDE = 40
-#: Heights that differ by less are one level: the source has no elevation.
+#: Smallest range of heights that counts as elevation.
 FLAT_M = 0.01
-#: Flags that are decided here, whatever the reader said. That lights are known is not among them: a source may know
-#: that there are none.
+#: Flags that are measured here and override those of the reader. ``LIGHTS`` is not among them: a source may know that
+#: there are no lights.
 MEASURED = (
     Flag.LANE_GRAPH
     | Flag.DEFAULT_LIMITS
@@ -79,7 +70,7 @@ _COUNTED = {
 
 
 def count_source(recording: Recording) -> SourceCounts:
-    """Counts what the source holds: every feature and every point as given, before cropping and capping."""
+    """Count the features and points of the source, before cropping and capping."""
     kinds = np.array([feature.kind for feature in recording.features], dtype=np.int64)
     tracks = recording.tracks
     return SourceCounts(
@@ -92,105 +83,18 @@ def count_source(recording: Recording) -> SourceCounts:
     )
 
 
-def windows(recording: Recording, stride: int = STRIDE) -> Iterator[Recording]:
-    """Cuts a long recording into windows of 91 steps that share its segment.
-
-    A recording of at most 91 steps is its own window. Of a longer one, window ``k`` holds the steps from ``k * stride``
-    on, so with the default stride 51 of 91 steps are in the next window too; steps at the end that fill no window are
-    left out (110 steps are one window, 199 are three). Windows in which the ego is not there at the current step are
-    left out and counted in the others' ``lost`` as ``windows_without_ego``.
-
-    Args:
-        recording: Any recording.
-        stride: Steps between the starts of two windows.
-
-    Raises:
-        UsageError: The stride is not positive.
-        DataError: The ego is not there at the current step of any window.
-    """
-    if stride < 1:
-        raise UsageError(f"a stride of {stride} steps", cure="choose 1 or more")
-    steps = len(recording.timestamps_s)
-    if steps <= STEPS:
-        yield recording
-        return
-    starts = range(0, steps - STEPS + 1, stride)
-    usable = [start for start in starts if recording.tracks.valid[recording.ego, start + CURRENT_STEP]]
-    if not usable:
-        raise DataError(
-            f"the ego is not valid at the current step of any of {len(starts)} windows",
-            record=recording.scenario_id,
-            cure="skip the recording",
-        )
-    lost = dict(recording.lost)
-    if len(usable) < len(starts):
-        lost["windows_without_ego"] = len(starts) - len(usable)
-    for start in usable:
-        yield replace(_window(recording, start), lost=lost)
-
-
-def _window(recording: Recording, start: int) -> Recording:
-    """The 91 steps from ``start`` on, with the current step at its usual place."""
-    part = slice(start, start + STEPS)
-    tracks = recording.tracks
-    time_fields = ("xy", "z", "heading", "velocity", "size", "valid")
-    events = (replace(e, start=e.start - start, end=e.end - start) for e in recording.events)
-    return replace(
-        recording,
-        scenario_id=f"{recording.scenario_id}@{start}",
-        timestamps_s=recording.timestamps_s[part],
-        current_step=CURRENT_STEP,
-        tracks=replace(tracks, **{name: getattr(tracks, name)[:, part] for name in time_fields}),
-        seen=None if recording.seen is None else recording.seen[:, part],
-        lights=tuple(replace(light, states=light.states[part]) for light in recording.lights),
-        events=tuple(
-            replace(e, start=max(e.start, 0), end=min(e.end, STEPS - 1))
-            for e in events
-            if e.end >= 0 and e.start < STEPS
-        ),
-    )
-
-
-def with_ego(recording: Recording, row: int) -> Recording:
-    """The same recording with another logged vehicle as the ego.
-
-    What was known of the former ego's route, and of what its sensors saw, is dropped.
-
-    Raises:
-        UsageError: The row is no vehicle that is valid at the current step.
-    """
-    tracks = recording.tracks
-    good = 0 <= row < len(tracks.kind) and tracks.kind[row] == AgentKind.VEHICLE
-    if not good or not tracks.valid[row, recording.current_step]:
-        raise UsageError(
-            f"track row {row} is no vehicle that is valid at step {recording.current_step}",
-            record=recording.scenario_id,
-            cure="choose the row of a vehicle that is there at the current step",
-        )
-    if row == recording.ego:
-        return recording
-    return replace(
-        recording,
-        scenario_id=f"{recording.scenario_id}#{int(tracks.track_id[row])}",
-        ego=row,
-        seen=None,
-        route_lanes=(),
-        route_corridor=(),
-    )
-
-
 def assemble(
     recording: Recording, capacity: Capacity = CAPACITIES["default"], routes: RouteStyle = "graph"
 ) -> Scenario:
-    """Turns a recording into a scenario.
+    """Assemble a scenario from a recording.
 
     Args:
-        recording: At most ``capacity.steps`` steps; cut longer ones with :func:`windows`.
-        capacity: Padded sizes; what does not fit is counted in ``overflow``, the farthest from the ego's log first.
-        routes: How candidate routes are made (``scenario.build.routes``).
+        recording: At most ``capacity.steps`` steps; cut longer recordings with ``windows``.
+        capacity: Padded sizes; the farthest items from the ego's log that do not fit are counted in ``overflow``.
+        routes: Source of candidate routes (``scenario.build.routes``).
 
     Raises:
-        DataError: The recording makes no sense; the message names what and its record.
+        DataError: The recording is invalid.
     """
     check(recording, capacity)
     try:
@@ -200,7 +104,6 @@ def assemble(
 
 
 def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Scenario:
-    """``assemble`` of a checked recording."""
     now, ego = recording.current_step, recording.ego
     origin = np.append(recording.tracks.xy[ego, now], recording.tracks.z[ego, now]).astype(np.float64)
     tracks = local_tracks(recording.tracks, ego, origin)
@@ -253,23 +156,23 @@ def _assemble(recording: Recording, capacity: Capacity, style: RouteStyle) -> Sc
 
 
 def _intent(recording: Recording, graph: LaneGraph) -> tuple[Intent, dict[str, int]]:
-    """What the source says about the intended route in dense indices, and how many of its lanes are missing."""
+    """Intended route in dense indices, and the numbers of its missing lanes."""
     index = graph.index()
-    named = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
-    found = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in named.items()}
-    missing = {f"{name}_missing": len(named[name]) - len(found[name]) for name in named}
-    return Intent(found["route_lanes"], found["route_corridor"]), missing
+    source = {"route_lanes": recording.route_lanes, "route_corridor": recording.route_corridor}
+    known = {name: tuple(index[lane] for lane in lanes if lane in index) for name, lanes in source.items()}
+    missing = {f"{name}_missing": len(source[name]) - len(known[name]) for name in source}
+    return Intent(known["route_lanes"], known["route_corridor"]), missing
 
 
-def _lost(recording: Recording, found: Mapping[str, int]) -> dict[str, int]:
-    """What the reader and the assembly left out, by name; only what is not zero."""
-    names = dict.fromkeys((*recording.lost, *found))
-    counts = {name: int(recording.lost.get(name, 0)) + found.get(name, 0) for name in names}
+def _lost(recording: Recording, lost: Mapping[str, int]) -> dict[str, int]:
+    """Nonzero numbers of items that the reader and the assembly left out, by name."""
+    names = dict.fromkeys((*recording.lost, *lost))
+    counts = {name: int(recording.lost.get(name, 0)) + lost.get(name, 0) for name in names}
     return {name: count for name, count in counts.items() if count}
 
 
 def _refuse_endless(roads: RoadLines) -> None:
-    """Raises where the map's lines are so long that they cannot be those of one place."""
+    """Refuse maps that are too long for one place."""
     length = float(roads.lines.length.sum())
     if length > MAP_M:
         problem = f"the map's lines are {length / 1000:.0f} km long together, more than {MAP_M / 1000:.0f} km"
@@ -277,14 +180,14 @@ def _refuse_endless(roads: RoadLines) -> None:
 
 
 def ego_log(tracks: LocalTracks, current_step: int) -> EgoLog:
-    """The ego's own log."""
+    """Return the log of the ego."""
     row = tracks.ego
     speed = np.hypot(*tracks.velocity[row].T)
     return EgoLog(tracks.xyz[row], tracks.heading[row], speed, tracks.valid[row], current_step)
 
 
 def _lanes_of(routes: RouteSet) -> Int[Array, " lane"]:
-    """Dense indices of all lanes under routes."""
+    """Return the dense indices of all lanes under routes."""
     lanes = np.unique(np.concatenate([route.lane for route in routes.routes]))
     return lanes[lanes >= 0]
 
@@ -296,10 +199,9 @@ def _kept_lanes(
     path: Float[Array, "step 2"],
     most: int,
 ) -> tuple[Int[Array, " kept"], int]:
-    """Lanes to store: those with a segment in the crop; where too many, routes first, bike lanes and far ones last.
+    """Return the lanes to store, in order of the source, and the number that did not fit.
 
-    Returns:
-        Dense indices in order of the source, and how many did not fit.
+    These are the lanes with a segment in the crop; routes come first, bike lanes and distant lanes last.
     """
     rows = np.flatnonzero(np.isin(graph.feature, near))
     far = np.full(graph.count, np.inf)
@@ -314,7 +216,7 @@ def _kept_lanes(
 def _kept_polylines(
     roads: RoadLines, grid: GridSegments, path: Float[Array, "step 2"], most: int
 ) -> tuple[Int[Array, " polyline"], int]:
-    """Polylines to store as features: those with a stored segment, the nearest where too many."""
+    """Return the nearest polylines with a stored segment, and the number that did not fit."""
     rows = np.unique(grid.segments.polyline)
     far = np.full(roads.lines.count, np.inf)
     np.minimum.at(far, grid.segments.polyline, path_distance(grid.segments.middle, path))
@@ -322,14 +224,14 @@ def _kept_polylines(
 
 
 def _renumber(routes: RouteSet, keep: Int[Array, " lane"], count: int) -> RouteSet:
-    """Routes in the dense indices of the stored lanes."""
+    """Return routes in the dense indices of the stored lanes."""
     new = np.full(count + 1, -1)
     new[keep] = np.arange(len(keep))
     return replace(routes, routes=tuple(replace(r, lane=new[r.lane]) for r in routes.routes))
 
 
 def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict[str, int]) -> dict[str, int]:
-    """All that did not fit, by name; only what is not zero."""
+    """Nonzero numbers of items that did not fit, by name."""
     actors = sum(max(len(event.actors) - EVENT_ACTORS, 0) for event in recording.events)
     counts = {
         **parts.placement.overflow,
@@ -346,7 +248,8 @@ def _overflow(parts: Parts, recording: Recording, capacity: Capacity, lost: dict
 
 
 def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) -> Flag:
-    """The reader's flags, and those that the data show, which the reader cannot know better."""
+    """Flags of the reader, with those that are measured here."""
+    heights = parts.roads.lines.points[:, 2]
     facts: Sequence[tuple[Flag, Any]] = (
         (Flag.LIGHTS, len(parts.lights.z) > 0),
         (Flag.NO_FUTURE, len(recording.timestamps_s) < capacity.steps),
@@ -355,10 +258,7 @@ def _flags(recording: Recording, parts: Parts, rings: bool, capacity: Capacity) 
         (Flag.JITTERED_TIME, step_seconds(recording.timestamps_s)[1] > JITTER_S),
         (Flag.ROUTE, parts.routes.on_lanes),
         (Flag.DEFAULT_LIMITS, ((parts.graph.limit <= 0) & among(parts.graph.kind, _LIMITED_KINDS)).any()),
-        (
-            Flag.ELEVATION,
-            np.ptp(parts.roads.lines.points[:, 2]) > FLAT_M if len(parts.roads.lines.points) else False,
-        ),
+        (Flag.ELEVATION, len(heights) > 0 and np.ptp(heights) > FLAT_M),
     )
     flags = (recording.flags & ~MEASURED) | parts.graph.flags
     for flag, holds in facts:

@@ -1,4 +1,4 @@
-"""Filling the stored record: padded float32 fields from the parts of a scenario."""
+"""The stored record of a scenario, filled from its parts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.scenario.build.checks import step_seconds
 from drivax.scenario.build.grid import GridSegments
 from drivax.scenario.build.lanes import LaneGraph, lane_of_feature
 from drivax.scenario.build.lights import Lights, Stops
@@ -16,14 +15,14 @@ from drivax.scenario.build.roads import RoadRows
 from drivax.scenario.build.routes import RouteSet
 from drivax.scenario.build.segments import RoadLines
 from drivax.scenario.build.tracks import EGO_BIT, INTEREST_BIT, PREDICT_BIT, LocalTracks, Placement
-from drivax.scenario.recording import Event, Recording
+from drivax.scenario.recording import Event, Recording, step_seconds
 from drivax.scenario.schema import Capacity, Flag, record_dtype
 
 Array = np.ndarray[Any, Any]
 Record = np.ndarray[Any, Any]
 
 EVENT_ACTORS = 4
-#: What unused slots and unknown values hold where it is not zero.
+#: Fields in which unused slots and unknown values are -1; they are 0 in all others.
 MISSING = (
     "agent_id", "parked_id", "light_lane", "light_state", "stop_lane", "segment_kind", "segment_feature",
     "segment_lane", "feature_id", "feature_kind", "lane_id", "lane_kind", "lane_width", "lane_limit",
@@ -34,22 +33,7 @@ MISSING = (
 
 @dataclass(frozen=True)
 class Parts:
-    """Everything that a record is filled from, in the local frame and with final indices.
-
-    Attributes:
-        tracks: All tracks.
-        placement: Which track has which slot.
-        extension: Where moving agents would go on.
-        graph: The lanes that are stored.
-        routes: Routes in dense indices of ``graph``.
-        grid: Segments in storage order.
-        sides: Side of the road of every cell.
-        roads: Polylines that segments are cut from.
-        polylines: Rows of ``roads`` that are stored as features.
-        rows: The observation layer.
-        lights: Traffic lights.
-        stops: Stop signs.
-    """
+    """Parts of a scenario in the local frame; ``polylines`` are the rows of ``roads`` that are stored as features."""
 
     tracks: LocalTracks
     placement: Placement
@@ -68,7 +52,7 @@ class Parts:
 def fill(
     parts: Parts, recording: Recording, capacity: Capacity, origin: Float[Array, "3"], flags: Flag
 ) -> Record:
-    """The record of a scenario: a zero-dimensional structured array of ``record_dtype(capacity)``."""
+    """Return the record of a scenario: a zero-dimensional structured array of ``record_dtype(capacity)``."""
     record = blank(capacity)
     _fill_head(record, recording, origin, flags)
     _fill_agents(record, parts, recording)
@@ -83,15 +67,15 @@ def fill(
 
 
 def blank(capacity: Capacity) -> Record:
-    """A record in which nothing is valid: zeros, and -1 where an index or a value is missing."""
+    """Return a record without valid entries: zeros, and -1 for missing indices and values."""
     record = np.zeros((), record_dtype(capacity))
     for name in MISSING:
         record[name] = -1
     return record
 
 
-def _put(record: Record, values: dict[str, Array]) -> None:
-    """Writes arrays into the beginning of the leading axis of fields."""
+def _put(record: Record, **values: Array) -> None:
+    """Write arrays into the beginning of the leading axis of fields."""
     for name, value in values.items():
         record[name][: len(value)] = value
 
@@ -100,7 +84,7 @@ def _fill_head(record: Record, recording: Recording, origin: Float[Array, "3"], 
     record["scenario_id"] = recording.scenario_id.encode()
     record["dataset"] = recording.dataset.encode()
     record["segment"] = recording.segment.encode()
-    # To a micrometre: the last bits depend on the processor where recordings are computed.
+    # Rounded to a micrometre: the last bits of generated recordings depend on the processor.
     record["origin"] = np.round(origin, 6) + 0.0
     record["dt_s"] = step_seconds(recording.timestamps_s)[0]
     record["current_step"] = recording.current_step
@@ -131,19 +115,17 @@ def _fill_agents(record: Record, parts: Parts, recording: Recording) -> None:
     pose = parts.placement.pose[parked]
     _put(
         record,
-        {
-            "agent_size": tracks.size[moving],
-            "agent_kind": tracks.kind[moving],
-            "agent_id": tracks.track_id[moving],
-            "agent_flags": flags[moving],
-            "agent_extension": parts.extension,
-            "parked_xy": pose[:, :2],
-            "parked_z": pose[:, 2],
-            "parked_heading": pose[:, 3],
-            "parked_size": tracks.size[parked],
-            "parked_kind": tracks.kind[parked],
-            "parked_id": tracks.track_id[parked],
-        },
+        agent_size=tracks.size[moving],
+        agent_kind=tracks.kind[moving],
+        agent_id=tracks.track_id[moving],
+        agent_flags=flags[moving],
+        agent_extension=parts.extension,
+        parked_xy=pose[:, :2],
+        parked_z=pose[:, 2],
+        parked_heading=pose[:, 3],
+        parked_size=tracks.size[parked],
+        parked_kind=tracks.kind[parked],
+        parked_id=tracks.track_id[parked],
     )
 
 
@@ -153,15 +135,13 @@ def _fill_lights(record: Record, parts: Parts) -> None:
     record["light_state"][:steps, :count] = lights.state.T
     _put(
         record,
-        {
-            "light_line": lights.line,
-            "light_z": lights.z,
-            "light_lane": lights.lane,
-            "light_heading": lights.heading,
-            "light_exit_heading": lights.exit_heading,
-            "stop_xy": stops.xy,
-            "stop_lane": stops.lane,
-        },
+        light_line=lights.line,
+        light_z=lights.z,
+        light_lane=lights.lane,
+        light_heading=lights.heading,
+        light_exit_heading=lights.exit_heading,
+        stop_xy=stops.xy,
+        stop_lane=stops.lane,
     )
 
 
@@ -173,22 +153,20 @@ def _fill_segments(record: Record, parts: Parts, recording: Recording) -> None:
     source_ids = np.array([feature.feature_id for feature in recording.features], dtype=np.int64)
     _put(
         record,
-        {
-            "segment_a": segments.a,
-            "segment_b": segments.b,
-            "segment_kind": segments.kind,
-            "segment_feature": row_of[segments.polyline],
-            "segment_lane": lane_of_feature(parts.graph, segments.feature),
-            "segment_start_m": segments.start_m,
-            "segment_blocks": grid.blocks,
-            "feature_id": source_ids[roads.feature[kept]],
-            "feature_kind": roads.kind[kept],
-            "feature_closed": roads.closed[kept],
-            "grid_edge": grid.edge_start,
-            "grid_lane": grid.lane_start,
-            "grid_side": parts.sides,
-            "grid_origin": grid.grid.origin,
-        },
+        segment_a=segments.a,
+        segment_b=segments.b,
+        segment_kind=segments.kind,
+        segment_feature=row_of[segments.polyline],
+        segment_lane=lane_of_feature(parts.graph, segments.feature),
+        segment_start_m=segments.start_m,
+        segment_blocks=grid.blocks,
+        feature_id=source_ids[roads.feature[kept]],
+        feature_kind=roads.kind[kept],
+        feature_closed=roads.closed[kept],
+        grid_edge=grid.edge_start,
+        grid_lane=grid.lane_start,
+        grid_side=parts.sides,
+        grid_origin=grid.grid.origin,
     )
 
 
@@ -200,20 +178,18 @@ def _fill_lanes(record: Record, parts: Parts) -> None:
     stops_at[parts.stops.lane[parts.stops.lane >= 0]] = True
     _put(
         record,
-        {
-            "lane_id": graph.lane_id,
-            "lane_kind": graph.kind,
-            "lane_length": graph.lines.length,
-            "lane_width": graph.width,
-            "lane_limit": graph.limit,
-            "lane_interpolating": graph.interpolating,
-            "lane_successor": graph.successor,
-            "lane_predecessor": graph.predecessor,
-            "lane_left": graph.left,
-            "lane_right": graph.right,
-            "lane_light": light_of,
-            "lane_stop": stops_at,
-        },
+        lane_id=graph.lane_id,
+        lane_kind=graph.kind,
+        lane_length=graph.lines.length,
+        lane_width=graph.width,
+        lane_limit=graph.limit,
+        lane_interpolating=graph.interpolating,
+        lane_successor=graph.successor,
+        lane_predecessor=graph.predecessor,
+        lane_left=graph.left,
+        lane_right=graph.right,
+        lane_light=light_of,
+        lane_stop=stops_at,
     )
 
 
@@ -228,27 +204,17 @@ def _fill_routes(record: Record, parts: Parts) -> None:
         record["route_limit"][k, :count] = limits[route.lane]
         record["route_points"][k] = count
     record["goal_xy"] = parts.routes.goal
-    _put(record, {"log_progress": parts.routes.progress})
+    _put(record, log_progress=parts.routes.progress)
 
 
 def _fill_rows(record: Record, rows: RoadRows) -> None:
-    _put(
-        record,
-        {
-            "road_xy": rows.xy,
-            "road_direction": rows.direction,
-            "road_length": rows.length,
-            "road_kind": rows.kind,
-            "road_limit": rows.limit,
-            "road_curvature": rows.curvature,
-        },
-    )
+    names = ("xy", "direction", "length", "kind", "limit", "curvature")
+    _put(record, **{f"road_{name}": getattr(rows, name) for name in names})
     record["road_rows"] = len(rows.kind)
 
 
 def _fill_event(record: Record, row: int, event: Event) -> None:
-    record["event_kind"][row] = event.kind
-    record["event_start"][row] = event.start
-    record["event_end"][row] = event.end
+    for name in ("kind", "start", "end"):
+        record[f"event_{name}"][row] = getattr(event, name)
     actors = event.actors[:EVENT_ACTORS]
     record["event_actor"][row, : len(actors)] = actors

@@ -1,4 +1,4 @@
-"""The uniform grid over a scenario's map: which segments lie near a place, without a search."""
+"""The uniform grid over the map of a scenario: segments near a place, and the drivable side of every cell."""
 
 from __future__ import annotations
 
@@ -6,16 +6,26 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8, Int32
 
 from drivax.errors import DataError
 from drivax.scenario.build.segments import Segments, path_distance
 from drivax.scenario.schema import Capacity
 
+#: Nearer to an edge than this the edge itself decides (``scenario.bank.queries.EDGE_CUTOFF_M``), m.
+CUTOFF_M = 3.0
+#: Side cells along a grid cell. Half the diagonal of a side cell is below the cut-off, so no edge lies between its
+#: centre and those of its points that are beyond the cut-off.
+SPLIT = 3
+#: Codes of a packed side cell; 0 is unknown.
+DRIVABLE, NOT_DRIVABLE = 1, 2
+#: Edges decide the side of cells up to this distance, m.
+_REACH_M = 20.0
+#: End points within this distance are one vertex, m.
+_JOINED_M = 0.01
 Array = np.ndarray[Any, Any]
-
 EDGE_BLOCK, LANE_BLOCK, REST_BLOCK = 0, 1, 2
-#: Missing an edge this near to the logged ego would make off-road tests wrong: the scenario is refused.
+#: A scenario is refused if an edge this near to the logged ego does not fit: off-road tests would be wrong.
 UNSAFE_M = 20.0
 
 
@@ -33,7 +43,7 @@ class Grid:
 
     @classmethod
     def around(cls, xy: Float[Array, "point 2"], path: Float[Array, "step 2"], capacity: Capacity) -> Grid:
-        """The grid centred on these points, or on the ego's log where they do not fit into the square."""
+        """Return the grid centred on points, or on the log of the ego if the points do not fit."""
         size = capacity.grid * capacity.cell_m
         points = xy if len(xy) and np.all(np.ptp(xy, axis=0) < size) else path
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -45,7 +55,7 @@ class Grid:
         return np.floor((xy - self.origin) / self.cell_m).astype(np.int64)
 
     def contains(self, xy: Float[Array, "point 2"]) -> Bool[Array, " point"]:
-        """Whether points lie in the square."""
+        """Return whether points lie in the square."""
         cell = self.column_row(xy)
         return np.all((cell >= 0) & (cell < self.side), axis=1)
 
@@ -60,13 +70,7 @@ class Grid:
         return table[:, :-2] + table[:, 1:-1] + table[:, 2:]
 
     def crowded(self, cell: Int[Array, " entry"], far: Float[Array, " entry"], cap: int) -> Array:
-        """Entries to drop so that no run of three cells is longer than ``cap``: the farthest of crowded runs.
-
-        Args:
-            cell: Cell index of every entry.
-            far: Distance of every entry from the ego's log, metres.
-            cap: Longest run.
-        """
+        """Return the farthest entries to drop so that no run of three cells is longer than ``cap``."""
         dropped = np.zeros(len(cell), dtype=bool)
         while True:
             counts = np.bincount(cell[~dropped], minlength=self.side**2)
@@ -106,12 +110,9 @@ class GridSegments:
 
 
 def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity) -> GridSegments:
-    """Sorts segments into the grid and drops what fits neither the square, the table nor a query's runs.
+    """Sort segments into the grid; drop those that fit neither the square, the table nor the runs of a query.
 
-    Args:
-        segments: The segments of the cropped map.
-        path: A few points along the ego's log; what is farthest from it is dropped first.
-        capacity: Padded sizes.
+    Segments that are farthest from ``path``, the log of the ego, are dropped first.
 
     Raises:
         DataError: Road edges near the ego's log would have to be dropped.
@@ -153,7 +154,7 @@ def arrange(segments: Segments, path: Float[Array, "step 2"], capacity: Capacity
 def _refuse_unsafe(
     dropped: Bool[Array, " segment"], far: Float[Array, " segment"], capacity: Capacity
 ) -> None:
-    """Raises where an edge next to the ego's log did not fit."""
+    """Refuse a scenario if an edge next to the log of the ego did not fit."""
     lost = int((dropped & (far < UNSAFE_M)).sum())
     if lost:
         raise DataError(
@@ -161,3 +162,161 @@ def _refuse_unsafe(
             f" {capacity.name!r}",
             cure="convert with a larger capacity",
         )
+
+
+def cell_sides(
+    grid: Grid, edges: Segments, lanes: Float[Array, "point 2"], rings_closed: bool
+) -> Int32[Array, " cell"]:
+    """Sides of the 3 x 3 side cells of every grid cell, packed by :func:`packed`.
+
+    The edge nearest to the centre of a side cell decides: its left is drivable; the side beyond the end of an open edge
+    is unknown. Side cells with a lane centre are never off the road. Cells out of reach of all edges get a side only if
+    every road edge is a closed ring.
+
+    Args:
+        grid: The grid.
+        edges: All road-edge segments, also those outside the crop.
+        lanes: Points of lane centres.
+        rings_closed: Whether every road edge is a closed ring.
+    """
+    fine = Grid(grid.origin, grid.cell_m / SPLIT, grid.side * SPLIT)
+    if not len(edges):
+        return np.zeros(grid.side**2, dtype=np.int32)
+    side, distance = _nearest_sides(fine, edges.take(_in_reach(grid, edges)))
+    lane_cells = fine.cell(lanes[fine.contains(lanes)])
+    contradicted = lane_cells[(side[lane_cells] < 0) & (distance[lane_cells] > CUTOFF_M)]
+    side[contradicted] = 0
+    if rings_closed:
+        square = _sides_within_rings(grid, edges).reshape(grid.side, grid.side)
+        within = square.repeat(SPLIT, axis=0).repeat(SPLIT, axis=1).ravel()
+        side = np.where(within != 0, within, side)
+    return packed(side.reshape(fine.side, fine.side))
+
+
+def packed(side: Int[Array, "row column"]) -> Int32[Array, " cell"]:
+    """Pack the sides (1 drivable, -1 not, 0 unknown) of the 3 x 3 side cells of every grid cell into a number.
+
+    Each takes two bits, row by row from the lowest: 0 unknown, 1 drivable, 2 not drivable.
+    """
+    count = len(side) // SPLIT
+    blocks = side.reshape(count, SPLIT, count, SPLIT).swapaxes(1, 2).reshape(count * count, SPLIT * SPLIT)
+    codes = np.where(blocks < 0, NOT_DRIVABLE, blocks).astype(np.int32)
+    return np.bitwise_or.reduce(codes << np.arange(0, 2 * SPLIT * SPLIT, 2, dtype=np.int32), axis=1)
+
+
+def _in_reach(grid: Grid, edges: Segments) -> Bool[Array, " segment"]:
+    """Mask of edges in reach of the grid."""
+    reach = _REACH_M + grid.cell_m
+    middle = (edges.a[:, :2] + edges.b[:, :2]) / 2 - grid.origin
+    return np.all((middle >= -reach) & (middle <= grid.side * grid.cell_m + reach), axis=1)
+
+
+def _nearest_sides(fine: Grid, edges: Segments) -> tuple[Int[Array, " cell"], Float[Array, " cell"]]:
+    """Side of the nearest edge at every cell centre (0: out of reach, or beyond its open end), and its distance."""
+    size, width = fine.side, fine.cell_m
+    reach = int(np.ceil(_REACH_M / width))
+    steps = np.arange(-reach, reach + 1)
+    dx, dy = (part.ravel() for part in np.meshgrid(steps, steps))
+    a, b = edges.a[:, :2] - fine.origin, edges.b[:, :2] - fine.origin
+    base = np.floor((a + b) / (2 * width)).astype(np.int64)
+    column, row = base[:, :1] + dx, base[:, 1:] + dy
+    inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
+    # Cells outside the grid share the last index.
+    cell = np.where(inside, row * size + column, size * size)
+    x, y = (column + 0.5) * width, (row + 0.5) * width
+    squared = _squared_distances(x, y, a, b)
+    nearest = np.full(size * size + 1, np.inf)
+    np.minimum.at(nearest, cell.ravel(), squared.ravel())
+    segment, place = np.nonzero(inside & (squared <= nearest[cell] * (1 + 1e-6) + 1e-6))
+    at = cell[segment, place]
+    u = b[segment] - a[segment]
+    w = np.stack([x[segment, place], y[segment, place]], axis=-1) - a[segment]
+    length = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-6)
+    along = (u * w).sum(axis=1) / length**2
+    left = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / length
+    begins, ends = _open_ends(a, b)
+    beyond = (begins[segment] & (along <= 0.0)) | (ends[segment] & (along >= 1.0))
+    # At a vertex the segment whose line is further away decides.
+    most, least, cut = np.zeros(size * size), np.zeros(size * size), np.zeros(size * size, dtype=bool)
+    np.maximum.at(most, at, left)
+    np.minimum.at(least, at, left)
+    cut[at[beyond]] = True
+    sign, distance = np.where(most >= -least, 1, -1), np.sqrt(nearest[:-1])
+    return np.where(cut | (distance > _REACH_M), 0, sign), distance
+
+
+def _squared_distances(
+    x: Float[Array, "segment near"], y: Float[Array, "segment near"], a: Float[Array, "segment 2"],
+    b: Float[Array, "segment 2"],
+) -> Float[Array, "segment near"]:  # fmt: skip
+    """Squared distances from each segment to points near it."""
+    u = b - a
+    squared = np.maximum((u * u).sum(axis=1), 1e-12)[:, None]
+    x, y = x - a[:, :1], y - a[:, 1:]
+    along = x * (u[:, :1] / squared)
+    along += y * (u[:, 1:] / squared)
+    np.minimum(np.maximum(along, 0.0, out=along), 1.0, out=along)
+    x -= along * u[:, :1]
+    y -= along * u[:, 1:]
+    x *= x
+    y *= y
+    x += y
+    return x
+
+
+def _open_ends(a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> tuple[Array, Array]:
+    """Masks of segments that begin at an open end, and that end at one."""
+    both = np.round(np.concatenate((a, b)) / _JOINED_M).astype(np.int64)
+    name = both[:, 0] * 2**32 + both[:, 1]
+    first, last = name[: len(a)], name[len(a) :]
+    return ~np.isin(first, last), ~np.isin(last, first)
+
+
+def _sides_within_rings(grid: Grid, edges: Segments) -> Int8[Array, " cell"]:
+    """Sides of cells far from every edge, if all edges are closed rings: 1 drivable, -1 not, 0 unknown.
+
+    No edge crosses a cell whose 3 x 3 block holds none, so the whole cell lies on one side. Rings have the drivable
+    side on their left (outer rings counter-clockwise, islands clockwise), so the winding number of its centre is one
+    lower off the road. Crossings of the line through the cell centres of a row are counted from the right (Sunday,
+    2001).
+    """
+    side = np.zeros(grid.side**2, dtype=np.int8)
+    winding = _winding_at_centres(grid, edges)
+    low, high = min(winding.min(), 0), max(winding.max(), 0)
+    if low < 0 < high:
+        return side  # Rings contradict each other.
+    drivable = winding > 0 if high > 0 else winding == 0
+    corner = np.concatenate((edges.a[:, :2], edges.b[:, :2]))
+    centre = grid.origin + (np.arange(grid.side)[:, None] + 0.5) * grid.cell_m
+    within = (centre >= corner.min(axis=0)) & (centre <= corner.max(axis=0))
+    known = (within[None, :, 0] & within[:, None, 1]) & ~_near_edge(grid, edges)
+    side.reshape(grid.side, grid.side)[known] = np.where(drivable[known], 1, -1)
+    return side
+
+
+def _winding_at_centres(grid: Grid, edges: Segments) -> Int[Array, "row column"]:
+    """Winding number of the edges around the centre of every cell."""
+    scaled_a = (edges.a[:, :2] - grid.origin) / grid.cell_m - 0.5
+    scaled_b = (edges.b[:, :2] - grid.origin) / grid.cell_m - 0.5
+    row_a, row_b = np.floor(scaled_a[:, 1]), np.floor(scaled_b[:, 1])
+    crossing = np.flatnonzero(row_a != row_b)  # A segment crosses at most one row line.
+    line = np.maximum(row_a, row_b)[crossing]
+    a, b = scaled_a[crossing], scaled_b[crossing]
+    x = a[:, 0] + (line - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    up = np.where(row_b[crossing] > row_a[crossing], 1, -1)
+    last = np.clip(np.ceil(x) - 1, -1, grid.side - 1).astype(np.int64)  # last column left of the crossing
+    seen = (line >= 0) & (line < grid.side) & (last >= 0)
+    table = np.zeros((grid.side, grid.side), dtype=np.int64)
+    np.add.at(table, (line[seen].astype(np.int64), last[seen]), up[seen])
+    return np.cumsum(table[:, ::-1], axis=1)[:, ::-1]
+
+
+def _near_edge(grid: Grid, edges: Segments) -> Bool[Array, "row column"]:
+    """Mask of cells whose 3 x 3 block holds the midpoint of an edge segment."""
+    cell = grid.column_row(edges.middle) + 1
+    padded = np.zeros((grid.side + 2, grid.side + 2), dtype=bool)
+    near_square = np.all((cell >= 0) & (cell < grid.side + 2), axis=1)
+    padded[cell[near_square, 1], cell[near_square, 0]] = True
+    size = grid.side
+    shifts = [padded[dy : dy + size, dx : dx + size] for dy in range(3) for dx in range(3)]
+    return np.logical_or.reduce(shifts)

@@ -1,39 +1,252 @@
-"""The line that a sequence of lanes draws: joints closed, lane changes blended, ends continued straight."""
+"""Lane paths: search of the lane graph ahead of the ego and to the goal, and the line along a path."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import heapq
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from drivax.geometry.polylines import project
-from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
+from drivax.geometry.vectors import wrap
+from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph, LaneSegments
+from drivax.scenario.schema import CAR_LANE_KINDS
 
 Array = np.ndarray[Any, Any]
 
-#: A line and the dense lane index of each of its points (-1 where it runs beside the map).
+#: A line and the dense lane index of each of its points (-1 off the map).
 Line = tuple[Float[Array, "_ 3"], Int[Array, " _"]]
-
 #: Least stretch over which a route moves to the next lane.
 CHANGE_M = 20.0
-#: Joints with a gap between these are closed by fading the gap out; wider ones are crossed in a straight line.
+#: Gaps of this size between lanes are faded out; wider ones are crossed in a straight line.
 GAP_M = (0.05, 2.0)
 FADE_M = 10.0
+#: Lateral distance and heading difference within which a lane is under the ego or the goal.
+REACH_M = 4.0
+TURN_RAD = np.deg2rad(60.0)
+SAME_TURN_RAD = np.deg2rad(45.0)
+#: Costs in metres: of a lane change, of a metre between ego and its first lane, of a radian of turning.
+CHANGE_COST_M, LATERAL_COST, TURN_COST_M = 60.0, 30.0, 10.0
+#: Of a radian between the headings of ego and of its first lane, and of a lane outside the intended corridor.
+ASKEW_COST_M, OUTSIDE_COST_M = 30.0, 200.0
+MOST_CHANGES = 2
+MOST_EXPANSIONS = 400
+MOST_GOAL_LANES = 3
+#: Cost of each missing metre of an unfinished path, which makes the search go forward.
+EAGERNESS = 0.1
+
+
+@dataclass(frozen=True)
+class LanePath:
+    """A sequence of lanes, each a successor or neighbour of the previous one.
+
+    Attributes:
+        lanes: Dense indices, from the lane of the ego on.
+        s: Arc length of the ego on the first lane.
+        ahead: Distance from the ego to the beginning of the last lane, metres.
+        entry: Arc length on the last lane at which it is entered.
+        penalty: Cost of lane changes, turns and lateral distance, metres.
+        changes: Number of lane changes.
+        until: Distance from the ego to the goal, metres; infinite without one.
+        lateral: Distance of the ego from the first lane, metres.
+    """
+
+    lanes: tuple[int, ...]
+    s: float
+    ahead: float
+    entry: float
+    penalty: float
+    changes: int
+    until: float = np.inf
+    lateral: float = 0.0
+
+
+@dataclass(frozen=True)
+class LaneSearch:
+    """Best-first search from the lanes under the ego.
+
+    Attributes:
+        graph: The lane graph.
+        on: Lane segments of the same graph.
+        starts: Paths of one lane under the ego, the best fitting first.
+        need_m: Length of a complete path ahead of the ego.
+        bend: Heading change along every lane, radians.
+        drivable: Mask of car lanes.
+        outside: Cost of entering a lane outside the intended corridor, metres.
+    """
+
+    graph: LaneGraph
+    on: LaneSegments
+    starts: tuple[LanePath, ...]
+    need_m: float
+    bend: Float[Array, " lane"]
+    drivable: tuple[bool, ...]
+    outside: tuple[float, ...]
+
+    @classmethod
+    def start(
+        cls,
+        graph: LaneGraph,
+        on: LaneSegments,
+        xyz: Float[Array, "3"],
+        heading: float,
+        need_m: float,
+        corridor: Collection[int] = (),
+    ) -> LaneSearch:
+        """Start a search at the lanes within 4 m and 60 degrees of a pose.
+
+        ``corridor`` holds the lanes that the intended route may use; empty means any.
+        """
+        row = np.arange(graph.count)
+        lines = graph.lines
+        begin, end = lines.heading(row, 0.0 * row, END_SPAN_M), lines.heading(row, lines.length, END_SPAN_M)
+        near = on.around(xyz, heading, REACH_M, TURN_RAD)
+        outside = np.zeros(graph.count)
+        if corridor:
+            outside[~np.isin(row, list(corridor))] = OUTSIDE_COST_M
+        lane, arc = (np.array(values) for values in ([x[0] for x in near], [x[1] for x in near]))
+        askew = np.abs(wrap(lines.heading(lane, arc) - heading)) if near else np.zeros(0)
+        lane_paths = [
+            LanePath(
+                lanes=(lane,),
+                s=s,
+                ahead=-s,
+                entry=s,
+                penalty=LATERAL_COST * far + ASKEW_COST_M * float(turn) + float(outside[lane]),
+                changes=0,
+                lateral=far,
+            )
+            for (lane, s, far), turn in zip(near, askew, strict=True)
+        ]
+        drivable = tuple(bool(kind) for kind in np.isin(graph.kind, CAR_LANE_KINDS))
+        lane_paths.sort(key=lambda lane_path: lane_path.penalty)
+        return cls(
+            graph, on, tuple(lane_paths), need_m, np.abs(wrap(end - begin)), drivable, tuple(outside.tolist())
+        )
+
+    def alternatives(self, most: int) -> list[LanePath]:
+        """Complete paths with different lanes at a third, two thirds and all of their length; the cheapest first."""
+        complete: dict[tuple[int, ...], LanePath] = {}
+        serial = count()
+        heap = [(self._urgency(lane_path), next(serial), lane_path) for lane_path in self.starts]
+        heapq.heapify(heap)
+        for _ in range(MOST_EXPANSIONS):
+            if not heap or len(complete) >= most:
+                break
+            lane_path = heapq.heappop(heap)[2]
+            following = [] if self.reach(lane_path) >= self.need_m else self.following(lane_path)
+            if not any(
+                not is_change(self.graph, lane_path.lanes[-1], child.lanes[-1]) for child in following
+            ):
+                complete.setdefault(self._signature(lane_path), lane_path)
+            for child in following:
+                heapq.heappush(heap, (self._urgency(child), next(serial), child))
+        return list(complete.values())
+
+    def to_goal(self, xyz: Float[Array, "3"], heading: float) -> list[LanePath]:
+        """Cheapest paths to the lanes under the goal (Dijkstra's search)."""
+        goals = self._goals(xyz, heading)
+        complete: list[LanePath] = []
+        done: set[int] = set()
+        serial = count()
+        heap = [(lane_path.penalty, next(serial), lane_path) for lane_path in self.starts]
+        heapq.heapify(heap)
+        while heap and len(complete) < len(goals):
+            lane_path = heapq.heappop(heap)[2]
+            lane = lane_path.lanes[-1]
+            if lane in done:
+                continue
+            done.add(lane)
+            if lane in goals:
+                complete.append(replace(lane_path, until=lane_path.ahead + goals[lane]))
+            for child in self.following(lane_path):
+                if child.lanes[-1] not in done:
+                    heapq.heappush(heap, (child.penalty + child.ahead + child.entry, next(serial), child))
+        return complete
+
+    def along(self, lanes: Sequence[int], xyz: Float[Array, "3"], heading: float) -> LanePath:
+        """Path along given lanes to a goal, from the lane that fits the ego best (the first where none does)."""
+        lane_path = LanePath(tuple(lanes), 0.0, 0.0, 0.0, 0.0, 0)
+        for start in self.starts:
+            if start.lanes[0] in lanes:
+                rest = tuple(lanes[list(lanes).index(start.lanes[0]) :])
+                lane_path = replace(start, lanes=rest)
+                break
+        goals, ahead, until = self._goals(xyz, heading), lane_path.ahead, np.inf
+        for lane, following in zip(lane_path.lanes, (*lane_path.lanes[1:], -1), strict=True):
+            until = ahead + goals[lane] if lane in goals else until
+            if following >= 0 and is_change(self.graph, lane, following):
+                ahead -= change_room(self.graph, lane, following, 0.0)[2]
+            else:
+                ahead += float(self.graph.lines.length[lane])
+        return replace(lane_path, until=until)
+
+    def _goals(self, xyz: Float[Array, "3"], heading: float) -> dict[int, float]:
+        """Lanes under the goal, with its arc length on each."""
+        near = self.on.around(xyz, heading, REACH_M, TURN_RAD)[:MOST_GOAL_LANES]
+        return {lane: s for lane, s, _ in near}
+
+    def reach(self, lane_path: LanePath) -> float:
+        """Distance from the ego to the end of a path, metres."""
+        return lane_path.ahead + float(self.graph.lines.length[lane_path.lanes[-1]])
+
+    def _urgency(self, lane_path: LanePath) -> float:
+        return lane_path.penalty + EAGERNESS * max(self.need_m - self.reach(lane_path), 0.0)
+
+    def following(self, lane_path: LanePath) -> list[LanePath]:
+        """Paths with one more lane: successors, and neighbours where there is room for a lane change."""
+        graph, lane = self.graph, lane_path.lanes[-1]
+        result = []
+        for other in (int(x) for x in graph.successor[lane] if x >= 0):
+            if self.drivable[other] and other not in lane_path.lanes:
+                penalty = lane_path.penalty + TURN_COST_M * float(self.bend[other]) + self.outside[other]
+                lanes = (*lane_path.lanes, other)
+                result.append(
+                    replace(lane_path, lanes=lanes, ahead=self.reach(lane_path), entry=0.0, penalty=penalty)
+                )
+        if lane_path.changes >= MOST_CHANGES:
+            return result
+        for other, shift in graph.neighbours(lane):
+            low, high, _ = change_room(graph, lane, other, lane_path.entry)
+            if self.drivable[other] and other not in lane_path.lanes and high - low >= CHANGE_M:
+                changed = replace(
+                    lane_path,
+                    lanes=(*lane_path.lanes, other),
+                    ahead=lane_path.ahead - shift,
+                    entry=low + shift + CHANGE_M,
+                    penalty=lane_path.penalty + CHANGE_COST_M + self.outside[other],
+                    changes=lane_path.changes + 1,
+                )
+                result.append(changed)
+        return result
+
+    def _signature(self, lane_path: LanePath) -> tuple[int, ...]:
+        """Lanes at a third, two thirds and all of the required length; a lane left by a change is its neighbour."""
+        graph = self.graph
+        ends, reach = [], -lane_path.s
+        for lane, following in zip(lane_path.lanes, (*lane_path.lanes[1:], -1), strict=True):
+            if following < 0 or not is_change(graph, lane, following):
+                reach += float(graph.lines.length[lane])
+            ends.append(reach)
+        marks = np.searchsorted(ends, self.need_m * np.array([1 / 3, 2 / 3, 1.0]))
+        return tuple(lane_path.lanes[min(int(i), len(lane_path.lanes) - 1)] for i in marks)
 
 
 def is_change(graph: LaneGraph, lane: int, following: int) -> bool:
-    """Whether going from one lane to the next means moving sideways."""
-    beside = following in (graph.left[lane], graph.right[lane])
-    return beside and following not in graph.successor[lane]
+    """Return whether the step from one lane to the next is a lane change."""
+    adjacent = following in (graph.left[lane], graph.right[lane])
+    return adjacent and following not in graph.successor[lane]
 
 
 def change_room(graph: LaneGraph, lane: int, following: int, entry_m: float) -> tuple[float, float, float]:
-    """Where a lane's neighbour runs beside it, at or after ``entry_m``.
+    """Stretch of a lane, from ``entry_m`` on, along which its neighbour runs.
 
     Returns:
-        Begin and end of the stretch in arc length of the lane, and what to add for arc length of the neighbour.
+        Begin and end in arc length of the lane, and the offset to arc length of the neighbour.
     """
     on_left = graph.left[lane] == following
     shift = float(graph.left_shift[lane] if on_left else graph.right_shift[lane])
@@ -50,16 +263,16 @@ def trace(
     place: float,
     change_m: float = CHANGE_M,
 ) -> Line:
-    """The line along a sequence of lanes.
+    """Draw the line along a sequence of lanes.
 
     Args:
         graph: The lane graph.
-        lanes: Dense indices; each follows the one before as successor or as neighbour.
+        lanes: Dense indices; each is a successor or neighbour of the previous one.
         begin_m: Arc length on the first lane where the line begins.
-        ahead_m: Where the first lane starts, metres ahead of the ego (negative: behind).
-        window_m: Lane changes begin and end in this range ahead of the ego where there is room for them.
-        place: Where in the possible stretch a change happens: 0 as early as possible, 1 as late as possible.
-        change_m: Length of a change where there is room for it.
+        ahead_m: Distance from the ego to the start of the first lane (negative: behind), metres.
+        window_m: Range ahead of the ego for lane changes, where there is room.
+        place: Position of a lane change in its stretch: 0 as early, 1 as late as possible.
+        change_m: Length of a lane change, where there is room.
     """
     parts: list[Line] = []
     s = begin_m
@@ -80,13 +293,13 @@ def trace(
     xyz = np.concatenate([part[0] for part in parts])
     label = np.concatenate([part[1] for part in parts])
     step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
-    # Of two equal points the later one stays: what lies ahead of it belongs to its lane.
+    # Of two equal points keep the later one, which has the lane of what lies ahead.
     keep = np.concatenate((step > 0.01, [True]))
     return xyz[keep], label[keep]
 
 
 def _stretch(graph: LaneGraph, lane: int, begin: float, end: float) -> Line:
-    """A lane's own points between two arc lengths, ends included."""
+    """Points of a lane between two arc lengths, ends included."""
     part = slice(graph.lines.start[lane], graph.lines.start[lane + 1])
     arc = graph.lines.arc[part]
     ends = graph.lines.at(np.array([lane, lane]), np.array([begin, end]))
@@ -96,7 +309,7 @@ def _stretch(graph: LaneGraph, lane: int, begin: float, end: float) -> Line:
 
 
 def _close_gap(parts: Sequence[Line], line: Line) -> Line:
-    """Shifts the beginning of a line onto the end of the one before; the shift fades out along it."""
+    """Shift the beginning of a line onto the end of the previous one; the shift fades out."""
     if not parts:
         return line
     gap = parts[-1][0][-1] - line[0][0]
@@ -109,27 +322,23 @@ def _close_gap(parts: Sequence[Line], line: Line) -> Line:
 
 
 def _blend(graph: LaneGraph, lane: int, following: int, leave: float, length: float) -> tuple[Line, float]:
-    """The way from one lane to its neighbour, and the arc length on the neighbour where it arrives.
+    """Line from a lane to its neighbour, and the arc length on the neighbour where it ends.
 
     Lateral motion by the quintic 10 t^3 - 15 t^4 + 6 t^5: no jump in heading or curvature at the ends.
     """
     part = slice(graph.lines.start[following], graph.lines.start[following + 1])
     t = np.linspace(0.0, 1.0, int(np.ceil(length)) + 1)
-    one = graph.lines.at(np.full(len(t), lane), leave + t * length)
-    s, _ = project(graph.lines.points[part], one[[0, -1], :2])
-    other = graph.lines.at(np.full(len(t), following), s[0] + t * (s[1] - s[0]))
+    origin = graph.lines.at(np.full(len(t), lane), leave + t * length)
+    s, _ = project(graph.lines.points[part], origin[[0, -1], :2])
+    target = graph.lines.at(np.full(len(t), following), s[0] + t * (s[1] - s[0]))
     weight = (t**3 * (10.0 - 15.0 * t + 6.0 * t**2))[:, None]
-    return ((1.0 - weight) * one + weight * other, np.where(t < 0.5, lane, following)), float(s[1])
+    return ((1.0 - weight) * origin + weight * target, np.where(t < 0.5, lane, following)), float(s[1])
 
 
 def follow(graph: LaneGraph, lanes: Sequence[int], ahead_m: float, need_m: float) -> tuple[int, ...]:
-    """Continues a sequence of lanes along the straightest successors.
+    """Continue a sequence of lanes along the straightest successors, from ``ahead_m`` to ``need_m`` ahead of the ego.
 
-    Args:
-        graph: The lane graph.
-        lanes: Dense indices.
-        ahead_m: Where the last of them ends, metres ahead of the ego.
-        need_m: How far ahead to go; the sequence ends earlier where lanes end or repeat.
+    The sequence ends earlier where lanes end or repeat.
     """
     result = list(lanes)
     while ahead_m < need_m:
@@ -146,15 +355,8 @@ def walk(
 ) -> tuple[Float[Array, "start count 2"], Float[Array, "start count"]]:
     """Points ahead along lanes and their straightest successors; straight on where lanes end.
 
-    Args:
-        graph: The lane graph.
-        lane: Start lanes, all valid.
-        s: Arc lengths on them.
-        step_m: Distance between the points, metres.
-        count: Number of points; the first lies one step ahead of the start.
-
-    Returns:
-        Points, and the lanes' headings there.
+    The first of ``count`` points lies ``step_m`` ahead of arc length ``s`` on each start lane. Returns points and
+    headings.
     """
     distance = step_m * np.arange(1, count + 1)
     chain, begin = [lane], [-s]
@@ -178,13 +380,9 @@ def walk(
 def precede(
     graph: LaneGraph, lane: int, need_m: float, driven: Float[Array, "step 2"]
 ) -> tuple[tuple[int, ...], float]:
-    """Lanes before a lane, nearest to where the ego came from, and their total length.
+    """Predecessors of a lane along the ego's past positions ``driven``, and their total length.
 
-    Args:
-        graph: The lane graph.
-        lane: Dense index.
-        need_m: Wanted length; shorter where lanes begin.
-        driven: Positions of the ego up to now.
+    They are ``need_m`` long, or less where lanes begin.
     """
     result: list[int] = []
     total = 0.0
@@ -206,7 +404,7 @@ def _mean_distance(graph: LaneGraph, lane: int, driven: Float[Array, "step 2"]) 
 
 
 def continue_straight(line: Line, behind_m: float, ahead_m: float) -> Line:
-    """Lengthens a line at both ends in the direction it has there; the new points have no lane."""
+    """Extend a line straight on at both ends; the new points have no lane."""
     xyz, label = line
     if ahead_m > 0.0:
         tip = xyz[-1] + _end_direction(xyz) * ahead_m

@@ -1,4 +1,4 @@
-"""The lane graph: which lanes there are, how they connect, how wide they are, and which one a pose is on."""
+"""The lane graph: lanes, their links and widths, and the lanes under a pose."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from drivax.errors import DataError
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import Polylines, point_to_segment
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.segments import LONGEST_M, Segments, inside_box
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAR_LANE_KINDS, LANE_KINDS, Flag, RoadKind, among
@@ -49,17 +49,12 @@ class LaneGraph:
         width: Metres, -1 unknown.
         limit: Speed limit in m/s, -1 unknown.
         interpolating: Turn paths inside junctions (WOMD).
-        successor: Dense indices, -1 padded, the straightest first.
-        predecessor: Dense indices, -1 padded, the straightest first.
-        left: Neighbour in the same direction, -1 none.
-        right: Neighbour in the same direction, -1 none.
-        left_shift: Arc length on the left neighbour beside arc length s, minus s, metres.
-        right_shift: The same for the right neighbour.
+        successor, predecessor: Dense indices, -1 padded, the straightest first.
+        left, right: Neighbours in the same direction, -1 none.
+        left_shift, right_shift: Arc length on the neighbour at arc length s, minus s, metres.
         chained: Whether the links were made from geometry.
-        linked: Whether there is any successor.
         dropped_links: Links beyond the four that are stored.
-        lost: What the source names and does not hold: ``dangling_links`` (successors and predecessors) and
-            ``dangling_neighbours``.
+        lost: Numbers of ``dangling_links`` (successors and predecessors) and ``dangling_neighbours`` of the source.
     """
 
     lines: Polylines
@@ -86,7 +81,7 @@ class LaneGraph:
 
     @property
     def linked(self) -> bool:
-        """Whether any lane leads to another."""
+        """Whether any lane has a successor."""
         return bool((self.successor >= 0).any())
 
     @property
@@ -102,17 +97,13 @@ class LaneGraph:
         return {int(lane): i for i, lane in enumerate(self.lane_id)}
 
     def neighbours(self, lane: int) -> list[tuple[int, float]]:
-        """Lanes beside a lane in the same direction, each with its arc-length shift."""
+        """Adjacent lanes in the same direction, each with its arc-length shift."""
         sides = ((self.left[lane], self.left_shift[lane]), (self.right[lane], self.right_shift[lane]))
         return [(int(other), float(shift)) for other, shift in sides if other >= 0]
 
 
 def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> LaneGraph:
-    """Builds the lane graph of all lanes that have a direction (two or more points, some length).
-
-    Args:
-        features: The source's map features. Links to features that are missing or no lanes are dropped and counted.
-        origin: Origin of the local frame in the source's frame.
+    """Build the lane graph of all lanes of two or more points; dangling links are dropped and counted.
 
     Raises:
         DataError: Two lanes share an id.
@@ -134,13 +125,12 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
     successor, lost = _link_table(pairs, end, begin)
     predecessor, lost_back = _link_table([(b, a) for a, b in pairs], begin, end)
     samples = _samples(lines)
-    left, left_shift, left_gap = _beside(lanes, index, samples, lines.length, "left_neighbours")
-    right, right_shift, right_gap = _beside(lanes, index, samples, lines.length, "right_neighbours")
+    left, left_shift, left_gap = _adjacent(lanes, index, samples, lines.length, "left_neighbours")
+    right, right_shift, right_gap = _adjacent(lanes, index, samples, lines.length, "right_neighbours")
     gap = np.fmin(left_gap, right_gap)
     measured = np.where((gap >= WIDTHS_M[0]) & (gap <= WIDTHS_M[1]), gap, -1.0)
     given = np.array(
-        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes],
-        dtype=np.float64,
+        [lane.width_m if _within(lane.width_m, MOST_WIDTH_M) else np.nan for lane in lanes], dtype=np.float64
     )
     return LaneGraph(
         lines=lines,
@@ -166,12 +156,12 @@ def lane_graph(features: Sequence[MapFeature], origin: Float[Array, " 3"]) -> La
 
 
 def _dangling(lanes: Sequence[MapFeature], index: Mapping[int, int], names: Sequence[str]) -> int:
-    """How many links of these kinds name a lane that is not there."""
+    """Number of links of these kinds to missing lanes."""
     return sum(other not in index for lane in lanes for name in names for other in getattr(lane, name))
 
 
 def known_limit(feature: MapFeature) -> float:
-    """Speed limit of a lane in m/s; -1 where there is none that can be believed, and for what is no lane."""
+    """Plausible speed limit of a lane in m/s, else -1."""
     limit = feature.limit_mps if feature.kind in LANE_KINDS else None
     return limit if limit is not None and _within(limit, MOST_LIMIT_MPS) else -1.0
 
@@ -204,7 +194,7 @@ def _linked_pairs(lanes: Sequence[MapFeature], index: Mapping[int, int]) -> list
 
 
 def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> list[tuple[int, int]]:
-    """Pairs of lanes of which one ends where and as the other begins."""
+    """Pairs of lanes where the end of the first meets the beginning of the second, in place and heading."""
     if lines.count == 0:
         return []
     first, last = lines.points[lines.start[:-1]], lines.points[lines.start[1:] - 1]
@@ -223,7 +213,7 @@ def _chained_pairs(lines: Polylines, begin: Array, end: Array, kind: Array) -> l
 def _link_table(
     pairs: Sequence[tuple[int, int]], out_heading: Array, in_heading: Array
 ) -> tuple[Int[Array, "lane 4"], int]:
-    """Up to four links per lane, the straightest first, and how many did not fit."""
+    """Up to four links per lane, the straightest first, and the number of links that did not fit."""
     table = np.full((len(out_heading), LINKS), -1, dtype=np.int64)
     used = np.zeros(len(out_heading), dtype=np.int64)
     if not pairs:
@@ -238,31 +228,28 @@ def _link_table(
 
 
 def _samples(lines: Polylines) -> Float[Array, "lane sample 2"]:
-    """Evenly spaced points of every lane: enough to measure neighbours with."""
+    """Evenly spaced points of every lane, to measure neighbours."""
     fraction = np.linspace(0.0, 1.0, _SAMPLES)
     if lines.count == 0:
         return np.zeros((0, _SAMPLES, 2))
     return lines.at(np.arange(lines.count)[:, None], lines.length[:, None] * fraction)[..., :2]
 
 
-def _beside(
+def _adjacent(
     lanes: Sequence[MapFeature], index: Mapping[int, int], samples: Array, length: Array, side: str
 ) -> tuple[Int[Array, " lane"], Float[Array, " lane"], Float[Array, " lane"]]:
-    """The neighbour that runs beside a lane the same way, its arc-length shift, and the gap between them.
+    """Adjacent lane in the same direction, its arc-length shift, and the gap between them.
 
-    Of several the one that lies beside most of the lane, then the nearest. Neighbours that run the other way
-    (oncoming lanes in Argoverse 2) are no neighbours here.
+    Of several, the lane that runs along most of this one, then the nearest. Oncoming lanes (neighbours in Argoverse 2)
+    do not count.
     """
     best, shift, gap = np.full(len(lanes), -1), np.zeros(len(lanes)), np.full(len(lanes), np.nan)
-    pairs = list(
-        dict.fromkeys(
-            (i, index[j]) for i, lane in enumerate(lanes) for j in getattr(lane, side) if index.get(j, i) != i
-        )
-    )
+    links = ((i, j) for i, lane in enumerate(lanes) for j in getattr(lane, side))
+    pairs = list(dict.fromkeys((i, index[j]) for i, j in links if index.get(j, i) != i))
     if not pairs:
         return best, shift, gap
     a, b = np.array(pairs).T
-    interior, distance, offset = _measure_beside(samples, length, a, b)
+    interior, distance, offset = _measure_adjacent(samples, length, a, b)
     ok = interior.any(axis=1)
     a, b, interior, share = a[ok], b[ok], interior[ok], interior.sum(axis=1)[ok]
     pick = (np.arange(len(a)), (share - 1) // 2)  # the (lower) median of the interior probes
@@ -273,8 +260,8 @@ def _beside(
     return best, shift, gap
 
 
-def _measure_beside(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """For probes along lanes ``a``: is ``b`` beside and parallel there, how far, and its arc length minus a's."""
+def _measure_adjacent(samples: Array, length: Array, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Whether lane ``b`` is adjacent and parallel at probes along ``a``, its distance, and its arc-length shift."""
     fraction = np.array(_PROBES)
     at = np.round(fraction * (_SAMPLES - 1)).astype(np.int64)
     probe = samples[a][:, at]
@@ -293,7 +280,7 @@ def _measure_beside(samples: Array, length: Array, a: Array, b: Array) -> tuple[
 
 
 def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
-    """The graph of these lanes only, with new dense indices; links to other lanes are dropped."""
+    """Return the graph of these lanes with new dense indices; links to other lanes are dropped."""
     new = np.full(graph.count + 1, -1)
     new[rows] = np.arange(len(rows))
     lines = [graph.lines.points[graph.lines.start[i] : graph.lines.start[i + 1]] for i in rows]
@@ -310,13 +297,13 @@ def select(graph: LaneGraph, rows: Int[Array, " kept"]) -> LaneGraph:
 
 
 def _compact(links: Int[Array, "lane 4"]) -> Int[Array, "lane 4"]:
-    """Moves missing links to the end of each row."""
+    """Move missing links to the end of each row."""
     return np.take_along_axis(links, np.argsort(links < 0, axis=1, kind="stable"), axis=1)
 
 
 @dataclass(frozen=True)
 class LaneSegments:
-    """The segments of lanes, for asking which lane a pose is on.
+    """Segments of lanes, to look up the lanes under a pose.
 
     Attributes:
         segments: Segments of car lanes.
@@ -341,7 +328,7 @@ class LaneSegments:
     def nearest(
         self, xyz: Float[Array, "pose 3"], heading: Float[Array, " pose"], reach_m: float, turn_rad: float
     ) -> tuple[Int[Array, " pose"], Float[Array, " pose"], Float[Array, " pose"]]:
-        """The lane that fits each pose best: nearest within reach, heading gate and level.
+        """Nearest lane of each pose within reach, heading difference and level.
 
         Returns:
             Dense lane index (-1 none), arc length on it, distance from it in metres.
@@ -352,25 +339,25 @@ class LaneSegments:
         distance, s = near._measure(xyz, heading, turn_rad)
         best = distance.argmin(axis=1)
         rows = np.arange(len(xyz))
-        found = distance[rows, best] <= reach_m
-        return np.where(found, near.lane[best], -1), s[rows, best], distance[rows, best]
+        reached = distance[rows, best] <= reach_m
+        return np.where(reached, near.lane[best], -1), s[rows, best], distance[rows, best]
 
     def around(
         self, xyz: Float[Array, " 3"], heading: float, reach_m: float, turn_rad: float
     ) -> list[tuple[int, float, float]]:
-        """All lanes that fit one pose: (lane, arc length on it, distance), the nearest first."""
+        """Lanes within reach of a pose as (lane, arc length on it, distance), the nearest first."""
         near = self._near(xyz[None, :2], reach_m)
         distance, s = near._measure(xyz[None], np.array([heading]), turn_rad)
-        found: dict[int, tuple[int, float, float]] = {}
+        lanes: dict[int, tuple[int, float, float]] = {}
         for i in np.argsort(distance[0], kind="stable"):
             if distance[0, i] > reach_m:
                 break
             lane = int(near.lane[i])
-            found.setdefault(lane, (lane, float(s[0, i]), float(distance[0, i])))
-        return list(found.values())
+            lanes.setdefault(lane, (lane, float(s[0, i]), float(distance[0, i])))
+        return list(lanes.values())
 
     def _near(self, xy: Float[Array, "pose 2"], reach_m: float) -> LaneSegments:
-        """The segments in the box of the poses, widened by the reach."""
+        """Segments in the box of the poses, widened by the reach."""
         if len(xy) == 0 or len(self.segments) == 0:
             return LaneSegments(self.segments.take(np.zeros(0, int)), self.lane[:0], self.heading[:0])
         rows = np.flatnonzero(inside_box(self.segments.a[:, :2], xy, reach_m + LONGEST_M))
@@ -387,7 +374,7 @@ class LaneSegments:
 
 
 def lane_of_feature(graph: LaneGraph, feature: Int[Array, " row"]) -> Int[Array, " row"]:
-    """Dense lane index of source feature rows, -1 where they are no lane of the graph."""
+    """Dense lane index of source features, -1 for those that are no lane of the graph."""
     size = max(int(graph.feature.max(initial=-1)), int(feature.max(initial=-1))) + 2
     table = np.full(size, -1)
     table[graph.feature] = np.arange(graph.count)

@@ -17,25 +17,24 @@ from drivax.scenario.schema import RoadKind
 
 Array = np.ndarray[Any, Any]
 
-#: Half the width of a stop line where the lane's width is unknown, metres.
+#: Half the width of a stop line on a lane of unknown width, metres.
 HALF_WIDTH_M = 1.85
-#: A light whose lane is missing from the map takes the heading of a lane segment this near.
+#: A light without a lane takes the heading of a lane segment within this distance.
 LANE_REACH_M = 2.0
 LANES_PER_STOP = 4
 
 
 @dataclass(frozen=True)
 class Lights:
-    """Lights in the local frame.
+    """Traffic lights in the local frame.
 
     Attributes:
         line: Stop lines from left to right of the lane: x, y, x, y.
         z: Heights of the stop points.
-        lane: Dense lane index, -1 where the map lacks the lane.
-        heading: Of the lane at the stop point.
-        exit_heading: Of the lane at its end.
+        lane: Dense lane index, -1 if the lane is missing in the map.
+        heading, exit_heading: Headings of the lane at the stop point and at its end.
         state: States over time, -1 unobserved.
-        overflow: Lights that do not fit, or whose direction nothing tells, by name.
+        overflow: Numbers of lights that do not fit or have no known direction, by name.
     """
 
     line: Float[Array, "light 4"]
@@ -55,16 +54,7 @@ def place_lights(
     path: Float[Array, "step 2"],
     most: int,
 ) -> Lights:
-    """Stop lines across the lanes at the stop points.
-
-    Args:
-        lights: The source's lights, one per lane.
-        graph: The lane graph.
-        on: Lane segments of the same graph.
-        origin: Origin of the local frame.
-        path: A few points along the ego's log; the nearest lights are kept.
-        most: Number of slots.
-    """
+    """Place stop lines across the lanes at the stop points; keep the ``most`` lights nearest to ``path``."""
     steps = len(lights[0].states) if lights else 0
     stop = np.array([light.stop_point for light in lights], dtype=np.float64).reshape(-1, 3) - origin
     index = graph.index()
@@ -98,7 +88,7 @@ def place_lights(
 def _arc_at(
     graph: LaneGraph, lane: Int[Array, " light"], xy: Float[Array, "light 2"]
 ) -> Float[Array, " light"]:
-    """Arc length of the point of each lane that is nearest to a stop point."""
+    """Arc length on each lane of the point nearest to its stop point."""
     result = np.zeros(len(lane))
     lines = graph.lines
     for i, (row, point) in enumerate(zip(lane, xy, strict=True)):
@@ -111,7 +101,7 @@ def _arc_at(
 
 
 def _heading_near(on: LaneSegments, stop: Float[Array, "3"]) -> float:
-    """Heading of the nearest lane segment, NaN where none is near."""
+    """Heading of the nearest lane segment, NaN without one in reach."""
     if len(on.segments) == 0:
         return float("nan")
     distance, _ = point_to_segment(stop[:2], on.segments.a[:, :2], on.segments.b[:, :2])
@@ -121,7 +111,7 @@ def _heading_near(on: LaneSegments, stop: Float[Array, "3"]) -> float:
 
 @dataclass(frozen=True)
 class Stops:
-    """Stop signs in the local frame: where, and up to four dense lane indices each (-1 padded)."""
+    """Stop signs in the local frame, each with up to four dense lane indices (-1 padded)."""
 
     xy: Float[Array, "stop 2"]
     lane: Int[Array, "stop 4"]
@@ -135,7 +125,7 @@ def place_stops(
     path: Float[Array, "step 2"],
     most: int,
 ) -> Stops:
-    """Stop signs with the lanes that they control; the nearest to the ego's log are kept."""
+    """Place stop signs with the lanes that they control; keep the ``most`` signs nearest to ``path``."""
     signs = [f for f in features if f.kind == RoadKind.STOP_SIGN and len(f.points)]
     xy = np.array([f.points[0] for f in signs], dtype=np.float64).reshape(-1, 3)[:, :2] - origin[:2]
     index = graph.index()

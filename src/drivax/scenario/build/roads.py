@@ -1,4 +1,4 @@
-"""The observation layer: lanes, edges and crosswalks in pieces of at most 10 m, in order of rank."""
+"""Pieces of road to observe: lanes, edges and crosswalks in pieces of at most 10 m, in order of rank."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import cut_counts
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lanes import known_limit
 from drivax.scenario.build.segments import RoadLines, inside_box, path_distance
 from drivax.scenario.recording import MapFeature
@@ -21,19 +21,18 @@ Array = np.ndarray[Any, Any]
 PIECE_M = 10.0
 #: A closed ring is cut into at least this many pieces, so that each has a direction.
 RING_PIECES = 4
-#: Rows rank by rings of this width around the ego's log.
+#: Pieces rank by rings of this width around the log of the ego.
 RING_M = 50.0
 
 
 @dataclass(frozen=True)
 class RoadRows:
-    """Rows of the observation layer, the most useful first, local frame.
+    """Pieces of road in the local frame, in order of rank.
 
     Attributes:
-        xy: Point in the middle of the piece (by arc length).
-        direction: Unit vector from its first to its last point.
+        xy: Midpoint by arc length.
+        direction: Unit vector from the first to the last point.
         length: Arc length, metres.
-        kind: Road kind.
         limit: Speed limit in m/s, -1 unknown or no lane.
         curvature: Heading change per metre, 1/m, left positive.
         overflow: Rows that did not fit, by name.
@@ -49,20 +48,11 @@ class RoadRows:
 
 
 def road_rows(
-    roads: RoadLines,
-    features: Sequence[MapFeature],
-    path: Float[Array, "step 2"],
-    margin_m: float,
-    most: int,
+    roads: RoadLines, features: Sequence[MapFeature], path: Float[Array, "step 2"], margin_m: float, most: int
 ) -> RoadRows:
-    """Cuts lanes, road edges and crosswalks into pieces and ranks them.
+    """Cut lanes, road edges and crosswalks into pieces and keep the ``most`` highest ranks.
 
-    Args:
-        roads: The map's polylines.
-        features: The source features, for speed limits.
-        path: A few points along the ego's log.
-        margin_m: Pieces whose middle lies further outside the log's box are left out.
-        most: Number of rows.
+    Pieces whose midpoint lies more than ``margin_m`` outside the box of ``path``, the log of the ego, are left out.
     """
     line = np.flatnonzero(np.isin(roads.kind, (*LANE_KINDS, *EDGE_KINDS, RoadKind.CROSSWALK)))
     length = roads.lines.length[line]
@@ -90,14 +80,14 @@ def road_rows(
         length=span,
         kind=kind,
         limit=np.array(limits, dtype=np.float64)[roads.feature[owner]] if len(owner) else np.zeros(0),
-        # A straight road has 0, not the last bit of an angle or the sign of it: those depend on the processor.
+        # Rounded: the last bits of angles depend on the processor.
         curvature=np.round(turn / (span * 2 / 3), 6) + 0.0,
         overflow={"road_rows": lost} if lost else {},
     )
 
 
 def _class_of(kind: Int[Array, " row"]) -> Int[Array, " row"]:
-    """0 lane, 1 edge, 2 crosswalk."""
+    """Class of road kinds: 0 lane, 1 edge, 2 crosswalk."""
     return np.where(among(kind, LANE_KINDS), 0, np.where(among(kind, EDGE_KINDS), 1, 2))
 
 
@@ -116,17 +106,10 @@ def _direction(roads: RoadLines, line: Array, begin: Array, end: Array) -> Float
 
 
 def rank(group: Int[Array, " row"], far: Float[Array, " row"]) -> Int[Array, " row"]:
-    """An order of which every prefix spreads evenly over each group, nearer rings first.
+    """Order pieces so that every prefix spreads evenly over each group, nearer rings first.
 
     Within a ring of 50 m around the log, the rows of a group (in order along the map) are taken in bit-reversed
     order (van der Corput's sequence), and the groups are interleaved in proportion to their sizes.
-
-    Args:
-        group: Class of each row; rows come in order along the map.
-        far: Distance from the ego's log, metres.
-
-    Returns:
-        Row indices, first rank first.
     """
     ring = np.floor(far / RING_M).astype(np.int64)
     place = np.zeros(len(group))
@@ -142,7 +125,7 @@ def _members(label: Int[Array, " row"]) -> list[Int[Array, " member"]]:
 
 
 def _bit_reversed_place(count: int) -> Int[Array, " count"]:
-    """Place of each of ``count`` items when they are taken in order of their reversed binary index."""
+    """Rank of each of ``count`` items in the order of their bit-reversed indices."""
     bits = max(int(count - 1).bit_length(), 1)
     index = np.arange(count)
     reverse = np.zeros(count, dtype=np.int64)

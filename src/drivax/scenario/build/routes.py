@@ -1,13 +1,14 @@
-"""Routes: ways along the lane graph from where the ego is, at one point per metre.
+"""Routes along the lane graph from the pose of the ego, one point per metre.
 
-Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the log's route
-see the ego's poses up to the current step and the goal region only; among routes that reach the goal equally well
-the one nearest to the log is taken. Routes come from this project's search of the lane graph (``graph``), or from
-the published one (``published``, :mod:`drivax.scenario.build.route_published`); both are drawn by the same code.
+Row 0 leads to the goal, row 1 is the log itself (privileged), the others are alternatives. All but the route of the log
+depend on the poses up to the current step and on the goal region only; among routes that reach the goal equally well
+the nearest to the log is taken. Candidates come from the search of this project (``graph``) or from the published
+search (``published``).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -18,6 +19,10 @@ from jaxtyping import Bool, Float, Int
 from drivax.geometry.polylines import arc_lengths, headings, project, project_monotone, resample
 from drivax.scenario.build.lane_paths import (
     CHANGE_M,
+    REACH_M,
+    SAME_TURN_RAD,
+    LanePath,
+    LaneSearch,
     continue_straight,
     follow,
     is_change,
@@ -25,17 +30,28 @@ from drivax.scenario.build.lane_paths import (
     trace,
     walk,
 )
-from drivax.scenario.build.lane_search import REACH_M, SAME_TURN_RAD, LaneSearch, Way
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
-from drivax.scenario.build.route_published import LEAST_M, published_ways
-from drivax.scenario.build.route_start import join
 from drivax.scenario.build.segments import thin_path
 
+#: A route may run this far from the driven path; a larger offset is taken back.
+OFFSET_M = 1.0
+#: Least distance between driven poses that are compared with a line.
+_APART_M = 1.0
+#: The ego drifts across a line by at most this many metres per metre (a change of 3.5 m within 12 m).
+_MOST_SLOPE = 0.3
+#: The line goes over to the ego's poses within this distance behind the first of them.
+_BEHIND_M = 20.0
+#: Published candidates begin on lanes within this distance of the ego at the start of the log, m.
+PUBLISHED_REACH_M = 2.5
+LEAST_M, MOST_PATHS = 250.0, 10
+#: A lane that turns by more than this is a turn.
+TURN_RAD = np.deg2rad(30.0)
+CHANGE_WEIGHT, TURN_WEIGHT, LENGTH_WEIGHT, CURVATURE_WEIGHT = -0.3, -0.2, 0.1, -0.1
+#: Paths that the published search expands at most.
+MOST_EXPANSIONS = 5000
 Array = np.ndarray[Any, Any]
-
 #: How candidates are made: by the search of this project, or as published.
 RouteStyle = Literal["graph", "published"]
-
 SPACING_M = 1.0
 #: Candidates are this long at least, or as far as the present speed carries in ``AHEAD_S``.
 AHEAD_M, AHEAD_S = 200.0, 12.0
@@ -46,21 +62,21 @@ BEHIND_M = 20.0
 REACTION_S = 0.5
 #: Time that a lane change takes at the present speed.
 CHANGE_S = 3.0
-#: A route whose nearest point is further from the goal does not lead there.
+#: A route to the goal passes it within this distance.
 GOAL_M = 10.0
 #: Where along the stretch of two parallel lanes a route may change from one to the other.
 CHANGE_PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Steps of the log shorter than this are jitter of a standing car; a log that gets no further than that has no way.
+#: Shorter steps of the log are jitter of a standing car; a log that stays within the second distance has no path.
 STEP_M, STANDS_M = 0.5, 2.0
 #: The log's route goes on this far beyond the log.
 LOG_AHEAD_M = 100.0
-#: Its lanes are looked up at every so manyth of its points (0.5 to 3 m apart).
+#: Its lanes are looked up at every n-th of its points (0.5 to 3 m apart).
 LABEL_EVERY = 4
 
 
 @dataclass(frozen=True)
 class Route:
-    """Points 1 m apart along a way.
+    """Points 1 m apart along a lane path.
 
     Attributes:
         xyz: Points in the local frame, metres.
@@ -74,7 +90,7 @@ class Route:
 
     @classmethod
     def along(cls, xyz: Float[Array, "_ 3"], lane: Int[Array, " _"], most: int) -> Route:
-        """Resamples a polyline at 1 m, at most ``most`` points."""
+        """Resample a polyline at 1 m to at most ``most`` points."""
         points, index = resample(xyz, SPACING_M, most)
         return cls(points, headings(points), lane[index])
 
@@ -132,12 +148,7 @@ class RouteSet:
 
 @dataclass(frozen=True)
 class Intent:
-    """What the source knows about where the ego wants to go; dense lane indices, empty where it does not.
-
-    Attributes:
-        lanes: The lanes of the intended route in order.
-        corridor: All lanes that the intended route may use.
-    """
+    """Intended route according to the source: its lanes in order, or all lanes that it may use; empty if unknown."""
 
     lanes: tuple[int, ...] = ()
     corridor: tuple[int, ...] = ()
@@ -152,17 +163,7 @@ def find_routes(
     most_routes: int,
     most_points: int,
 ) -> RouteSet:
-    """All routes of a scenario.
-
-    Args:
-        graph: The lane graph.
-        on: Lane segments of the same graph.
-        ego: The logged ego.
-        intent: What the source says about the intended route; ``published`` routes do not look at it.
-        style: How candidates are made.
-        most_routes: Number of rows.
-        most_points: Points per route.
-    """
+    """Find all routes of a scenario; ``published`` candidates ignore the intended route."""
     log = log_route(graph, on, ego, most_points)
     draft = _published if style == "published" else _searched
     best, others = draft(graph, on, ego, intent, (most_routes, most_points))
@@ -177,12 +178,12 @@ def find_routes(
 def _searched(
     graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
 ) -> tuple[Route | None, list[Route]]:
-    """The route to the goal, if any, and the alternatives of the best-first search from the current step."""
+    """Route to the goal, if any, and alternatives, by best-first search from the current step."""
     pose = ego.xyz[ego.current], float(ego.heading[ego.current])
     need = max(AHEAD_M, float(ego.speed[ego.current]) * AHEAD_S)
     search = LaneSearch.start(graph, on, *pose, need, intent.corridor)
     drawer = _Drawer(graph, ego, most[1])
-    others = [drawer.draw(way, 0.0) for way in search.alternatives(most[0] - 1)]
+    others = [drawer.draw(lane_path, 0.0) for lane_path in search.alternatives(most[0] - 1)]
     end = ego.xyz[ego.last], float(ego.heading[ego.last])
     if intent.lanes:
         return _best(ego, drawer.variants([search.along(intent.lanes, *end)]), np.inf), others
@@ -192,20 +193,62 @@ def _searched(
 def _published(
     graph: LaneGraph, on: LaneSegments, ego: EgoLog, intent: Intent, most: tuple[int, int]
 ) -> tuple[Route | None, list[Route]]:
-    """The published candidates, the best score first, and the one of them that leads to the goal, if any."""
+    """Published candidate that leads to the goal, if any, and all candidates, the best score first."""
     ego = replace(ego, current=int(np.argmax(ego.valid)))
     search = LaneSearch.start(graph, on, ego.xyz[ego.current], float(ego.heading[ego.current]), LEAST_M)
     drawer = _Drawer(graph, ego, most[1], plain=True)
-    others = [drawer.draw(way, 0.0) for way in published_ways(search)]
+    others = [drawer.draw(lane_path, 0.0) for lane_path in published_paths(search)]
     return _best(ego, others, GOAL_M), others
 
 
-def _same(one: Route, other: Route) -> bool:
-    return len(one.xyz) == len(other.xyz) and bool(np.abs(one.xyz - other.xyz).max() < 0.1)
+def published_paths(search: LaneSearch) -> list[LanePath]:
+    """First ten complete paths of a breadth-first search, the best score first.
+
+    A path is complete with the first lane that ends 250 m or more ahead. From a lane the search goes to its successors,
+    the straightest first, then to its left and right neighbour where there is room for a change; paths never use a lane
+    twice and change lanes at most twice. Where the map ends too early for ten such paths, paths to its end are used.
+    The search begins at the first logged pose, on lanes within 2.5 m.
+    """
+    queue = deque(lane_path for lane_path in search.starts if lane_path.lateral <= PUBLISHED_REACH_M)
+    complete: list[LanePath] = []
+    ended: list[LanePath] = []
+    for _ in range(MOST_EXPANSIONS):
+        if not queue or len(complete) >= MOST_PATHS:
+            break
+        lane_path = queue.popleft()
+        if search.reach(lane_path) >= search.need_m:
+            complete.append(lane_path)
+            continue
+        following = search.following(lane_path)
+        if not any(not is_change(search.graph, lane_path.lanes[-1], child.lanes[-1]) for child in following):
+            ended.append(lane_path)
+        queue.extend(following)
+    return sorted([*complete, *ended][:MOST_PATHS], key=lambda lane_path: -score(search, lane_path))
+
+
+def score(search: LaneSearch, lane_path: LanePath) -> float:
+    """-0.3 lane changes - 0.2 turns + 0.1 length - 0.1 curvature.
+
+    Lane changes and turns (lanes whose heading changes by more than 30 degrees from end to end) are numbers, the length
+    ahead of the ego is in metres, and curvature is the heading change of all lanes from end to end per metre of that
+    length, rad/m. With these units a metre of length outweighs most of the rest, as published.
+    """
+    length = max(search.reach(lane_path), 1.0)
+    bend = search.bend[list(lane_path.lanes)]
+    return float(
+        CHANGE_WEIGHT * lane_path.changes
+        + TURN_WEIGHT * int((bend > TURN_RAD).sum())
+        + LENGTH_WEIGHT * length
+        + CURVATURE_WEIGHT * float(bend.sum()) / length
+    )
+
+
+def _same(route: Route, other: Route) -> bool:
+    return len(route.xyz) == len(other.xyz) and bool(np.abs(route.xyz - other.xyz).max() < 0.1)
 
 
 def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
-    """The route that passes nearest to the goal region, then nearest to the log; None where none comes in reach."""
+    """Route that passes nearest to the goal region, then nearest to the log; None without one in reach."""
     if not routes:
         return None
     path = thin_path(ego.seen[:, :2])
@@ -219,10 +262,10 @@ def _best(ego: EgoLog, routes: Sequence[Route], reach_m: float) -> Route | None:
 
 @dataclass(frozen=True)
 class _Drawer:
-    """Turns ways (lane sequences) into routes of at most ``most`` points for one ego.
+    """Draws routes of at most ``most`` points along lane paths.
 
-    A plain route begins beside the ego and keeps to the lanes; others begin 20 m behind the ego's first logged
-    position and bend to where the ego drove.
+    A plain route begins at the ego and keeps to the lanes; others begin 20 m behind the first logged position and bend
+    to the driven path.
     """
 
     graph: LaneGraph
@@ -230,32 +273,32 @@ class _Drawer:
     most: int
     plain: bool = False
 
-    def variants(self, ways: Sequence[Way]) -> list[Route]:
-        """Routes along the ways; a way with lane changes is drawn with early to late changes."""
+    def variants(self, lane_paths: Sequence[LanePath]) -> list[Route]:
+        """Routes along lane paths; those with lane changes are drawn with early to late changes."""
         routes = []
-        for way in ways:
-            steps = zip(way.lanes, way.lanes[1:], strict=False)
+        for lane_path in lane_paths:
+            steps = zip(lane_path.lanes, lane_path.lanes[1:], strict=False)
             changes = any(is_change(self.graph, a, b) for a, b in steps)
-            routes += [self.draw(way, place) for place in (CHANGE_PLACES if changes else (0.0,))]
+            routes += [self.draw(lane_path, place) for place in (CHANGE_PLACES if changes else (0.0,))]
         return routes
 
-    def draw(self, way: Way, place: float) -> Route:
-        """The route along a way to the end of its lanes and of those that follow them straight on."""
+    def draw(self, lane_path: LanePath, place: float) -> Route:
+        """Route along a lane path and the straightest successors of its last lane."""
         graph, ego = self.graph, self.ego
         driven = ego.driven[:, :2]
         behind = 0.0 if self.plain else BEHIND_M + float(arc_lengths(driven)[-1])
-        prefix, length = precede(graph, way.lanes[0], behind - way.s, driven)
-        begin = way.s + length - behind
-        ends = float(graph.lines.length[list(way.lanes)].sum()) - way.s
-        lanes = (*prefix, *follow(graph, way.lanes, ends, self.most * SPACING_M))
+        prefix, length = precede(graph, lane_path.lanes[0], behind - lane_path.s, driven)
+        begin = lane_path.s + length - behind
+        ends = float(graph.lines.length[list(lane_path.lanes)].sum()) - lane_path.s
+        lanes = (*prefix, *follow(graph, lane_path.lanes, ends, self.most * SPACING_M))
         speed = float(ego.speed[ego.current])
         change_m = max(CHANGE_M, CHANGE_S * speed)
         line = trace(
             graph,
             lanes,
             max(begin, 0.0),
-            -way.s - length,
-            (REACTION_S * speed, way.until),
+            -lane_path.s - length,
+            (REACTION_S * speed, lane_path.until),
             place,
             change_m,
         )
@@ -267,11 +310,65 @@ class _Drawer:
         return Route.along(points if self.plain else join(points, driven, change_m), label[index], self.most)
 
 
-def log_route(graph: LaneGraph, on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
-    """The logged ego's own way (privileged), continued along its last lane, else straight on.
+def join(
+    xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"], ahead_m: float
+) -> Float[Array, "point 3"]:
+    """Bend a line so that it passes within a metre of the driven path.
 
-    Positions within half a metre of the one before are skipped: the jitter of a standing car is no way. Of a log that
-    stays within 2 m only the last pose is used.
+    At each driven pose the line is shifted across by what its distance exceeds a metre; between the poses the shift
+    is interpolated along the line, and ahead of the last of them it fades out by a cubic polynomial that goes on in the
+    ego's direction (Hermite: its shift and slope at the ego, zero and zero at the end).
+
+    Args:
+        xyz: Points of the line, about 1 m apart.
+        driven: Positions of the ego up to now, in order.
+        ahead_m: How far ahead of the ego the line is on its lane again.
+    """
+    first = int(arc_lengths(driven)[-1] + 2 * _BEHIND_M) + 2
+    s, shift = _shifts(xyz[: max(first, 2)], driven)
+    if not shift.any():
+        return xyz
+    arc = arc_lengths(xyz)
+    across = np.interp(arc, s, shift)
+    back = slice(0, int(np.searchsorted(arc, s[0])))
+    ahead = slice(int(np.searchsorted(arc, s[-1], side="right")), len(arc))
+    slope = np.clip(np.diff(shift) / np.diff(s), -_MOST_SLOPE, _MOST_SLOPE) if len(s) > 1 else np.zeros(1)
+    across[back] = _fade(s[0] - arc[back], shift[0], -slope[0], _BEHIND_M)
+    across[ahead] = _fade(arc[ahead] - s[-1], shift[-1], slope[-1], ahead_m)
+    result = xyz.copy()
+    result[:, :2] += across[:, None] * _left(headings(xyz))
+    return result
+
+
+def _shifts(xyz: Float[Array, "point 3"], driven: Float[Array, "step 2"]) -> tuple[Array, Array]:
+    """Increasing arc lengths of driven poses along a line, and the shift of the line to its left there."""
+    s, _ = project(xyz, driven)
+    keep = [len(s) - 1]
+    for i in range(len(s) - 2, -1, -1):
+        if s[i] <= s[keep[-1]] - _APART_M:
+            keep.append(i)
+    rows = np.array(keep[::-1])
+    arc, course = arc_lengths(xyz), np.unwrap(headings(xyz))
+    foot = np.stack([np.interp(s[rows], arc, xyz[:, axis]) for axis in (0, 1)], axis=-1)
+    offset = np.einsum("ij,ij->i", driven[rows] - foot, _left(np.interp(s[rows], arc, course)))
+    return s[rows], np.sign(offset) * np.maximum(np.abs(offset) - OFFSET_M, 0.0)
+
+
+def _fade(distance: Array, shift: float, slope: float, length: float) -> Array:
+    """Cubic from a shift and its slope to zero and level at ``length``, zero beyond."""
+    t = np.clip(distance / length, 0.0, 1.0)
+    return shift * (1.0 + t**2 * (2.0 * t - 3.0)) + slope * length * t * (1.0 - t) ** 2
+
+
+def _left(heading: Array) -> Array:
+    return np.stack((-np.sin(heading), np.cos(heading)), axis=-1)
+
+
+def log_route(graph: LaneGraph, on: LaneSegments, ego: EgoLog, most_points: int) -> Route:
+    """Path of the logged ego (privileged), continued along its last lane, else straight on.
+
+    Positions within half a metre of the previous one are skipped as jitter; a log that stays within 2 m has only its
+    last pose.
     """
     seen, heading = ego.seen, ego.heading[ego.valid]
     keep = [0]
@@ -306,8 +403,8 @@ def _ahead(graph: LaneGraph, on: LaneSegments, pose: Float[Array, "3"], heading:
 def log_progress(route: Route, ego: EgoLog) -> Float[Array, " time"]:
     """Arc length of the logged ego along a route at every step, never decreasing, metres.
 
-    Each position is searched no further ahead than the ego has moved since the last valid one (and 2 m); steps
-    that are not valid repeat the last value.
+    Each position is searched no further ahead than 1.5 times the distance driven since the last valid step, plus 2 m.
+    Invalid steps repeat the last value.
     """
     rows = np.flatnonzero(ego.valid)
     moved = np.hypot(*np.diff(ego.seen[:, :2], axis=0, prepend=ego.seen[:1, :2]).T)

@@ -1,4 +1,4 @@
-"""Map features cut into the short straight segments that every map query reads."""
+"""Map features as polylines and as short straight segments for map queries."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from drivax.scenario.schema import CAR_LANE_KINDS, EDGE_KINDS, POLYGON_KINDS, Ro
 
 Array = np.ndarray[Any, Any]
 
-#: Longest segment; the grid's guarantee holds for 4 m, the rest is room for rounding to float32.
+#: Longest segment: 4 m, as the grid requires, less a margin for rounding to float32.
 LONGEST_M = 3.99
 TOLERANCE_M = 0.05
-#: 20 cm of height count as much as 5 cm in the plane.
+#: Weight of heights in the tolerance: 20 cm count as 5 cm in the plane.
 Z_WEIGHT = 0.25
-#: A ring is closed where its last point is this near to its first.
+#: Largest gap between the first and last point of a closed ring.
 CLOSED_M = 0.05
 
 
@@ -30,9 +30,8 @@ class RoadLines:
 
     Attributes:
         lines: The polylines; ``lines.arc`` is measured per polyline.
-        feature: Row of the source feature of each polyline.
-        kind: Road kind of each polyline.
-        closed: Whether a polyline is a closed ring.
+        feature: Row of the source feature.
+        closed: Mask of closed rings.
         arc: Arc length of every point along its source feature (gaps included), metres.
     """
 
@@ -48,10 +47,8 @@ class Segments:
     """Straight pieces of at most 4 m, in the local frame, float64.
 
     Attributes:
-        a: Start points.
-        b: End points.
-        kind: Road kind.
-        polyline: Row of the polyline that it is cut from.
+        a, b: Start and end points.
+        polyline: Row of the polyline.
         feature: Row of the source feature.
         start_m: Arc length at ``a`` along the source feature.
         span_m: Arc length between ``a`` and ``b`` along the source feature.
@@ -69,12 +66,12 @@ class Segments:
         return len(self.a)
 
     def take(self, rows: Array) -> Segments:
-        """The segments in these rows (indices or a mask)."""
+        """Select segments by indices or a mask."""
         return Segments(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
 
     @property
     def middle(self) -> Float[Array, "segment 2"]:
-        """Midpoints in the plane as the stored float32 end points give them."""
+        """Midpoints in the plane of the end points rounded to float32."""
         ends = self.a[:, :2].astype(np.float32), self.b[:, :2].astype(np.float32)
         return ((ends[0] + ends[1]) * np.float32(0.5)).astype(np.float64)
 
@@ -88,12 +85,9 @@ class Segments:
 def road_lines(
     features: Sequence[MapFeature], origin: Float[Array, " 3"], split_gap_m: float | None
 ) -> RoadLines:
-    """Features of two or more points as polylines in the local frame.
+    """Features of two or more points as polylines in the local frame; stop signs are left out.
 
-    Args:
-        features: The source's map features; stop signs have no line and are left out.
-        origin: Origin of the local frame in the source's frame, metres.
-        split_gap_m: Cut where neighbouring points are further apart than this; None: never. Polygons stay whole.
+    Polylines other than polygons are split where neighbouring points are more than ``split_gap_m`` apart.
     """
     rows = [i for i, f in enumerate(features) if f.kind != RoadKind.STOP_SIGN and len(f.points) >= 2]
     whole = Polylines.of([_outline(features[i]) for i in rows])
@@ -114,7 +108,7 @@ def road_lines(
 
 
 def _outline(feature: MapFeature) -> Array:
-    """Points of a feature; a polygon gets its first point again at the end."""
+    """Points of a feature; polygons are closed."""
     points = np.asarray(feature.points, dtype=np.float64)
     if feature.kind in POLYGON_KINDS and np.any(points[0] != points[-1]):
         return np.concatenate((points, points[:1]))
@@ -122,7 +116,7 @@ def _outline(feature: MapFeature) -> Array:
 
 
 def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " point"]]:
-    """Polylines that begin at these points, without those of one point or of no length."""
+    """Polylines that begin at these points, and the mask of their points; those without length are left out."""
     start = np.concatenate((begin, [len(points)])).astype(np.int64)
     counts = np.diff(start)
     arc = arc_lengths(points, start)
@@ -133,7 +127,7 @@ def _long_enough(points: Array, begin: Array) -> tuple[Polylines, Bool[Array, " 
 
 
 def cut(roads: RoadLines) -> Segments:
-    """Cuts polylines into segments: simplified to 5 cm, then no segment longer than 4 m, order kept."""
+    """Simplify polylines to 5 cm and cut them into segments of at most 4 m, in order."""
     keep = simplify(roads.lines, TOLERANCE_M, Z_WEIGHT)
     points, arc, line = roads.lines.points[keep], roads.arc[keep], roads.lines.row[keep]
     inner = line[1:] == line[:-1]
@@ -156,7 +150,7 @@ def cut(roads: RoadLines) -> Segments:
 
 
 def path_distance(xy: Float[Array, "point 2"], path: Float[Array, "step 2"]) -> Float[Array, " point"]:
-    """Distance of points from the nearest of a few points along the ego's log, metres."""
+    """Distance of points from the nearest point of ``path``, metres."""
     best = np.full(len(xy), np.inf)
     for x, y in path:
         np.minimum(best, np.hypot(xy[:, 0] - x, xy[:, 1] - y), out=best)
@@ -164,7 +158,7 @@ def path_distance(xy: Float[Array, "point 2"], path: Float[Array, "step 2"]) -> 
 
 
 def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array, "kept 2"]:
-    """First and last point of a trajectory and those about ``spacing_m`` apart between them."""
+    """Thin a trajectory to points about ``spacing_m`` apart, with its first and last point."""
     bin_number = np.floor(arc_lengths(xy) / spacing_m)
     keep = np.diff(bin_number, prepend=-1.0) > 0
     keep[-1] = True
@@ -174,6 +168,6 @@ def thin_path(xy: Float[Array, "step 2"], spacing_m: float = 5.0) -> Float[Array
 def inside_box(
     xy: Float[Array, "point 2"], path: Float[Array, "step 2"], margin_m: float
 ) -> Bool[Array, " point"]:
-    """Whether points lie in the axis-aligned box of a trajectory, widened by a margin."""
+    """Return whether points lie in the axis-aligned box of a trajectory, widened by a margin."""
     low, high = path.min(axis=0) - margin_m, path.max(axis=0) + margin_m
     return np.all((xy >= low) & (xy <= high), axis=1)

@@ -1,4 +1,4 @@
-"""Tracks sorted into those that move and those that stay where they are, with one box size each."""
+"""Tracks in the local frame, sorted into moving and parked agents with one box size each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lane_paths import walk
 from drivax.scenario.build.lanes import LaneGraph, LaneSegments
 from drivax.scenario.recording import Tracks
@@ -22,7 +22,7 @@ PARKED_RAD = 0.1
 EXTENSION_STEP_M = 4.0
 #: Over this distance an extension fades from the agent's lateral offset to the centre of its lane.
 FADE_M = 20.0
-#: Movers rank as if they were this much nearer to the ego.
+#: Agents that move rank as if they were nearer to the ego by this distance.
 MOVER_BONUS_M = 50.0
 MOVER_M = 2.0
 #: Bits of ``agent_flags``.
@@ -37,7 +37,7 @@ DEFAULT_SIZES = {
     AgentKind.STATIC: (0.5, 0.5, 1.0),
 }
 DEFAULT_EGO_SIZE = (4.9, 2.0, 1.5)
-#: No road user is longer; larger measurements are not believed.
+#: Larger measured sizes are ignored.
 MOST_SIZE_M = 100.0
 
 
@@ -49,12 +49,9 @@ class LocalTracks:
         xyz: Box centres, metres.
         heading: Radians in [-pi, pi).
         velocity: m/s.
-        size: Length, width, height: medians over the valid steps, metres.
-        valid: Whether a step was observed.
-        kind: Agent kinds.
-        track_id: Ids in the source.
+        size: Median length, width and height over the valid steps, metres.
         ego: Row of the ego.
-        defaulted: How many tracks took a size from their class.
+        defaulted: Number of tracks with a default size.
     """
 
     xyz: Float[Array, "track time 3"]
@@ -69,10 +66,10 @@ class LocalTracks:
 
 
 def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTracks:
-    """Moves tracks into the local frame and gives every track one box size.
+    """Move tracks into the local frame and give every track one box size.
 
-    Sizes vary by metres between steps of one object in public data; the median over valid measurements between 0
-    and 100 m is used, and class defaults where there is none.
+    The size is the median of valid measurements between 0 and 100 m, since sizes of one object vary by metres in public
+    data; without any it is the default of the class.
     """
     valid = tracks.valid.astype(bool)
     mask = valid[..., None]
@@ -92,7 +89,7 @@ def local_tracks(tracks: Tracks, ego: int, origin: Float[Array, "3"]) -> LocalTr
 
 
 def _sizes(tracks: Tracks, ego: int) -> tuple[Float[Array, "track 3"], int]:
-    """Median box size of every track, and how many tracks needed a default."""
+    """Median box size of every track, and the number of tracks with a default size."""
     plain = np.nan_to_num(tracks.size)
     measured = tracks.valid[..., None] & (plain > 0.0) & (plain <= MOST_SIZE_M)
     size = masked_median(np.swapaxes(tracks.size, 1, 2), np.swapaxes(measured, 1, 2))
@@ -116,13 +113,13 @@ def masked_median(values: Float[Array, "*row time"], valid: Bool[Array, "*row ti
 
 @dataclass(frozen=True)
 class Placement:
-    """Which track goes where.
+    """Slots of tracks.
 
     Attributes:
-        moving: Rows of the moving block in slot order; the ego first.
-        parked: Rows of the parked block in slot order.
+        moving: Tracks of the moving block in slot order; the ego first.
+        parked: Tracks of the parked block in slot order.
         pose: Median x, y, z and heading of every track.
-        overflow: Tracks that fit neither, by name.
+        overflow: Numbers of tracks that did not fit, by name.
     """
 
     moving: Int[Array, " slot"]
@@ -132,17 +129,11 @@ class Placement:
 
 
 def place(tracks: LocalTracks, marked: Sequence[int], agents: int, parked: int) -> Placement:
-    """Sorts tracks into the moving and the parked block, the most relevant first.
+    """Sort tracks into the moving and the parked block, the most relevant first.
 
-    A track is parked when at every valid step it is within 0.3 m of its median position and 0.1 rad of its median
-    heading. Rank: the ego, then marked tracks (to predict, of interest), then by the smallest distance to the ego
-    over the log, where movers count as 50 m nearer. Tracks that are never valid are left out and not counted.
-
-    Args:
-        tracks: The tracks.
-        marked: Rows of tracks to predict and of interest.
-        agents: Slots of the moving block.
-        parked: Slots of the parked block.
+    A track is parked if every valid pose is within 0.3 m and 0.1 rad of its median pose. The ego comes first, then
+    ``marked`` tracks (to predict, of interest), then tracks by their smallest distance to the ego over the log, where
+    those that move rank 50 m nearer. Tracks without a valid step are left out.
     """
     pose = median_pose(tracks)
     away = np.hypot(*np.moveaxis(tracks.xyz[..., :2] - pose[:, None, :2], -1, 0))
@@ -161,7 +152,7 @@ def place(tracks: LocalTracks, marked: Sequence[int], agents: int, parked: int) 
 
 
 def median_pose(tracks: LocalTracks) -> Float[Array, "track 4"]:
-    """Median x, y, z and heading over the valid steps; the heading's median is taken around its circular mean."""
+    """Median x, y, z and heading over the valid steps; the heading relative to its circular mean."""
     xyz = masked_median(
         np.swapaxes(tracks.xyz, 1, 2), np.broadcast_to(tracks.valid[:, None], _swapped(tracks))
     )
@@ -191,17 +182,10 @@ def _rank(
 def extend(
     tracks: LocalTracks, rows: Int[Array, " slot"], graph: LaneGraph, on: LaneSegments, count: int
 ) -> Float[Array, "slot count 2"]:
-    """Where agents would go on after their last logged pose: along their lane, else straight ahead.
+    """Extend tracks by ``count`` points 4 m apart beyond their last valid pose: along their lane, else straight on.
 
-    Vehicles and cyclists whose last valid pose lies within 3 m and 45 degrees of a lane follow it and its
-    straightest successors, 4 m apart; their lateral offset fades within 20 m. All others go straight on.
-
-    Args:
-        tracks: The tracks.
-        rows: Tracks to extend, each valid at least once.
-        graph: The lane graph.
-        on: Lane segments of the same graph.
-        count: Number of points.
+    Vehicles and cyclists within 3 m and 45 degrees of a lane follow it and its straightest successors; their lateral
+    offset fades within 20 m.
     """
     last = tracks.valid.shape[1] - 1 - np.argmax(tracks.valid[rows][:, ::-1], axis=1)
     xyz, heading = tracks.xyz[rows, last], tracks.heading[rows, last]

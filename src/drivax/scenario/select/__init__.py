@@ -1,1 +1,5 @@
-"""Which scenarios of a set: tags, filters and splits."""
+"""Tags, selections and splits of scenario sets."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,7 @@
-"""Which recordings are for training, for validation and for the test: decided by recording, not by scenario.
+"""Training, validation and test splits by recording.
 
-Windows of one recording overlap and look alike, so all scenarios of a segment belong to the same split. Where a
-segment belongs depends on its name alone: it stays there when data are added, and whatever else a set holds.
+Windows of a recording overlap, so all scenarios of a segment belong to the same split. The split depends on the name of
+the segment only; it does not change when data are added.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from drivax.errors import UsageError
+from drivax.files import write_text
 
 NAMES = ("train", "validation", "test")
 #: Percentages of recordings for each of :data:`NAMES`.
@@ -21,10 +22,10 @@ FOLDER = "splits"
 
 
 def parse_shares(text: str) -> Shares:
-    """The shares that ``80/10/10`` names.
+    """Parse shares such as ``80/10/10``.
 
     Raises:
-        UsageError: They are not three percentages that add up to 100.
+        UsageError: The text is not three percentages that add up to 100.
     """
     try:
         train, validation, test = (float(part) for part in text.split("/"))
@@ -40,7 +41,7 @@ def parse_shares(text: str) -> Shares:
 
 
 def split_of(dataset: str, segment: str, shares: Shares) -> str:
-    """The split of a recording: its SHA-256, read as a number in [0, 1), falls into one of the shares."""
+    """Return the split of a recording, by its SHA-256 as a number in [0, 1)."""
     digest = hashlib.sha256(f"{dataset}\0{segment}".encode()).digest()
     place = int.from_bytes(digest[:8], "big") / 2**64
     train, validation, test = shares
@@ -52,11 +53,6 @@ def split_of(dataset: str, segment: str, shares: Shares) -> str:
 def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Shares) -> dict[str, int]:
     """Write ``splits/{train,validation,test}.txt``: one line ``dataset<TAB>scenario_id`` per scenario, in order.
 
-    Args:
-        folder: The scenario set.
-        entries: Its scenarios, as in the manifest.
-        shares: Percentages of the recordings.
-
     Returns:
         Number of scenarios per split.
     """
@@ -64,9 +60,6 @@ def write_splits(folder: Path, entries: Iterable[Mapping[str, Any]], shares: Sha
     for entry in entries:
         split = split_of(entry["dataset"], entry["segment"], shares)
         lines[split].append(f"{entry['dataset']}\t{entry['scenario_id']}\n")
-    (folder / FOLDER).mkdir(exist_ok=True)
     for name, members in lines.items():
-        draft = folder / FOLDER / f".{name}.txt"
-        draft.write_text("".join(members))
-        draft.rename(folder / FOLDER / f"{name}.txt")
+        write_text(folder / FOLDER / f"{name}.txt", "".join(members))
     return {name: len(members) for name, members in lines.items()}

@@ -1,8 +1,7 @@
-"""Words that say what kind of scenario this is: one vocabulary for filters and strata, whatever the source.
+"""Tags of scenarios, for filters and strata.
 
-Every scenario gets every tag of :data:`TAGS` when it is assembled; readers and the built-in world add their own words
-(``place``, ``family``, ...), which are kept as they are. All tags describe the ego's log as it was driven: they sort
-scenarios, a planner never sees them.
+Every scenario gets the tags of :data:`TAGS` when it is assembled; readers and the built-in world add tags of their own
+(``place``, ``family``, ...). Tags describe the log of the ego; planners do not observe them.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.polylines import arc_lengths
+from drivax.geometry.vectors import wrap
 from drivax.scenario.build.filling import Parts
 from drivax.scenario.build.lanes import END_SPAN_M, LaneGraph
 from drivax.scenario.build.routes import STEP_M, Route
@@ -25,7 +24,7 @@ from drivax.scenario.schema import DT_S, AgentKind, Flag, among
 
 Array = np.ndarray[Any, Any]
 
-#: Every tag that is computed here, and what it can be.
+#: Computed tags and their values.
 TAGS: Mapping[str, tuple[str, ...]] = {
     "type": ("straight", "lane_follow", "junction", "merge", "turn_left", "turn_right", "u_turn"),
     "difficulty": ("easy", "medium", "hard"),
@@ -36,35 +35,35 @@ TAGS: Mapping[str, tuple[str, ...]] = {
     "lane_graph": ("given", "chained", "none"),
     "routes": ("graph", "published"),
 }
-#: A log that drives less does not move.
+#: Shortest log that moves.
 MOVES_M = 5.0
-#: A turn changes the heading by this much within ``TURN_WITHIN_M`` of driving; a U-turn by that much.
+#: Least heading change of a turn and of a U-turn within ``TURN_WITHIN_M`` of driving.
 TURN_RAD, U_TURN_RAD, TURN_WITHIN_M = np.deg2rad(45.0), np.deg2rad(135.0), 40.0
-#: A straight log stays within a range of headings of this width.
+#: Largest range of headings of a straight log.
 STRAIGHT_RAD = np.deg2rad(10.0)
-#: Lanes that leave one lane, or enter one lane, at angles that differ by more than this belong to a junction ...
+#: Lanes that leave or enter the same lane at angles that differ by more than this belong to a junction ...
 FORK_RAD = np.deg2rad(30.0)
-#: ... where they are no longer than this (a ramp is no junction).
+#: ... unless they are longer than this (ramps).
 JUNCTION_LANE_M = 60.0
-#: Agents within ``NEAR_M`` of ego at the current step: below the first number low, from the second on high density.
+#: Density is low below the first number of agents within ``NEAR_M`` at the current step, high from the second on.
 NEAR_M, DENSITY = 50.0, (5, 20)
 #: Difficulty is medium from the first number of demands on, hard from the second on.
 DIFFICULTY = (2, 3)
 VULNERABLE_M = 15.0
-#: Crossing traffic: this near, at least this fast, at an angle to ego's heading between these.
+#: Crossing traffic: largest distance, least speed, and range of angles to the heading of the ego.
 CROSSING_M, CROSSING_MPS, CROSSING_RAD = 20.0, 1.0, (np.deg2rad(45.0), np.deg2rad(135.0))
-#: Braking: this much speed lost within a second.
+#: Braking: least loss of speed within a second.
 BRAKING_MPS = 2.0
 
 
 @dataclass(frozen=True)
 class Driven:
-    """The ego's log without the jitter of a standing car: poses at least half a metre apart.
+    """Log of the ego as poses at least half a metre apart.
 
     Attributes:
         arc: Distance driven, metres.
         heading: Unwrapped, radians.
-        lane: Dense lane index under every metre of the log, -1 where there is none.
+        lane: Dense lane index under every metre of the log, -1 without a lane.
     """
 
     arc: Float[Array, " pose"]
@@ -73,7 +72,7 @@ class Driven:
 
     @classmethod
     def of(cls, tracks: LocalTracks, log: Route) -> Driven:
-        """From the ego's track and the route of its log."""
+        """Build from the track of the ego and the route of its log."""
         valid = tracks.valid[tracks.ego]
         xy, heading = tracks.xyz[tracks.ego, valid, :2], tracks.heading[tracks.ego, valid]
         keep = [0]
@@ -85,14 +84,7 @@ class Driven:
 
 
 def scenario_tags(recording: Recording, parts: Parts, flags: Flag, routes: str) -> dict[str, str]:
-    """All tags of a scenario.
-
-    Args:
-        recording: The source, for its own tags.
-        parts: What the scenario consists of; row 1 of the routes is the log's.
-        flags: The scenario's flags.
-        routes: How its candidate routes were made.
-    """
+    """Return all tags of a scenario; ``routes`` names the source of its candidate routes."""
     driven = Driven.of(parts.tracks, parts.routes.routes[1] if len(parts.routes.routes) > 1 else _nowhere())
     kind = type_of(driven, parts.graph)
     density = density_of(parts.tracks, recording.current_step)
@@ -127,13 +119,13 @@ def _lane_graph(flags: Flag) -> str:
 
 
 def type_of(driven: Driven, graph: LaneGraph) -> str:
-    """What the ego does, the most specific that holds: U-turn, turn, merge, junction, bends of its lane, straight.
+    """Return the most specific manoeuvre of the ego.
 
     - ``u_turn``, ``turn_left``, ``turn_right``: the heading changes by 135 or 45 degrees within 40 m of driving, and
-      the log is on a lane of a junction or beside all lanes somewhere (else it is a bend of the road).
-    - ``merge``: it goes on to a lane that another lane enters in the same direction, outside junctions.
-    - ``junction``: it drives on a lane of a junction.
-    - ``lane_follow``, ``straight``: its headings differ by 10 degrees or more, or by less.
+      the log is somewhere on a lane of a junction or off all lanes (otherwise the road bends).
+    - ``merge``: the log continues on a lane that another lane enters in the same direction, outside junctions.
+    - ``junction``: the log is on a lane of a junction.
+    - ``lane_follow``, ``straight``: the headings differ by 10 degrees or more, or by less.
 
     A log that drives less than 5 m is ``straight``.
     """
@@ -155,14 +147,14 @@ def type_of(driven: Driven, graph: LaneGraph) -> str:
 
 
 def _sharpest(driven: Driven) -> float:
-    """The largest change of heading within 40 m of driving, left positive, radians."""
+    """Largest change of heading within 40 m of driving, left positive, radians."""
     within = np.abs(driven.arc[:, None] - driven.arc) <= TURN_WITHIN_M
     turn = np.where(np.triu(within), driven.heading - driven.heading[:, None], 0.0)
     return float(turn.flat[np.abs(turn).argmax()])
 
 
 def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
-    """Lanes inside junctions: turn paths of the source, and short lanes that fork off or join at an angle."""
+    """Mask of lanes inside junctions: turn paths of the source, and short lanes that fork or join at an angle."""
     result = graph.interpolating.copy()
     if graph.count == 0:
         return result
@@ -179,7 +171,7 @@ def junction_lanes(graph: LaneGraph) -> Bool[Array, " lane"]:
 
 
 def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, " lane"]) -> bool:
-    """Whether the log goes on to a lane that another lane enters as well, neither of them in a junction."""
+    """Return whether the log continues on a lane that another lane enters, neither in a junction."""
     changes = np.flatnonzero(lane[1:] != lane[:-1])
     for a, b in zip(lane[changes], lane[changes + 1], strict=True):
         into = graph.predecessor[b]
@@ -190,7 +182,7 @@ def _merges(lane: Int[Array, " metre"], graph: LaneGraph, junction: Bool[Array, 
 
 
 def density_of(tracks: LocalTracks, current_step: int) -> str:
-    """How many road users there are within 50 m of ego at the current step: below 5, 5 to 19, 20 or more."""
+    """Return the density of road users within 50 m at the current step: below 5, 5 to 19, 20 or more."""
     here = tracks.valid[:, current_step] & _is_road_user(tracks)
     apart = np.hypot(*(tracks.xyz[:, current_step, :2] - tracks.xyz[tracks.ego, current_step, :2]).T)
     count = int((here & (apart <= NEAR_M)).sum())
@@ -198,14 +190,14 @@ def density_of(tracks: LocalTracks, current_step: int) -> str:
 
 
 def _is_road_user(tracks: LocalTracks) -> Bool[Array, " track"]:
-    """Vehicles, pedestrians and cyclists other than ego."""
+    """Mask of vehicles, pedestrians and cyclists other than the ego."""
     users = among(tracks.kind, (AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.CYCLIST))
     users[tracks.ego] = False
     return users
 
 
 def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
-    """How many demands there are on the ego: up to one is easy, two are medium, three or more are hard.
+    """Return the difficulty by the number of demands on the ego: 2 are medium, 3 or more hard.
 
     The demands: a manoeuvre (any type but ``straight`` and ``lane_follow``); high density; a pedestrian or cyclist
     within 15 m; a vehicle at 1 m/s or more within 20 m that crosses ego's heading at 45 to 135 degrees; and the log's
@@ -222,7 +214,7 @@ def difficulty_of(tracks: LocalTracks, kind: str, density: str) -> str:
 
 
 def _apart(tracks: LocalTracks, rows: Int[Array, " row"]) -> Float[Array, "row time"]:
-    """Distance of tracks from ego at every step, infinite where either is not valid."""
+    """Distance of tracks from the ego at every step, infinite where either is invalid."""
     offset = tracks.xyz[rows, :, :2] - tracks.xyz[tracks.ego, :, :2]
     both = tracks.valid[rows] & tracks.valid[tracks.ego]
     return np.where(both, np.hypot(offset[..., 0], offset[..., 1]), np.inf)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import LightRow
 from drivax.scenario.bank.queries import LEVEL_M
 from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank

@@ -1,4 +1,4 @@
-"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded.
+"""How agents that are not driven move. ``log``: they replay; they appear and disappear as recorded.
 
 Others: ``simulator.traffic.reactive`` (``idm``) and ``simulator.traffic.override``; ``simulator.traffic.catalogue``
 knows them by name.
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
-from drivax.simulator.types import HISTORY, Frame, Scene
+from drivax.simulator.types import HISTORY, AgentContext, Frame
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class LogTraffic:
         """Nothing: the bank and the step say it all."""
         return ()
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> tuple[()]:
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> tuple[()]:
         """Nothing."""
         return ()
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """The logged rows ``back`` steps ago; steps before the recording repeat its first one."""
-        return bank.agents[scene.index, jnp.clip(scene.step - back, 0, bank.steps - 1)]
+        return bank.agents[context.index, jnp.clip(context.step - back, 0, bank.steps - 1)]
 
 
 def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Float[Array, "16 4"]:
@@ -61,16 +61,16 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
 
 
 def frame_of(
-    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: Scene, back: int
+    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: AgentContext, back: int
 ) -> Frame:
-    """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
+    """All agents at one step: traffic's rows, the driven agents put in their place, and the parked ones.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         step: The present step; the frame is that of ``step - back``.
         agents: Rows of the moving slots, from the traffic model.
-        cast: Scenes of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are nobody's.
+        cast: Contexts of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are empty.
         back: How many steps ago, 0 to 15; reactive traffic remembers 9.
     """
     driven = cast.history[:, HISTORY - 1 - back]
@@ -79,7 +79,7 @@ def frame_of(
     # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
     rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
     rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
-    # Before the recording nobody else was seen.
+    # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
     z = agents[:, AgentColumn.Z].at[cast.slot].set(cast.z, mode="drop")
     agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
@@ -102,6 +102,6 @@ def frame_of(
     )
 
 
-def alone(scene: Scene) -> Scene:
+def alone(context: AgentContext) -> AgentContext:
     """The cast of a scenario with one driven agent."""
-    return jax.tree.map(lambda leaf: leaf[None], scene)
+    return jax.tree.map(lambda leaf: leaf[None], context)

@@ -8,7 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
@@ -24,8 +23,9 @@ from drivax.simulator.traffic.agent_paths import (
     AgentPaths,
     with_paths,
 )
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
-from drivax.simulator.types import Frame, Scene
+from drivax.simulator.types import AgentContext, Frame
 
 #: Steps of recent motion that are kept, which is what observations look back; older frames repeat the oldest.
 PAST = 10
@@ -42,7 +42,7 @@ class Reactive:
     """State of the R vehicles of a scenario that may react; the last of the 10 rows is now.
 
     Attributes:
-        begin: Step at which the episode began; until then everyone moved as logged.
+        begin: Step at which the episode began; until then all agents moved as logged.
         phase: Replays (0), waits to appear (1), drives (2), has left (3).
         entry: Step at which the log has the vehicle appear.
         arc: Place along the path, m.
@@ -64,7 +64,7 @@ class Reactive:
 class IdmTraffic:
     """Vehicles react to ego, to each other, to everything else in their way and to red lights.
 
-    A vehicle that travels more than 2 m in the rest of its log follows its own path; everyone else replays. What a
+    A vehicle that travels more than 2 m in the rest of its log follows its own path; every other agent replays. What a
     driver cannot help is left alone: a pair that overlaps when the vehicle appears ignores each other until it parts.
 
     Attributes:
@@ -76,16 +76,16 @@ class IdmTraffic:
     name: str = "idm"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """The bank with the paths that this traffic needs; one that has them already is returned as it is."""
+        """The bank with the paths that this traffic needs; one that has them already is returned unchanged."""
         return with_paths(bank, tuple(kind for kind, _ in self.drivers))
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Reactive:
-        """Everyone where the log has them at ``step``.
+        """All agents where the log has them at ``step``.
 
         Raises:
-            UsageError: If the bank has no paths.
+            UsageError: The bank has no paths.
         """
-        paths = _paths(bank)
+        paths = data_of(bank, AgentPaths)
         index, step = jnp.asarray(index, jnp.int32), jnp.asarray(step, jnp.int32)
         slot = paths.slot[index].astype(jnp.int32)
         entry = paths.appears[index, step].astype(jnp.int32)
@@ -107,35 +107,35 @@ class IdmTraffic:
             ignored=paths.overlaps[index, at, row],
         )
 
-    def agents(self, bank: ScenarioBank, scene: Scene, back: int) -> Float[Array, "A 8"]:
+    def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of the moving slots ``back`` steps ago (at most 9): who reacts on its path, others as logged."""
-        paths, now = _paths(bank), scene.traffic
-        step = scene.step - back
-        logged = bank.agents[scene.index, jnp.clip(step, 0, bank.steps - 1)]
+        paths, now = data_of(bank, AgentPaths), context.traffic
+        step = context.step - back
+        logged = bank.agents[context.index, jnp.clip(step, 0, bank.steps - 1)]
         at = PAST - 1 - min(back, PAST - 1)
-        (here, profile), speed = path_poses(paths, scene.index, now.arc[at]), now.speed[at, :, None]
+        (here, profile), speed = path_poses(paths, context.index, now.arc[at]), now.speed[at, :, None]
         direction, there = here[:, 2:], now.there[at, :, None].astype(jnp.float32)
         height = profile[:, PROFILE_Z : PROFILE_Z + 1]
         driven = jnp.concatenate(
             [here[:, AgentColumn.XY], height, direction, direction * speed, there], axis=-1
         )
-        slot = paths.slot[scene.index].astype(jnp.int32)
+        slot = paths.slot[context.index].astype(jnp.int32)
         reacts = (now.phase != REPLAYS) & (step > now.begin)
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
 
-    def advance(self, bank: ScenarioBank, scene: Scene, frame: Frame) -> Reactive:
-        """One step of 0.1 s: everyone looks at the present frame, then all move."""
-        paths, now = _paths(bank), scene.traffic
-        slot = paths.slot[scene.index].astype(jnp.int32)
-        movers, most = _movers(bank, scene, slot)
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
+        """One step of 0.1 s: every agent looks at the present frame, then all move."""
+        paths, now = data_of(bank, AgentPaths), context.traffic
+        slot = paths.slot[context.index].astype(jnp.int32)
+        movers, most = _movers(bank, context, slot)
         movers, ignored = _without_parted(movers, frame, now.phase == WAITS)
-        ahead = leaders(paths, scene.index, movers, frame)
-        driver = self._parameters(bank, scene.index, slot)
-        wanted = _acceleration(bank, scene, movers, most, ahead, driver)
-        arc, speed = _driven(movers.arc, movers.speed, wanted)
+        ahead = leaders(paths, context.index, movers, frame)
+        driver = self._parameters(bank, context.index, slot)
+        acceleration = _acceleration(bank, context, movers, most, ahead, driver)
+        arc, speed = _driven(movers.arc, movers.speed, acceleration)
         drives, waits = now.phase == DRIVES, now.phase == WAITS
-        enters = waits & _may_enter(scene, movers, ahead, frame)
-        arrived = arc >= paths.spacing[scene.index] * (PATH_POINTS - 1)
+        enters = waits & _may_enter(context, movers, ahead, frame)
+        arrived = arc >= paths.spacing[context.index] * (PATH_POINTS - 1)
         phase = jnp.where(enters, DRIVES, jnp.where(drives & arrived, LEFT, now.phase))
         arc = jnp.where(drives, arc, movers.arc)
         speed = jnp.where(drives, speed, jnp.where(enters, _entry_speed(movers, ahead, driver), movers.speed))
@@ -169,20 +169,14 @@ class IdmTraffic:
         return IdmParameters(**table)
 
 
-def _paths(bank: ScenarioBank) -> AgentPaths:
-    if bank.paths is None:
-        raise UsageError(
-            "the bank has no paths for reactive traffic", cure="use IdmTraffic().prepare(bank) first"
-        )
-    return bank.paths
-
-
-def _movers(bank: ScenarioBank, scene: Scene, slot: Int[Array, " R"]) -> tuple[Movers, Float[Array, " R"]]:
+def _movers(
+    bank: ScenarioBank, context: AgentContext, slot: Int[Array, " R"]
+) -> tuple[Movers, Float[Array, " R"]]:
     """The vehicles where they are now (waiting ones where they will appear), and the speed that their paths allow."""
-    now = scene.traffic
+    now = context.traffic
     arc, speed = now.arc[-1], now.speed[-1]
-    here, profile = path_poses(bank.paths, scene.index, arc)
-    size = bank.agent_box[scene.index, jnp.maximum(slot, 0), SizeColumn.FOOTPRINT]
+    here, profile = path_poses(data_of(bank, AgentPaths), context.index, arc)
+    size = bank.agent_box[context.index, jnp.maximum(slot, 0), SizeColumn.FOOTPRINT]
     box, z = jnp.concatenate([here, size], axis=-1), profile[:, PROFILE_Z]
     return Movers(box, z, arc, speed, slot, now.ignored.astype(jnp.int32)), profile[:, PROFILE_SPEED]
 
@@ -199,24 +193,27 @@ def _without_parted(
 
 
 def _acceleration(
-    bank: ScenarioBank, scene: Scene, movers: Movers, most: Float[Array, " R"], ahead: Leaders, driver: IdmParameters
+    bank: ScenarioBank, context: AgentContext, movers: Movers,
+    most: Float[Array, " R"], ahead: Leaders, driver: IdmParameters
 ) -> Float[Array, " R"]:  # fmt: skip
     """IDM behind the leader, and before a red light as behind a car that stands on the stop line."""
-    stop = _stop_gap(bank, scene, movers, driver)
+    stop = _stop_gap(bank, context, movers, driver)
     behind = idm_acceleration(movers.speed, most, ahead.gap, ahead.speed, driver)
     before = idm_acceleration(movers.speed, most, stop, jnp.zeros_like(stop), driver)
     return jnp.minimum(behind, before)
 
 
-def _stop_gap(bank: ScenarioBank, scene: Scene, movers: Movers, driver: IdmParameters) -> Float[Array, " R"]:
+def _stop_gap(
+    bank: ScenarioBank, context: AgentContext, movers: Movers, driver: IdmParameters
+) -> Float[Array, " R"]:
     """Distance from the front bumper to the nearest stop line of the path that asks to stop, m.
 
-    A red light asks everyone who can still stop, a yellow one those who can do so comfortably.
+    A red light asks all that can still stop, a yellow one those that can do so comfortably.
     """
-    paths = bank.paths
-    light = paths.stop_light[scene.index].astype(jnp.int32)
-    state = bank.light_state[scene.index, jnp.clip(scene.step, 0, bank.steps - 1)][light]
-    line = paths.stop_arc[scene.index] - movers.arc[:, None]
+    paths = data_of(bank, AgentPaths)
+    light = paths.stop_light[context.index].astype(jnp.int32)
+    state = bank.light_state[context.index, jnp.clip(context.step, 0, bank.steps - 1)][light]
+    line = paths.stop_arc[context.index] - movers.arc[:, None]
     front = line - movers.box[:, LENGTH : LENGTH + 1] / 2
     square = (movers.speed * movers.speed)[:, None]
     hard, soft = (
@@ -234,35 +231,35 @@ def _driven(
     arc: Float[Array, " R"], speed: Float[Array, " R"], acceleration: Float[Array, " R"]
 ) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
     """Place and speed one step later; who would go below zero stops inside the step."""
-    wanted = speed + acceleration * DT_S
-    stops = wanted < 0.0
-    after = jnp.where(stops, 0.0, wanted)
+    unclipped = speed + acceleration * DT_S
+    stops = unclipped < 0.0
+    after = jnp.where(stops, 0.0, unclipped)
     braking = jnp.where(stops, -acceleration, 1.0)
     distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + after) / 2.0 * DT_S)
     return arc + distance, after
 
 
-def _may_enter(scene: Scene, movers: Movers, ahead: Leaders, frame: Frame) -> Bool[Array, " R"]:
+def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Frame) -> Bool[Array, " R"]:
     """Who of the waiting may appear one step from now: it is time, and the place will be free.
 
     Of two that wait for one place the one that is due first goes first; those that appear on time never exclude
     each other, since the log has room for both.
     """
-    now = scene.traffic
+    now = context.traffic
     size = jnp.asarray([0.0, 0.0, 0.0, 0.0, 2 * _ENTRY_END_M, 2 * _ENTRY_SIDE_M])
     box, velocity = frame.box[ahead.things], frame.velocity[ahead.things]
     then = box.at[..., :2].add(velocity * DT_S)
     taken = (overlap((movers.box + size)[:, None], then) & ahead.real).any(axis=1)
     entry = now.entry.astype(jnp.int32)
-    ready = (now.phase == WAITS) & (scene.step + 1 >= entry) & ~taken
-    late = scene.step + 1 > entry
+    ready = (now.phase == WAITS) & (context.step + 1 >= entry) & ~taken
+    late = context.step + 1 > entry
     # Whole numbers as floats: their minima vectorise.
     order = (entry * entry.shape[0] + jnp.arange(entry.shape[0])).astype(jnp.float32)
     reach = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
     x, y = columns(movers.box)[:2]
     dx, dy = x[:, None] - x, y[:, None] - y
     near = dx * dx + dy * dy < (reach[:, None] + reach + 2 * _ENTRY_END_M) ** 2
-    # Those that are not ready come after everyone; one that is due now makes way for those that are late.
+    # Those that are not ready come last; one that is due now makes way for those that are late.
     order = jnp.where(ready, order, jnp.inf)
     rival = jnp.where(near & (late[None] | late[:, None]), order[None], jnp.inf)
     return ready & (jnp.min(rival, axis=1) >= order)

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 
 #: Lowest and highest longitudinal acceleration, m/s2; then the largest lateral acceleration, jerk, jerk magnitude, yaw

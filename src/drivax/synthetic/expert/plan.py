@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.expert.reservations import Meetings, Wall, arrivals, meetings, walls
 from drivax.synthetic.expert.smoothing import Bounds, Drive, smoothed

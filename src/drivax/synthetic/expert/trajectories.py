@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.geometry.angles import wrap
 from drivax.geometry.boxes import corners
+from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.lateral import located, quintic_step

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 
 #: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
 STEP_M = 0.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.lateral import Occupied, around
 from drivax.synthetic.traffic.obstacles import Boxes, Extents, extents

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve
 from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, smoothed_curvature
 

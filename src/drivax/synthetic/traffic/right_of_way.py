@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
 from drivax.synthetic.roads.curves import resampled
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork

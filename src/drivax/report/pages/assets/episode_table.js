@@ -1,14 +1,14 @@
-// The list of all episodes: sorting, sieving, and the way from a cell of a table to the episodes behind it.
+// The list of all episodes: sorting, filtering, and links from cells of tables to their episodes.
 (() => {
   "use strict";
   const source = document.getElementById("list");
   if (!source) return;
-  const data = JSON.parse(source.textContent), form = document.getElementById("sieve").elements;
+  const data = JSON.parse(source.textContent), form = document.getElementById("filters").elements;
   const rows = document.getElementById("rows"), heads = document.getElementById("heads");
-  const more = document.getElementById("more"), found = document.getElementById("found");
+  const more = document.getElementById("more"), count = document.getElementById("count");
   const players = [...document.querySelectorAll("[data-episode]")];
   const FIRST = 50, MORE = 200;
-  const state = { matches: [], drawn: 0, sort: -1, turned: false };
+  const state = { matches: [], drawn: 0, sort: -1, reversed: false };
   const kind = data.metrics.findIndex((metric) => metric.name === "collision_type");
 
   function make(tag, parent, text, name) {
@@ -18,8 +18,8 @@
     return node;
   }
 
-  // --- What is asked for ------------------------------------------------------------------------------------------
-  function choice(menu, first, words) {
+  // --- Filters ----------------------------------------------------------------------------------------------------
+  function fill(menu, first, words) {
     menu.replaceChildren();
     if (first) make("option", menu, first).value = "";
     words.forEach(([value, text]) => { make("option", menu, text).value = String(value); });
@@ -27,31 +27,31 @@
 
   const run = () => data.runs[Number(form.run.value)];
   const metrics = data.metrics.map((metric, i) => [i, metric.label]);
-  choice(form.run, null, data.runs.map((one, i) => [i, one.name]));
-  choice(form.failed, "any", metrics.filter(([i]) => data.metrics[i].bad !== null));
-  choice(form.metric, "none", metrics);
+  fill(form.run, null, data.runs.map((evaluation, i) => [i, evaluation.name]));
+  fill(form.failed, "any", metrics.filter(([i]) => data.metrics[i].bad !== null));
+  fill(form.metric, "none", metrics);
   const tags = data.tags.map((tag) => {
     const label = make("label", document.getElementById("tags"), `${tag.name} `);
     const menu = make("select", label);
-    choice(menu, "any", tag.words.map((word, i) => [i, word]));
+    fill(menu, "any", tag.words.map((word, i) => [i, word]));
     return menu;
   });
 
   function outcomes() {
-    choice(form.outcome, "any", run().outcomes.map((word, i) => [i, word]));
+    fill(form.outcome, "any", run().outcomes.map((word, i) => [i, word]));
   }
 
-  function wanted() {
+  function filtered() {
     const { values, scenario, outcome } = run();
     const tests = [];
-    const asked = (menu, test) => { if (menu.value !== "") tests.push(test(Number(menu.value))); };
-    asked(form.outcome, (code) => (row) => outcome[row] === code);
-    asked(form.failed, (i) => (row) => values[i][row] === data.metrics[i].bad);
-    tags.forEach((menu, i) => asked(menu, (code) => (row) => data.tags[i].of[scenario[row]] === code));
+    const require = (menu, test) => { if (menu.value !== "") tests.push(test(Number(menu.value))); };
+    require(form.outcome, (code) => (row) => outcome[row] === code);
+    require(form.failed, (i) => (row) => values[i][row] === data.metrics[i].bad);
+    tags.forEach((menu, i) => require(menu, (code) => (row) => data.tags[i].of[scenario[row]] === code));
     const bound = parseFloat(form.bound.value), compare = {
       ge: (value) => value >= bound, le: (value) => value <= bound, eq: (value) => value === bound,
     }[form.sign.value];
-    asked(form.metric, (i) => (row) => {
+    require(form.metric, (i) => (row) => {
       const value = values[i][row];
       return value !== null && (Number.isNaN(bound) || compare(value));
     });
@@ -60,12 +60,12 @@
     return scenario.map((_, row) => row).filter((row) => tests.every((test) => test(row)));
   }
 
-  // Undefined values come last whichever way the list is sorted; without a column it stays as it came, worst first.
-  const rises = () => (data.metrics[state.sort].better === "down") === state.turned;
+  // Undefined values come last in either direction; without a column the list stays worst first.
+  const ascending = () => (data.metrics[state.sort].better === "low") === state.reversed;
 
   function sorted(matches) {
     if (state.sort < 0) return matches;
-    const column = run().values[state.sort], sign = rises() ? 1 : -1;
+    const column = run().values[state.sort], sign = ascending() ? 1 : -1;
     return matches.sort((a, b) => {
       if (column[a] === null || column[b] === null) return (column[a] === null) - (column[b] === null) || a - b;
       return sign * (column[a] - column[b]) || a - b;
@@ -83,9 +83,9 @@
     heads.replaceChildren();
     for (const text of ["scenario", "outcome"]) make("th", heads, text).scope = "col";
     for (const i of columns()) {
-      const head = make("th", heads), here = state.sort === i, sign = !here ? "" : rises() ? " ▲" : " ▼";
+      const head = make("th", heads), here = state.sort === i, sign = !here ? "" : ascending() ? " ▲" : " ▼";
       head.scope = "col";
-      head.setAttribute("aria-sort", !here ? "none" : rises() ? "ascending" : "descending");
+      head.setAttribute("aria-sort", !here ? "none" : ascending() ? "ascending" : "descending");
       const button = make("button", head, data.metrics[i].label + sign, "plain");
       button.type = "button";
       button.title = "sort, worst first; again: best first";
@@ -107,7 +107,7 @@
     if (player) {
       const button = make("button", head, `▶ ${data.scenarios[number]}`, "plain");
       button.type = "button";
-      button.title = "play this drive";
+      button.title = "play this episode";
       button.addEventListener("click", () => play(player));
     } else make("span", head, data.scenarios[number]);
     make("small", head, data.tags.map((tag) => tag.words[tag.of[number]])
@@ -120,28 +120,28 @@
     }
   }
 
-  function draw(count) {
-    state.matches.slice(state.drawn, state.drawn + count).forEach(drawRow);
-    state.drawn = Math.min(state.drawn + count, state.matches.length);
+  function draw(most) {
+    state.matches.slice(state.drawn, state.drawn + most).forEach(drawRow);
+    state.drawn = Math.min(state.drawn + most, state.matches.length);
     const left = state.matches.length - state.drawn;
     more.hidden = !left;
     more.textContent = `${Math.min(left, MORE)} more of ${left}`;
   }
 
   function list() {
-    state.matches = sorted(wanted());
+    state.matches = sorted(filtered());
     state.drawn = 0;
     rows.replaceChildren();
     drawHeads();
     draw(FIRST);
-    found.textContent = `${state.matches.length} of ${run().scenario.length} episodes of ${run().name}`;
-    document.documentElement.dataset.found = String(state.matches.length);
+    count.textContent = `${state.matches.length} of ${run().scenario.length} episodes of ${run().name}`;
+    document.documentElement.dataset.matches = String(state.matches.length);
   }
 
   function sort(i) {
-    if (state.sort !== i) Object.assign(state, { sort: i, turned: false });
-    else if (!state.turned) state.turned = true;
-    else Object.assign(state, { sort: -1, turned: false });
+    if (state.sort !== i) Object.assign(state, { sort: i, reversed: false });
+    else if (!state.reversed) state.reversed = true;
+    else Object.assign(state, { sort: -1, reversed: false });
     const place = [...heads.children].findIndex((head) => head.contains(document.activeElement));
     list();
     heads.children[place]?.querySelector("button")?.focus();
@@ -157,44 +157,44 @@
     form.run.form.reset();
     form.run.value = String(place);
     outcomes();
-    Object.assign(state, { sort: -1, turned: false });
+    Object.assign(state, { sort: -1, reversed: false });
   }
 
-  function show(behind) {
-    clear(data.runs.findIndex((one) => one.name === behind.run));
-    for (const [name, word] of Object.entries(behind.tags || {})) {
+  function show(link) {
+    clear(data.runs.findIndex((evaluation) => evaluation.name === link.run));
+    for (const [name, word] of Object.entries(link.tags || {})) {
       const i = data.tags.findIndex((tag) => tag.name === name);
       if (i >= 0) tags[i].value = String(data.tags[i].words.indexOf(word));
     }
-    if (behind.kind !== undefined) {
-      form.metric.value = String(kind); form.sign.value = "eq"; form.bound.value = String(behind.kind);
+    if (link.kind !== undefined) {
+      form.metric.value = String(kind); form.sign.value = "eq"; form.bound.value = String(link.kind);
     }
-    const i = data.metrics.findIndex((metric) => metric.name === behind.metric);
+    const i = data.metrics.findIndex((metric) => metric.name === link.metric);
     if (i >= 0 && data.metrics[i].bad !== null) form.failed.value = String(i);
     else if (i >= 0) state.sort = i;
     list();
     const first = state.matches.find((row) => run().playable && players[data.played[run().scenario[row]]]);
     if (first !== undefined) players[data.played[run().scenario[first]]].click();
-    else if (players.length && state.matches.length) found.textContent += `. ${missing()}`;
+    else if (players.length && state.matches.length) count.textContent += `. ${missing()}`;
     document.getElementById("episodes").scrollIntoView();
     form.failed.focus({ preventScroll: true });
   }
 
-  // The player goes on showing another drive, which is none of those that were asked for.
+  // The player goes on showing another episode, which is not in the list.
   function missing() {
-    return run().playable ? "None of these plays in this page: --episodes N packs more drives, --video ID draws one"
-      : "None of these plays in this page: they are no pairs with the policy's episodes";
+    return run().playable ? "None of these plays in this page: --episodes N packs more episodes, --video ID draws a video"
+      : "None of these plays in this page: they have no pairs among the policy's episodes";
   }
 
-  document.querySelectorAll("[data-behind]").forEach((node) => {
+  document.querySelectorAll("[data-link]").forEach((node) => {
     const button = document.createElement("button");
     button.type = "button";
     button.className = "plain";
-    button.title = "the episodes behind this number";
+    button.title = "show the episodes of this number";
     const number = node.querySelector("b");
     number.replaceWith(button);
     button.append(number);
-    button.addEventListener("click", () => show(JSON.parse(node.dataset.behind)));
+    button.addEventListener("click", () => show(JSON.parse(node.dataset.link)));
   });
 
   form.run.addEventListener("change", outcomes);

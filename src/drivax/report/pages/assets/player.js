@@ -1,9 +1,7 @@
 "use strict";
-// Plays recorded drives: one canvas per planner, all at the same time of the same scenario. Data: see episode.py.
+// Plays rollouts: one canvas per planner, all at the same time of the same scenario. Data: see player_data.py.
 (() => {
   const ABSENT = -32768;
-  const LIGHTS = ["unknown", "red", "amber", "green"];
-  const EVENTS = { collision: "collision", offroad: "off-road", red_light: "red light", crashed: "planner crashed" };
   const page = document.documentElement;
   window.addEventListener("error", (event) => { page.dataset.error = event.message; });
 
@@ -11,7 +9,7 @@
   const stored = [...document.querySelectorAll("script.episode")];
   const stage = document.getElementById("stage");
   if (!stage || !stored.length) return;
-  const themes = read(document.getElementById("palette"));
+  const { themes, widths, radii, lights: LIGHTS, events: EVENTS } = read(document.getElementById("style"));
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const colour = () => themes[dark.matches ? "dark" : "light"];
 
@@ -50,11 +48,12 @@
       parked: { ...boxes(raw.parked), seen: shorts(raw.parked.seen) },
       lights: { line: metres(raw.lights.line, unit), state: new Int8Array(bytes(raw.lights.state).buffer) },
       log: shorts(raw.log),
-      drives: raw.drives.map((drive) => ({ ...drive, pose: shorts(drive.pose), speed: shorts(drive.speed) })),
+      rollouts: raw.rollouts.map((rollout) => (
+        { ...rollout, pose: shorts(rollout.pose), speed: shorts(rollout.speed) })),
     };
   }
 
-  // Pose at a time between two steps; null where the agent is not there. `first` is the index of its step 0.
+  // Pose at a time between two steps; null where the agent is absent. `first` is the index of its step 0.
   function poseAt(pose, first, time, steps, unit) {
     const step = Math.min(Math.floor(time), steps - 1);
     const at = 3 * (first + step);
@@ -71,16 +70,16 @@
   }
 
   // --- Drawing (in metres; `px` is the size of a CSS pixel in metres) ---------------------------------------------
-  function box(context, pose, length, width, fill, line, px, dashed) {
+  function box(context, pose, length, width, fill, paint, line, px, dashed) {
     context.save();
     context.translate(pose[0], pose[1]);
     context.rotate(pose[2]);
     context.beginPath();
     context.rect(-length / 2, -width / 2, length, width);
-    if (fill) { context.fillStyle = fill; context.fill(); }
+    if (fill) { context.fillStyle = paint[fill]; context.fill(); }
     if (line) {
       context.setLineDash(dashed ? [4 * px, 3 * px] : []);
-      context.strokeStyle = line; context.lineWidth = 1.2 * px; context.stroke();
+      context.strokeStyle = paint[line]; context.lineWidth = widths[line] * px; context.stroke();
     }
     context.restore();
   }
@@ -88,31 +87,29 @@
   function drawMap(context, episode, paint, px) {
     context.fillStyle = paint.crosswalk;
     context.fill(episode.map.crosswalk);
-    const strokes = [["lane", 1], ["bike", 1], ["line", 1], ["edge", 1.8]];
-    for (const [name, width] of strokes) {
-      context.strokeStyle = paint[name]; context.lineWidth = width * px;
+    for (const name of episode.layers.filter((layer) => layer !== "crosswalk")) {
+      context.strokeStyle = paint[name]; context.lineWidth = widths[name] * px;
       context.stroke(episode.map[name]);
     }
     context.fillStyle = paint.stop;
     for (let i = 0; i < episode.stops.length; i += 2) {
-      context.beginPath(); context.arc(episode.stops[i], episode.stops[i + 1], 0.9, 0, 7); context.fill();
+      context.beginPath(); context.arc(episode.stops[i], episode.stops[i + 1], radii.stop, 0, 7); context.fill();
     }
-    context.strokeStyle = paint.route; context.lineWidth = 2 * px; context.setLineDash([6 * px, 5 * px]);
+    context.strokeStyle = paint.route; context.lineWidth = widths.route * px; context.setLineDash([7 * px, 5 * px]);
     context.globalAlpha = 0.75; context.stroke(episode.route);
     context.setLineDash([]); context.globalAlpha = 1;
     if (episode.goal.length) {
-      context.beginPath(); context.arc(episode.goal[0], episode.goal[1], 2, 0, 7); context.stroke();
+      context.beginPath(); context.arc(episode.goal[0], episode.goal[1], radii.goal, 0, 7); context.stroke();
     }
   }
 
   function drawLights(context, episode, paint, step, px) {
     const { line, state } = episode.lights;
     const lights = line.length / 4;
-    const width = { red: 5, amber: 4, green: 2.5, unknown: 2 };
     for (let i = 0; i < lights; i++) {
       const name = LIGHTS[state[step * lights + i]];
       if (!name) continue;
-      context.strokeStyle = paint[name]; context.lineWidth = width[name] * px;
+      context.strokeStyle = paint[name]; context.lineWidth = widths[name] * px;
       context.beginPath();
       context.moveTo(line[4 * i], line[4 * i + 1]); context.lineTo(line[4 * i + 2], line[4 * i + 3]);
       context.stroke();
@@ -124,40 +121,40 @@
     parked.kind.forEach((kind, i) => {
       if (step < parked.seen[2 * i] || step > parked.seen[2 * i + 1]) return;
       const pose = [parked.pose[3 * i] * unit, parked.pose[3 * i + 1] * unit, parked.pose[3 * i + 2] / 1e4];
-      box(context, pose, parked.size[2 * i], parked.size[2 * i + 1], paint[kind], paint.outline, 0.5 * px);
+      box(context, pose, parked.size[2 * i], parked.size[2 * i + 1], kind, paint, "outline", px);
     });
     agents.kind.forEach((kind, i) => {
       const pose = poseAt(agents.pose, i * steps, time, steps, unit);
-      if (pose) box(context, pose, agents.size[2 * i], agents.size[2 * i + 1], paint[kind], paint.outline, 0.7 * px);
+      if (pose) box(context, pose, agents.size[2 * i], agents.size[2 * i + 1], kind, paint, "outline", px);
     });
   }
 
-  function drawEgo(context, episode, drive, paint, time, px) {
+  function drawEgo(context, episode, rollout, paint, time, px) {
     const { steps, unit, size: [length, width] } = episode;
-    context.strokeStyle = paint.ego; context.lineWidth = 2 * px;
+    context.strokeStyle = paint.ego; context.lineWidth = widths.ego * px;
     context.beginPath();
     for (let step = 0; step <= time; step++) {
-      const pose = poseAt(drive.pose, 0, step, steps, unit);
+      const pose = poseAt(rollout.pose, 0, step, steps, unit);
       if (pose) context.lineTo(pose[0], pose[1]);
     }
     context.stroke();
     const logged = poseAt(episode.log, 0, time, steps, unit);
-    if (logged) box(context, logged, length, width, null, paint.log, px, true);
-    const ego = poseAt(drive.pose, 0, time, steps, unit);
+    if (logged) box(context, logged, length, width, null, paint, "log", px, true);
+    const ego = poseAt(rollout.pose, 0, time, steps, unit);
     if (!ego) return;
-    box(context, ego, length, width, paint.ego, paint.ink, 1.2 * px);
+    box(context, ego, length, width, "ego", paint, "ink", px);
     context.save();
     context.translate(ego[0], ego[1]); context.rotate(ego[2]);
-    context.fillStyle = "#1b1f24";
+    context.fillStyle = paint.outline;
     context.beginPath();
     context.moveTo(0.38 * length, 0); context.lineTo(0.05 * length, 0.32 * width);
     context.lineTo(0.05 * length, -0.32 * width); context.fill();
     context.restore();
   }
 
-  function drawEvents(context, episode, drive, paint, time, px) {
-    for (const step of Object.values(drive.events)) {
-      const pose = step <= time ? poseAt(drive.pose, 0, step, episode.steps, episode.unit) : null;
+  function drawEvents(context, episode, rollout, paint, time, px) {
+    for (const step of Object.values(rollout.events)) {
+      const pose = step <= time ? poseAt(rollout.pose, 0, step, episode.steps, episode.unit) : null;
       if (!pose) continue;
       const reach = 9 * px;
       for (const [ink, width] of [[paint.ground, 7], [paint.mark, 3.5]]) {
@@ -187,7 +184,7 @@
 
   function extent(episode) {
     const low = [Infinity, Infinity], high = [-Infinity, -Infinity];
-    for (const pose of [episode.log, ...episode.drives.map((drive) => drive.pose)]) {
+    for (const pose of [episode.log, ...episode.rollouts.map((rollout) => rollout.pose)]) {
       for (let i = 0; i < pose.length; i += 3) {
         if (pose[i] === ABSENT) continue;
         for (const axis of [0, 1]) {
@@ -199,10 +196,10 @@
     return { low, high };
   }
 
-  function camera(episode, drive, width, height) {
+  function camera(episode, rollout, width, height) {
     if (state.follow) {
       const at = (pose) => poseAt(pose, 0, state.time, episode.steps, episode.unit);
-      const ego = at(drive.pose) || at(episode.log) || [0, 0];
+      const ego = at(rollout.pose) || at(episode.log) || [0, 0];
       return { x: ego[0] + state.pan[0], y: ego[1] + state.pan[1], scale: (Math.min(width, height) / 70) * state.zoom };
     }
     const { low, high } = episode.extent;
@@ -212,7 +209,7 @@
   }
 
   function drawPane(pane) {
-    const { canvas, drive } = pane, episode = state.episode, paint = colour();
+    const { canvas, rollout } = pane, episode = state.episode, paint = colour();
     const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width || !height) return;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
@@ -221,15 +218,15 @@
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.fillStyle = paint.ground; context.fillRect(0, 0, width, height);
-    const view = camera(episode, drive, width, height), px = 1 / view.scale, k = ratio * view.scale;
+    const view = camera(episode, rollout, width, height), px = 1 / view.scale, k = ratio * view.scale;
     context.setTransform(k, 0, 0, -k, ratio * (width / 2) - k * view.x, ratio * (height / 2) + k * view.y);
     context.lineJoin = context.lineCap = "round";
     const step = Math.min(Math.floor(state.time), episode.steps - 1);
     drawMap(context, episode, paint, px);
     drawLights(context, episode, paint, step, px);
     drawAgents(context, episode, paint, state.time, px);
-    drawEgo(context, episode, drive, paint, state.time, px);
-    drawEvents(context, episode, drive, paint, state.time, px);
+    drawEgo(context, episode, rollout, paint, state.time, px);
+    drawEvents(context, episode, rollout, paint, state.time, px);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     drawScaleBar(context, paint, height, px);
     pane.scale = view.scale;
@@ -237,25 +234,25 @@
 
   const seconds = (step) => `${(step * state.episode.dt).toFixed(1)} s`;
 
-  function tell() {
+  function updateTexts() {
     const step = Math.floor(state.time);
-    for (const { drive, speed, note } of state.panes) {
-      speed.textContent = `${(drive.speed[step] / 100).toFixed(1)} m/s`;
-      const happened = Object.entries(drive.events).filter(([, at]) => at <= state.time);
-      note.textContent = happened.map(([name, at]) => `✕ ${EVENTS[name]} at ${seconds(at)}`).join(", ");
+    for (const { rollout, speed, note } of state.panes) {
+      speed.textContent = `${(rollout.speed[step] / 100).toFixed(1)} m/s`;
+      const past = Object.entries(rollout.events).filter(([, at]) => at <= state.time);
+      note.textContent = past.map(([name, at]) => `✕ ${EVENTS[name]} at ${seconds(at)}`).join(", ");
     }
     control.scrub.value = String(step);
-    stage.dispatchEvent(new CustomEvent("moment", { detail: step }));
+    stage.dispatchEvent(new CustomEvent("step", { detail: step }));
     control.clock.textContent = `${seconds(state.time)} / ${seconds(state.episode.steps - 1)}`;
   }
 
-  let wanted = false;
+  let frameRequested = false;
   function redraw() {
-    tell();
-    if (wanted) return;
-    wanted = true;
+    updateTexts();
+    if (frameRequested) return;
+    frameRequested = true;
     requestAnimationFrame(() => {
-      wanted = false;
+      frameRequested = false;
       state.panes.forEach(drawPane);
     });
   }
@@ -272,16 +269,16 @@
     return node;
   }
 
-  function makePane(drive) {
+  function makePane(rollout) {
     const figure = make("figure", stage, "pane");
     const caption = make("figcaption", figure);
-    make("b", caption, "", drive.planner);
-    make("span", caption, drive.outcome === "success" ? "outcome good" : "outcome bad", drive.outcome);
+    make("b", caption, "", rollout.planner);
+    make("span", caption, rollout.outcome === "success" ? "outcome good" : "outcome bad", rollout.outcome);
     const speed = make("span", caption, "speed");
     const canvas = make("canvas", figure);
     canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `${drive.planner}: ${drive.outcome}`);
-    const pane = { canvas, drive, speed, note: make("p", figure, "note"), scale: 1 };
+    canvas.setAttribute("aria-label", `${rollout.planner}: ${rollout.outcome}`);
+    const pane = { canvas, rollout, speed, note: make("p", figure, "note"), scale: 1 };
     canvas.addEventListener("pointermove", (event) => {
       if (event.pointerType !== "mouse" || !(event.buttons & 1)) return;
       state.pan[0] -= event.movementX / pane.scale; state.pan[1] += event.movementY / pane.scale;
@@ -294,11 +291,11 @@
 
   function makeTicks(episode) {
     control.ticks.replaceChildren();
-    episode.drives.forEach((drive) => {
-      for (const [name, step] of Object.entries(drive.events)) {
+    episode.rollouts.forEach((rollout) => {
+      for (const [name, step] of Object.entries(rollout.events)) {
         const tick = make("i", control.ticks);
         tick.style.setProperty("--at", String(step / (episode.steps - 1)));
-        tick.title = `${drive.planner}: ${EVENTS[name]} at ${seconds(step)}`;
+        tick.title = `${rollout.planner}: ${EVENTS[name]} at ${seconds(step)}`;
       }
     });
   }
@@ -309,15 +306,15 @@
     episode.extent = extent(episode);
     sizes.disconnect();
     stage.replaceChildren();
-    stage.dataset.panes = String(episode.drives.length);
-    state.panes = episode.drives.map(makePane);
+    stage.dataset.panes = String(episode.rollouts.length);
+    state.panes = episode.rollouts.map(makePane);
     control.scrub.max = String(episode.steps - 1);
     control.title.textContent = episode.title;
     makeTicks(episode);
     choices.forEach((choice, i) => choice.setAttribute("aria-pressed", String(i === state.index)));
-    state.time = Math.min(...episode.drives.map((drive) => drive.start));
+    state.time = Math.min(...episode.rollouts.map((rollout) => rollout.start));
     page.dataset.panes = String(state.panes.length);
-    stage.dispatchEvent(new CustomEvent("drive", { detail: episode }));
+    stage.dispatchEvent(new CustomEvent("episode", { detail: episode }));
     setView(state.follow);
   }
 

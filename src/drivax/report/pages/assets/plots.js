@@ -1,10 +1,10 @@
-// Plots below the player: one small chart per signal, one line per planner, and a bar at the time that is shown.
+// Plots below the player: one small chart per signal, one line per planner, and a bar at the current time.
 (() => {
   "use strict";
   const ABSENT = -32768, WIDTH = 380, HEIGHT = 150, LEFT = 44, RIGHT = 8, TOP = 8, BOTTOM = 22;
-  const source = document.getElementById("signals"), stage = document.getElementById("stage");
-  const room = document.getElementById("plots");
-  if (!source || !stage || !room) return;
+  const source = document.getElementById("style"), stage = document.getElementById("stage");
+  const container = document.getElementById("plots");
+  if (!source || !stage || !container) return;
   const { signals, strokes } = JSON.parse(source.textContent);
   const SVG = new DOMParser().parseFromString("<svg></svg>", "text/html").body.firstChild.namespaceURI;
   let plots = [], episode = null;
@@ -47,7 +47,7 @@
   }
 
   function plot(signal, lines) {
-    const figure = room.appendChild(document.createElement("figure"));
+    const figure = container.appendChild(document.createElement("figure"));
     figure.className = "chart";
     const caption = figure.appendChild(document.createElement("figcaption"));
     const svg = draw("svg", figure, { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": signal.words });
@@ -72,7 +72,7 @@
       });
       const [stroke, dash] = strokes[i % strokes.length];
       draw("path", svg, { d: path, stroke, "stroke-dasharray": dash });
-      for (const step of Object.values(episode.drives[i].events)) {
+      for (const step of Object.values(episode.rollouts[i].events)) {
         const value = line[step];
         if (value === null || value === undefined) continue;
         draw("text", svg, { class: "mark", x: x(step), y: y(value) + 4, "text-anchor": "middle" }, "✕");
@@ -89,16 +89,16 @@
     return { signal, lines, caption, bar, x };
   }
 
-  stage.addEventListener("drive", (event) => {
+  stage.addEventListener("episode", (event) => {
     episode = event.detail;
-    room.replaceChildren();
-    const read = (drive, i) => values(drive.signals[i], signals[i].step);
-    plots = signals.map((signal, i) => [signal, episode.drives.map((drive) => read(drive, i))])
-      .filter(([, lines]) => lines.flat().some((value) => value !== null))  // the log, for one, was given no commands
+    container.replaceChildren();
+    const read = (rollout, i) => values(rollout.signals[i], signals[i].step);
+    plots = signals.map((signal, i) => [signal, episode.rollouts.map((rollout) => read(rollout, i))])
+      .filter(([, lines]) => lines.flat().some((value) => value !== null))  // the log has no commands
       .map(([signal, lines]) => plot(signal, lines));
   });
 
-  stage.addEventListener("moment", (event) => {
+  stage.addEventListener("step", (event) => {
     for (const { signal, lines, caption, bar, x } of plots) {
       bar.setAttribute("x1", x(event.detail));
       bar.setAttribute("x2", x(event.detail));
@@ -108,7 +108,7 @@
         const key = note.appendChild(document.createElement("i"));
         key.style.background = strokes[i % strokes.length][2];
         const text = value === null ? "–" : value.toFixed(digits(signal.step)).replace("-", "−");
-        note.append(`${episode.drives[i].planner} ${text}`);
+        note.append(`${episode.rollouts[i].planner} ${text}`);
       });
     }
   });

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivax.geometry.angles import wrap
+from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, connected, joined, resampled, straight, winding
 from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.network import Start

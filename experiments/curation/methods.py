@@ -1,0 +1,384 @@
+"""Does curation find rare events? Scores of every method against the labels of the built-in world's benchmark.
+
+    drivax generate sets/bench --benchmark
+    python -m experiments.curation.methods events --bench sets/bench [--method NAME ...]
+    python -m experiments.curation.methods check --data sets/bench/validation sets/fresh
+    python -m experiments.curation.methods speed --data sets/bench/train sets/womd
+    python -m experiments.curation.methods table
+
+``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
+``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
+nobody had seen (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
+Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
+as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
+``test`` alone says; scouts are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax import settings
+from drivax.curation.controls import event_kinds, event_steps, permute_scores
+from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
+from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.logged import BATCH, score_steps
+from drivax.curation.methods import Request, curate, ensemble_table, make_table
+from drivax.curation.published import PublishedConfig
+from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
+from drivax.curation.scores import ScoreTable
+from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
+from drivax.scenario.store import ScenarioSet
+from drivax.stats.ranking import (
+    auc_interval,
+    bootstrap_intervals,
+    correlation_interval,
+    precision_at_base_rate,
+    roc_auc,
+)
+from drivax.synthetic.events import EventKind
+from experiments.repository import DOCS, RESULTS
+
+STORED = RESULTS / "curation.json"
+PAGE = DOCS / "results" / "curation.md"
+BEGIN, END = "<!-- methods.py: {} -->", "<!-- methods.py: end -->"
+#: An event forces a reaction where it asks for no less braking than IDM finds comfortable, m/s2.
+FORCED_MPS2 = 3.0
+SCORED = (
+    "kinematic", "published", "ensemble", "ensemble_mixture", "action_rarity", "action_rarity_published"
+)  # fmt: skip
+#: Ensemble of point estimates, and of mixtures, which can disagree about modes.
+ENSEMBLES = {
+    "ensemble": EnsembleConfig(),
+    "ensemble_mixture": settings.load(
+        EnsembleConfig, {}, ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
+    ),
+}
+#: Share of scenarios with an event in an ordinary set (``WorldConfig.rare_rate``).
+NATURAL = 0.05
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of the scenarios of both test sets: kind and severity of the event, its steps, where ego is."""
+
+    kind: Any
+    severity: Any
+    during: Any
+    valid: Any
+
+    @classmethod
+    def of(cls, sets: list[ScenarioSet]) -> Truth:
+        """Of sets, one after the other."""
+        entries = [entry for data in sets for entry in data.entries]
+        return cls(
+            np.concatenate([event_kinds(data) for data in sets]),
+            np.array([float(entry["tags"].get("severity_mps2", 0.0)) for entry in entries]),
+            np.concatenate([event_steps(data) for data in sets]),
+            np.concatenate([[s.record["agent_valid"][:, 0] for s in data] for data in sets]).astype(bool),
+        )
+
+    def groups(self) -> dict[str, Any]:
+        """Which scenarios are to be found: all with an event, those that do and do not force a reaction, every kind."""
+        forced = self.severity >= FORCED_MPS2
+        found = {
+            "all": self.kind > 0, "forced": (self.kind > 0) & forced, "mild": (self.kind > 0) & ~forced
+        }  # fmt: skip
+        return found | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
+
+
+def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
+    """How well scores find a group of events among scenarios that have none, at both scales."""
+    rows = wanted | (truth.kind == 0)
+    label = wanted[rows]
+    weight = np.where(label, NATURAL / label.sum(), (1 - NATURAL) / (~label).sum())
+    _, precision = bootstrap_intervals(scenarios[rows], label, weight, np.arange(len(label)))
+    valid = truth.valid[rows]
+    step_label = (truth.during & wanted[:, None])[rows][valid]
+    step_weight = np.broadcast_to(weight[:, None], valid.shape)[valid]
+    step_scores = steps[rows][valid]
+    scenario = np.broadcast_to(np.arange(len(label))[:, None], valid.shape)[valid]
+    step_auc, step_precision = bootstrap_intervals(step_scores, step_label, step_weight, scenario)
+    return {
+        "scenarios": int(label.sum()),
+        "auc": roc_auc(scenarios[rows], label),
+        "auc_interval": auc_interval(scenarios[rows], label),
+        "precision": precision_at_base_rate(scenarios[rows], label, weight),
+        "precision_interval": precision,
+        "step_auc": roc_auc(step_scores, step_label, step_weight),
+        "step_auc_interval": step_auc,
+        "step_precision": precision_at_base_rate(step_scores, step_label, step_weight),
+        "step_precision_interval": step_precision,
+        "step_rate": float(step_weight[step_label].sum() / step_weight.sum()),
+    }
+
+
+def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
+    """Methods, or all of them, on both test sets, beside those that are known."""
+    sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
+    hashes = {data.path.name: data.hash for data in sets}
+    if only and stored.get("sets") != hashes:
+        raise SystemExit("what is stored is of other sets: score all methods, without --method")
+    truth = Truth.of(sets)
+    methods = dict(stored["methods"]) if only else {}
+    for name, own, both in scored(sets, bench / "train", only or list(SCORED)):
+        methods[name] = found_by(truth, both) | {"draws": draws(own)}
+        methods[name] |= {key: value for key, value in own.config.items() if key.startswith("error_rank_")}
+        if name == "kinematic":
+            methods["random_matched"] = found_by(truth, permute_scores(both, 0)) | {
+                "draws": draws(permute_scores(own, 0))
+            }
+        print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
+    return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL, "methods": methods}
+
+
+def scored(
+    sets: list[ScenarioSet], train: Path, names: list[str]
+) -> Iterator[tuple[str, ScoreTable, ScoreTable]]:
+    """By method: the table of the first set, and of all sets one after the other."""
+    for name in ("kinematic", "published"):
+        if name in names:
+            tables = [curate(name, Request(data)) for data in sets]
+            yield name, tables[0], joined(tables)
+    for name in ("ensemble", "ensemble_mixture"):
+        if name in names:
+            scouts = train_ensemble(ENSEMBLES[name], ScenarioSet.open(train))
+            first = ensemble_table(scouts, sets[0])
+            rest = [ensemble_table(scouts, data, scale=first.config["scale"]) for data in sets[1:]]
+            interval = {"error_rank_interval": error_interval(scouts, first, sets[0])}
+            yield name, replace(first, config={**first.config, **interval}), joined([first, *rest])
+    rarities = {"action_rarity": KernelRarity(), "action_rarity_published": PublishedRarity()}
+    if not rarities.keys() & set(names):
+        return
+    actions = [score_steps(data, ExpertActions()) for data in sets]
+    for name, config in rarities.items():
+        usual = actions[0]["action"][actions[0]["known"]].astype(np.float64)
+        tables = []
+        for data, found in zip(sets, actions, strict=True):
+            known, steps = found["known"], np.zeros(found["known"].shape)
+            steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
+            tables.append(make_table(name, config, data, {"rarity": steps}))
+        yield name, tables[0], joined(tables)
+
+
+def checked(paths: list[Path]) -> dict[str, Any]:
+    """How well ``kinematic`` finds the events that force a reaction in each of some sets."""
+    found = {}
+    for path in paths:
+        data = ScenarioSet.open(path)
+        truth, scores = Truth.of([data]), curate("kinematic", Request(data)).scenarios
+        wanted = truth.groups()["forced"]
+        rows = wanted | (truth.kind == 0)
+        found[path.name] = {
+            "hash": data.hash,
+            "scenarios": int(rows.sum()),
+            "events": int(wanted.sum()),
+            "auc": roc_auc(scores[rows], wanted[rows]),
+            "auc_interval": auc_interval(scores[rows], wanted[rows]),
+        }
+    return {"checks": found}
+
+
+def error_interval(scouts: Ensemble, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
+    """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
+    predictions = scouts.predictions(data)
+    error, known = predictions.error(scouts.deviation, None), predictions.known
+    return correlation_interval(table.steps[known], error[known], np.nonzero(known)[0])
+
+
+def joined(tables: list[ScoreTable]) -> ScoreTable:
+    """Tables one after the other."""
+    first = tables[0]
+    stacked = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ("valid", "steps", "scenarios")
+    }
+    ids = sum((table.scenario_ids for table in tables), ())
+    return ScoreTable(first.method, first.config, "both", ids, **stacked)
+
+
+def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
+    """What a method finds of every group."""
+    return {
+        "events": {
+            name: measured(truth, wanted, table.steps, table.scenarios)
+            for name, wanted in truth.groups().items()
+        }
+    }
+
+
+def draws(table: ScoreTable) -> dict[str, Any]:
+    """What the default weights of a table do."""
+    return {
+        scale: vars(draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable))
+        for scale in ("step", "scenario")
+    }
+
+
+def speed(paths: list[Path], count: int) -> dict[str, Any]:
+    """By set: seconds to score so many scenarios, reading and stacking included, compiling not; few are taken again."""
+    found: dict[str, Any] = {}
+    for path in paths:
+        known = list(ScenarioSet.open(path)[:count])
+        data = (known * -(-count // len(known)))[:count]
+        sizes = Sizes.used(data)
+        one: dict[str, Any] = {"scenarios": count, "different": len(known)}
+        one["stacking_s"] = min(stacking(data, sizes) for _ in range(2))  # the first one reads from the disk
+        for name, of in {
+            "kinematic": KinematicConfig(), "published": PublishedConfig(), "action_rarity": ExpertActions()
+        }.items():  # fmt: skip
+            score_steps(data, of)
+            began, wall = time.process_time(), time.perf_counter()
+            score_steps(data, of)
+            one[name] = {"cpu_s": time.process_time() - began, "wall_s": time.perf_counter() - wall}
+        found[path.name] = one
+    return {"cores": len(os.sched_getaffinity(0)), "sets": found}
+
+
+def stacking(data: list[Any], sizes: Sizes) -> float:
+    """Processor seconds to stack scenarios as scoring does, batch after batch."""
+    began = time.process_time()
+    for first in range(0, len(data), BATCH):
+        ScenarioBank.from_scenarios(data[first : first + BATCH], trim=sizes)
+    return time.process_time() - began
+
+
+def events_table(stored: dict[str, Any]) -> str:
+    """By method: all events and those that force a reaction, at both scales."""
+    lines = [
+        "| method | events | scenarios: AUC | precision | steps: AUC | precision |",
+        "|---|---|---|---|---|---|",
+    ]
+    for method, found in stored["methods"].items():
+        for group, words in (("forced", "that force a reaction"), ("mild", "that do not"), ("all", "all")):
+            one = found["events"][group]
+            measures = (("auc", 3), ("precision", 2), ("step_auc", 3), ("step_precision", 2))
+            cells = " | ".join(told(one, *measure) for measure in measures)
+            lines.append(f"| `{method}` | {words} ({one['scenarios']}) | {cells} |")
+    return "\n".join(lines)
+
+
+def told(one: dict[str, Any], measure: str, digits: int) -> str:
+    """A measure with its interval."""
+    low, high = one[f"{measure}_interval"]
+    return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def ensemble_checks_table(stored: dict[str, Any]) -> str:
+    """How far scouts disagree where they err."""
+    lines = ["| scouts | rank correlation of scores and errors, by step |", "|---|---|"]
+    for name in ENSEMBLES:
+        one = stored["methods"][name]
+        low, high = one["error_rank_interval"]
+        lines.append(f"| `{name}` | {one['error_rank_correlation']:.2f} [{low:.2f}, {high:.2f}] |")
+    return "\n".join(lines)
+
+
+def checks_table(stored: dict[str, Any]) -> str:
+    """What ``kinematic`` finds in other sets."""
+    lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
+    for name, one in stored["checks"].items():
+        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {told(one, 'auc', 3)} |")
+    return "\n".join(lines)
+
+
+def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
+    """One measure by kind of event and method."""
+    methods = stored["methods"]
+    kinds = [kind.name.lower() for kind in EventKind if kind]
+    lines = ["| event | scenarios | " + " | ".join(f"`{name}`" for name in methods) + " |"]
+    lines.append("|---|---|" + "---|" * len(methods))
+    for kind in kinds:
+        ones = [found["events"][kind] for found in methods.values()]
+        cells = " | ".join(told(one, measure, digits) for one in ones)
+        lines.append(f"| `{kind}` | {ones[0]['scenarios']} | {cells} |")
+    return "\n".join(lines)
+
+
+def draws_table(stored: dict[str, Any]) -> str:
+    """What the default weights do to an ordinary set."""
+    lines = [
+        "| method | scale | effective sample | of scenarios | tilt | largest | draws from 5 % |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for method, found in stored["methods"].items():
+        for scale, one in found["draws"].items():
+            lines.append(
+                f"| `{method}` | {scale} | {one['effective']:.2f} | {one['effective_scenarios']:.2f} | "
+                f"{one['tilt']:.2f} | {one['largest']:.2f} | {one['concentration']:.2f} |"
+            )
+    return "\n".join(lines)
+
+
+def speed_table(stored: dict[str, Any]) -> str:
+    """Seconds per 10,000 scenarios."""
+    cores = stored["speed"]["cores"]
+    lines = [
+        f"| set | method | 10,000 scenarios on {cores} cores (s) | processor seconds | over stacking alone |",
+        "|---|---|---|---|---|",
+    ]
+    for path, one in stored["speed"]["sets"].items():
+        times = 10_000 / one["scenarios"]
+        for name in ("kinematic", "published", "action_rarity"):
+            cpu, wall = (one[name][kind] * times for kind in ("cpu_s", "wall_s"))
+            over = cpu / times / one["stacking_s"]
+            lines.append(f"| `{path}` | `{name}` | {wall:,.0f} | {cpu:,.0f} | {over:.1f} |")
+    return "\n".join(lines)
+
+
+def filled(text: str, stored: dict[str, Any]) -> str:
+    """The page with its tables as stored."""
+    tables = {
+        "events": events_table(stored),
+        "scenario auc": kinds_table(stored, "auc", 3),
+        "scenario precision": kinds_table(stored, "precision", 2),
+        "step auc": kinds_table(stored, "step_auc", 3),
+        "step precision": kinds_table(stored, "step_precision", 2),
+        "scouts": ensemble_checks_table(stored),
+        "checks": checks_table(stored),
+        "draws": draws_table(stored),
+        "speed": speed_table(stored),
+    }
+    for name, table in tables.items():
+        before, rest = text.split(BEGIN.format(name))
+        after = rest.split(END, 1)[1]
+        text = f"{before}{BEGIN.format(name)}\n\n{table}\n\n{END}{after}"
+    return text
+
+
+def main() -> None:
+    """Measure, or write the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("events", "check", "speed", "table"))
+    parser.add_argument("--bench", type=Path)
+    parser.add_argument("--method", nargs="+", choices=SCORED, default=[])
+    parser.add_argument("--data", type=Path, nargs="+")
+    parser.add_argument("--count", type=int, default=1024)
+    args = parser.parse_args()
+    stored = json.loads(STORED.read_text()) if STORED.exists() else {}
+    if args.what == "table":
+        PAGE.write_text(filled(PAGE.read_text(), stored))
+        return
+    if args.what == "events":
+        made = events(args.bench, args.method, stored)
+    elif args.what == "check":
+        made = checked(args.data)
+    else:
+        made = {"speed": speed(args.data, args.count)}
+    STORED.write_text(json.dumps(stored | made, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""One picture of each family of criticality: the scenario that it finds most critical, and why.
+
+Run: python -m experiments.curation.pictures --data SET [--folder docs/guide] [--only kinematic|ensemble|rarity]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from drivax.curation.ensemble import EnsembleConfig, train_ensemble
+from drivax.curation.logged import score_steps
+from drivax.curation.methods import Request, curate, ensemble_table
+from drivax.curation.rarity import ExpertActions, KernelRarity
+from drivax.curation.scores import ScoreTable
+from drivax.report.pictures.palette import LIGHT, SERIES
+from drivax.report.pictures.still import draw_on
+from drivax.scenario.schema import DT_S, STEPS
+from drivax.scenario.store import ScenarioSet
+from experiments.repository import DOCS, save_picture
+
+mpl.use("Agg")
+
+#: Width, height, inches; dots per inch; half the side of the scene, m.
+SIZE, DPI, REACH_M = (11.0, 4.4), 100, 40.0
+#: DrawStatistics what stands beside the scene: of a row of the table, at a step.
+Beside = Callable[[list[Axes], int, int], None]
+
+
+def picture(data: ScenarioSet, table: ScoreTable, plots: int, beside: Beside, out: Path) -> None:
+    """The most critical scenario at its most critical step, and plots beside it."""
+    row = int(table.order[0])
+    step = int(table.steps[row].argmax())
+    page = Figure(figsize=SIZE, dpi=DPI, facecolor="white", layout="constrained")
+    grid = page.add_gridspec(plots, 2, width_ratios=(1, 1.45))
+    scene, scenario = page.add_subplot(grid[:, 0]), data[row]
+    x, y = (float(number) for number in scenario.agent_xy[step, 0])
+    draw_on(scene, scenario, step, (x, y), REACH_M)
+    scene.set_title(f"{step * DT_S:.1f} s, score {table.steps[row, step]:.2f}", fontsize=10)
+    beside([page.add_subplot(grid[number, 1]) for number in range(plots)], row, step)
+    save_picture(page, out)
+    print(f"{out.name}: {table.scenario_ids[row]}, step {step}")
+
+
+def over_time(axes: Axes, step: int, what: str) -> None:
+    """Seconds along the axis, and the moment of the scene."""
+    axes.axvline(step * DT_S, color=LIGHT["log"], linewidth=1.0, linestyle=":")
+    axes.set(xlabel="s", xlim=(0.0, (STEPS - 1) * DT_S), title=what)
+    axes.title.set_fontsize(10)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def kinematic(data: ScenarioSet, out: Path) -> None:
+    """Components over time, each as it counts, and the score."""
+    table = curate("kinematic", Request(data))
+
+    def beside(axes: list[Axes], row: int, step: int) -> None:
+        valid = np.flatnonzero(table.valid[row])
+        parts = {
+            name: weight * table.components[name][row, valid] for name, weight in _weights(table).items()
+        }
+        labels = [name.replace("_", " ") for name in parts]
+        axes[0].stackplot(valid * DT_S, list(parts.values()), labels=labels, colors=SERIES)
+        axes[0].legend(fontsize=8, frameon=False, loc="upper left")
+        axes[0].set_ylim(0.0, 1.0)
+        over_time(axes[0], step, "components times their weights: the score of a step is their sum")
+
+    picture(data, table, 1, beside, out)
+
+
+def _weights(table: ScoreTable) -> dict[str, float]:
+    return dict(table.combination.weights)
+
+
+def ensemble(data: ScenarioSet, out: Path) -> None:
+    """What each scout would do, what the expert did, and the score."""
+    scouts = train_ensemble(EnsembleConfig(), data)
+    table, predictions = ensemble_table(scouts, data), scouts.predictions(data)
+
+    def beside(axes: list[Axes], row: int, step: int) -> None:
+        known = np.flatnonzero(predictions.known[row])
+        for number, (name, part) in enumerate({"acceleration": axes[0], "steering": axes[1]}.items()):
+            part.plot(
+                known * DT_S, predictions.action[row, known, :, number], color=LIGHT["ego"], linewidth=0.9
+            )
+            part.plot(known * DT_S, predictions.expert[row, known, number], color=LIGHT["ink"], linewidth=1.6)
+            over_time(
+                part, step, f"{name}: five scouts, and (black) what the expert did; units of the action space"
+            )
+        valid = np.flatnonzero(table.valid[row])
+        axes[2].fill_between(valid * DT_S, table.steps[row, valid], color=LIGHT["mark"])
+        axes[2].set_ylim(0.0, 1.0)
+        over_time(axes[2], step, "score, by the variance among them")
+
+    picture(data, table, 3, beside, out)
+
+
+def rarity(data: ScenarioSet, out: Path) -> None:
+    """The density of all actions, and the actions of the scenario."""
+    table = curate("action_rarity", Request(data))
+    found = score_steps(data, ExpertActions(), None)
+    action, known = np.asarray(found["action"]), np.asarray(found["known"])
+    side = np.linspace(-1.0, 1.0, 201)
+    places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    density = KernelRarity().density(action[known], places).reshape(201, 201)
+
+    def beside(axes: list[Axes], row: int, step: int) -> None:
+        seen: Any = axes[0].pcolormesh(side, side, np.log10(density + 1e-4), cmap="Greys", rasterized=True)
+        axes[0].figure.colorbar(seen, ax=axes[0], label="density of all actions, power of ten")
+        mine = action[row, known[row]]
+        axes[0].scatter(*mine.T, s=14, c=LIGHT["ego"], linewidths=0)
+        axes[0].scatter(*action[row, step], s=90, facecolors="none", edgecolors=LIGHT["mark"], linewidths=2.0)
+        axes[0].set(
+            xlabel="acceleration", ylabel="steering", title="the actions of this drive among those of the set"
+        )
+        axes[0].title.set_fontsize(10)
+
+    picture(data, table, 1, beside, out)
+
+
+def main() -> None:
+    """Scores, draws, and says which scenarios were drawn."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    kinds = {"kinematic": kinematic, "ensemble": ensemble, "rarity": rarity}
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--folder", type=Path, default=DOCS / "guide")
+    parser.add_argument("--only", choices=kinds, default=None)
+    args = parser.parse_args()
+    data = ScenarioSet.open(args.data)
+    for name, draw in kinds.items():
+        if args.only in (None, name):
+            draw(data, args.folder / f"curation-{name}.png")
+
+
+if __name__ == "__main__":
+    main()

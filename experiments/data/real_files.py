@@ -1,0 +1,138 @@
+"""How every planner drives every real file: outcome and score per scenario, in recorded and in reactive traffic.
+
+python -m experiments.data.real_files --data ../shared/data [--write]     (--write stores the result and the page)
+python -m experiments.data.real_files --table                             (what is stored, into the page)
+
+A file that is longer than a scenario gives several, one after the other; the ego is the one of the source.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.api import find_planner
+from drivax.datasets.formats import detect, find_files
+from drivax.datasets.reader import BadRecord
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.runner import evaluate
+from drivax.learning.policies import find_traffic
+from drivax.report.episodes import outcome
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.recording import windows
+from drivax.scenario.schema import Scenario
+from drivax.tracking.run_folder import versions
+from experiments.repository import DOCS, RESULTS
+
+RESULT = RESULTS / "real_files.json"
+PAGE = DOCS / "results" / "real-files.md"
+BEGIN, END = "<!-- real_files.py: begin -->", "<!-- real_files.py: end -->"
+PLANNERS = (
+    "expert", "expert_actions", "pdm", "idm", "search", "zoo:aggressive", "constant_velocity", "random",
+)  # fmt: skip
+#: Planners outside of the package.
+MODULES = {"search": "search_planner:SearchPlanner"}
+TRAFFIC = ("log", "idm")
+
+
+def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
+    """Every scenario of every file, with the name of the folder of its file."""
+    for file in find_files(data)[0]:
+        for recording in detect(file).read(file):
+            if isinstance(recording, BadRecord):
+                raise SystemExit(str(recording.error()))
+            for window in windows(recording):
+                yield file.relative_to(data).parts[0], assemble(window)
+
+
+def measured(data: Path) -> dict[str, Any]:
+    """Outcome, score and progress of every planner, scenario by scenario."""
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
+    sources, scenarios = zip(*scenarios_of(data), strict=True)
+    bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
+    rows = [{"source": source, "scenario_id": one.id} for source, one in zip(sources, scenarios, strict=True)]
+    found: dict[str, Any] = {kind: {} for kind in TRAFFIC}
+    for planner in PLANNERS:
+        driver, task = find_planner(MODULES.get(planner, planner), bank, False)
+        for kind in TRAFFIC:
+            table = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
+            found[kind][planner] = [
+                {
+                    "outcome": outcome(table, row),
+                    **{name: _number(table.metrics[name][row]) for name in ("vmax_score", "progress")},
+                }
+                for row in range(len(rows))
+            ]
+            print(planner, kind, [one["outcome"] for one in found[kind][planner]], flush=True)
+    return {
+        "command": "python -m experiments.data.real_files --data ../shared/data --write",
+        "when": datetime.now(UTC).isoformat(timespec="minutes"),
+        "scenarios": rows,
+        "planners": found,
+        "versions": versions(),
+    }
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 3) if np.isfinite(value) else None
+
+
+def tables(result: dict[str, Any]) -> str:
+    """A table per kind of traffic: a row per scenario, a column per planner."""
+    lines: list[str] = []
+    for kind, planners in result["planners"].items():
+        lines += [
+            f"In `{kind}` traffic:",
+            "",
+            f"| source | scenario | {' | '.join(f'`{p}`' for p in planners)} |",
+        ]
+        lines.append("|---|---|" + "---|" * len(planners))
+        for row, about in enumerate(result["scenarios"]):
+            cells = [_cell(driven[row]) for driven in planners.values()]
+            lines.append(f"| {about['source']} | {about['scenario_id']} | {' | '.join(cells)} |")
+        passed = [sum(one["outcome"] == "success" for one in driven) for driven in planners.values()]
+        lines += [f"| | **successes** of {len(result['scenarios'])} | {' | '.join(map(str, passed))} |", ""]
+    return "\n".join(lines[:-1])
+
+
+def _cell(one: dict[str, Any]) -> str:
+    score = "" if one["vmax_score"] is None else f" {one['vmax_score']:.2f}"
+    return f"{one['outcome']}{score}"
+
+
+def into_page(result: dict[str, Any]) -> None:
+    """Puts the tables into the page."""
+    before, rest = PAGE.read_text().split(BEGIN)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{tables(result)}\n\n{END}{rest.split(END)[1]}")
+
+
+def main() -> None:
+    """Measures as asked, stores and shows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--write", action="store_true", help="store the result, and put it into the page")
+    parser.add_argument("--table", action="store_true", help="put what is stored into the page")
+    args = parser.parse_args()
+    if args.table:
+        into_page(json.loads(RESULT.read_text()))
+        return
+    if args.data is None:
+        parser.error("the following arguments are required: --data")
+    result = measured(args.data)
+    if args.write:
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+        into_page(result)
+
+
+if __name__ == "__main__":
+    main()

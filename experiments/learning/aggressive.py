@@ -1,0 +1,238 @@
+"""The aggressive driver of the zoo: how it is trained, whether it is aggressive, and how it gets into the package.
+
+drivax train aggressive --data BENCHMARK/train --out RUNS/aggressive
+drivax train aggressive --data BENCHMARK/train --out RUNS/clone --total_steps 1536000 --algorithm.kind bc
+    --algorithm.network.encoder.rows "[32, 32]" --algorithm.network.encoder.hidden "[128, 128]"
+    --algorithm.network.first_scale 0.1
+python -m experiments.learning.aggressive judge --data BENCHMARK/validation --runs RUNS [--only ego|others|traffic]
+    [--write]
+python -m experiments.learning.aggressive pack --data BENCHMARK/validation --runs RUNS
+python -m experiments.learning.aggressive table
+
+BENCHMARK is what `drivax generate BENCHMARK --benchmark` made. The clone has the same observation and as many
+updates toward the log as the aggressive driver has before it learns by reward. `judge` measures on the validation
+split who drives how in ego's place; how the two policies drive in the place of other vehicles, one at a time, which
+is what they do as traffic; and what meets a car that follows IDM in each kind of traffic. `pack` writes the policy
+into the package, with what was measured of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.episode_table import EpisodeTable, interval_of
+from drivax.evaluation.rollout import drive, judging
+from drivax.evaluation.runner import evaluate
+from drivax.evaluation.tables import paired_differences
+from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
+from drivax.planners.catalogue import make_planner
+from drivax.planners.planner import Planner
+from drivax.planners.planner_traffic import with_driver
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.simulator import Simulator
+from drivax.tasks.task import Task
+from drivax.tracking.run_folder import versions
+from experiments.repository import RESULTS, ROOT
+
+RESULT = RESULTS / "aggressive.json"
+ZOO = ROOT / "src" / "drivax" / "zoo"
+OWN = tuple(
+    f"boldness:{name}"
+    for name in ("speed_ratio", "short_ttc", "lane_changes", "max_acceleration", "max_braking")
+)
+BOLD = tuple(name.partition(":")[2] for name in OWN)
+FAILURES = ("collision", "at_fault_collision", "offroad", "red_light")
+#: Vehicles per scenario in whose place the policies are measured, and how many are driven side by side.
+OTHERS, BATCH = 2, 64
+
+Table = dict[str, dict[str, Any]]
+
+
+def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> dict[str, Any]:
+    """The log, IDM along the route, the clone and the aggressive driver, as ego."""
+    drivers: dict[str, tuple[Planner, Task]] = {
+        "log": (make_planner("expert"), Task()),
+        "idm": (make_planner("idm"), Task()),
+        **{name: load_policy(runs / name, bank) for name in ("clone", "aggressive")},
+    }
+    wanted = (*BOLD, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
+    driven = {
+        name: evaluate(planner, bank, names, task=replace(task, metrics=OWN))
+        for name, (planner, task) in drivers.items()
+    }
+    against = {
+        other: {
+            metric: paired_differences(driven["aggressive"], driven[other], metric).as_dict()
+            for metric in wanted
+        }
+        for other in ("clone", "log")
+    }
+    return {"drivers": {name: _summary(found, wanted) for name, found in driven.items()}, "minus": against}
+
+
+def _summary(found: EpisodeTable, wanted: tuple[str, ...]) -> dict[str, Any]:
+    metrics = found.summary()["metrics"]
+    return {name: metrics[name] for name in wanted}
+
+
+def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
+    """Both policies in the place of the vehicles nearest to ego, one at a time, everyone else as logged."""
+    traffic = policy_traffic(runs / "aggressive", count=OTHERS)
+    start = jax.jit(jax.vmap(lambda bank, row: traffic.start(bank, row, CURRENT_STEP), (None, 0)))
+    table: Table = {}
+    for name in ("clone", "aggressive"):
+        planner, task = load_policy(runs / name, bank)
+        slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
+        row, place = np.nonzero(slots < bank.agents.shape[2])
+        values = _driven(
+            Simulator(judging(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]
+        )
+        segments = np.array([names[number]["segment"] for number in row])
+        table[name] = {
+            metric: interval_of(metric, values[metric], segments).as_dict()
+            for metric in (*BOLD, "min_ttc", *FAILURES, "left_map")
+        }
+    return table
+
+
+def _driven(
+    simulator: Simulator,
+    planner: Planner,
+    bank: ScenarioBank,
+    row: np.ndarray[Any, Any],
+    slot: np.ndarray[Any, Any],
+) -> dict[str, np.ndarray[Any, Any]]:
+    """Metrics of one agent of each of these rows that a planner drives; NaN where undefined."""
+
+    def one(planner: Planner, bank: ScenarioBank, row: jax.Array, slot: jax.Array) -> Any:
+        keys = jax.random.key(0)[None]
+        return drive(simulator, planner, bank, row[None], keys, CURRENT_STEP, slot).metrics
+
+    many = jax.jit(jax.vmap(one, (None, None, 0, 0)))
+    parts = []
+    for first in range(0, len(row), BATCH):
+        chosen = np.arange(first, first + BATCH).clip(max=len(row) - 1)
+        found = jax.device_get(many(planner, bank, jnp.asarray(row[chosen]), jnp.asarray(slot[chosen])))
+        kept = min(BATCH, len(row) - first)
+        parts.append({name: np.where(v.defined, v.value, np.nan)[:kept, 0] for name, v in found.items()})
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
+    """What meets a car that follows IDM along its route, by how the others drive."""
+    kinds = {name: find_traffic(name) for name in ("log", "idm")}
+    kinds |= {name: policy_traffic(runs / name) for name in ("clone", "aggressive")}
+    wanted = ("short_ttc", "min_ttc", "max_braking", "collision", "at_fault_collision", "success")
+    return {
+        name: _summary(
+            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN), traffic=traffic), wanted
+        )
+        for name, traffic in kinds.items()
+    }
+
+
+PARTS = {"ego": in_egos_place, "others": in_others_place, "traffic": in_traffic}
+
+
+def judged(args: argparse.Namespace) -> None:
+    """Measures, prints, and with --write stores what was measured beside what is stored of the other parts."""
+    stored = ScenarioSet.open(args.data)
+    scenarios = list(stored)
+    bank, names = ScenarioBank.from_scenarios(scenarios), [dict(row) for row in scenario_names(scenarios)]
+    found: dict[str, Any] = json.loads(RESULT.read_text()) if RESULT.is_file() else {}
+    found |= {
+        "command": "python -m experiments.learning.aggressive judge --data BENCHMARK/validation --runs RUNS --write",
+        "when": datetime.now(UTC).isoformat(timespec="minutes"),
+        "validation": {"scenarios": len(scenarios), "hash": stored.hash},
+        "versions": versions(),
+    }
+    for name in [args.only] if args.only else PARTS:
+        found[name] = PARTS[name](bank, names, args.runs)
+        print(json.dumps({name: _means(found[name])}, indent=1), flush=True)
+        if args.write:
+            RESULT.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _means(found: Mapping[str, Any]) -> dict[str, Any]:
+    """The same tables with means only."""
+    if "mean" in found:
+        return found["mean"] if found["mean"] is None else round(found["mean"], 4)
+    return {name: _means(part) for name, part in found.items()}
+
+
+def packed(args: argparse.Namespace) -> None:
+    """Writes the policy into the package, with what is stored of it."""
+    found = json.loads(RESULT.read_text())
+    bank = ScenarioBank.from_scenarios([ScenarioSet.open(args.data)[0]])
+    measured = {
+        "validation": found["validation"],
+        "ego": _means(found["ego"]["drivers"]["aggressive"]),
+        "others": _means(found["others"]["aggressive"]),
+    }
+    folder = export_policy(
+        args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measured}, overwrite=True
+    )
+    print(f"wrote {folder.path}")
+
+
+COLUMNS = {
+    "speed_ratio": "speed / limit", "short_ttc": "ttc < 1 s", "min_ttc": "least ttc, s", "lane_changes": "lane changes",
+    "max_acceleration": "acceleration", "max_braking": "braking", "collision": "`collision`",
+    "at_fault_collision": "at fault", "offroad": "`offroad`", "red_light": "`red_light`", "success": "`success`",
+}  # fmt: skip
+
+
+def tables() -> str:
+    """What is stored, as the tables of the guide."""
+    found = json.loads(RESULT.read_text())
+    parts = (found["ego"]["drivers"], found["ego"]["minus"], found["others"], found["traffic"])
+    return "\n".join(_table(rows) for rows in parts)
+
+
+def _table(rows: Mapping[str, Any]) -> str:
+    names = [name for name in COLUMNS if name in next(iter(rows.values()))]
+    lines = [f"| | {' | '.join(COLUMNS[name] for name in names)} |", "|---" * (len(names) + 1) + "|"]
+    for row, cells in rows.items():
+        texts = [
+            f"{cells[name]['mean']:.3f} [{cells[name]['low']:.3f}, {cells[name]['high']:.3f}]"
+            for name in names
+        ]
+        lines.append(f"| {row} | {' | '.join(texts)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Judges, packs, or prints what is stored."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("table")
+    judging_command, packing = commands.add_parser("judge"), commands.add_parser("pack")
+    judging_command.add_argument("--only", choices=list(PARTS))
+    judging_command.add_argument("--write", action="store_true", help="store the result")
+    for command in (judging_command, packing):
+        command.add_argument("--data", type=Path, required=True)
+        command.add_argument("--runs", type=Path, required=True)
+    args = parser.parse_args()
+    if args.command == "table":
+        print(tables())
+        return
+    (judged if args.command == "judge" else packed)(args)
+
+
+if __name__ == "__main__":
+    main()

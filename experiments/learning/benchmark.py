@@ -1,0 +1,352 @@
+"""The main table: every planner on the benchmark's test split, in recorded and in reactive traffic.
+
+python -m experiments.learning.benchmark drive --data BENCHMARK [--planner NAME ...] [--traffic KIND ...]
+python -m experiments.learning.benchmark judge     (what was driven, as means with intervals, and the page)
+python -m experiments.learning.benchmark table     (what is stored, into the page)
+
+`drive` keeps the episodes of each planner and kind of traffic in a file of its own. Learned planners are those in
+experiments/state/policies, where `presets.py train` puts them, with several seeds each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.api import find_planner
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.episode_table import SHARES, EpisodeTable, interval_of
+from drivax.evaluation.runner import evaluate
+from drivax.learning.policies import find_traffic, load_policy
+from drivax.planners.planner import Planner
+from drivax.planners.simple import RandomActions
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.stats.intervals import Interval, bootstrap_mean, paired_bootstrap
+from drivax.stats.seeds import difference_interval, seeds_interval
+from drivax.tasks.actions import Published
+from drivax.tasks.task import Task
+from drivax.tracking.run_folder import versions
+from experiments.learning.tables import interval, table
+from experiments.repository import DOCS, RESULTS, STATE, fetched
+
+#: Weights of all seeds of the learned planners, and episodes of all planners: fetched from history where they are not.
+POLICIES, EPISODES = STATE / "policies", STATE / "benchmark"
+RESULT = RESULTS / "benchmark.json"
+PAGE = DOCS / "results" / "benchmark.md"
+TRAFFIC = ("log", "idm")
+#: Random actions in the box of the published action space; they have a table of their own.
+BOX = "random in the published box"
+PLANNERS = ("expert", "pdm", "idm", "constant_velocity", "random", BOX)
+#: Columns of the page, with their short names.
+COLUMNS = {
+    "accuracy": "accuracy", "collision": "collision", "at_fault_collision": "at fault", "offroad": "off-road",
+    "red_light": "red light", "progress": "progress (m)", "ttc_ok": "ttc", "comfortable": "comfort",
+    "vmax_score": "vmax score",
+}  # fmt: skip
+#: Whom every learned planner is compared with, and in what.
+AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
+#: Tags by which accuracy is told apart, and where those of the scenarios are kept.
+TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
+#: What the table of random actions shows: until the first failure, as published episodes end there.
+UNTIL = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
+
+Metrics = dict[str, np.ndarray[Any, Any]]
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Episodes of one planner in one kind of traffic.
+
+    Attributes:
+        values: ``[seeds, scenarios]`` by metric, NaN where undefined.
+        segments: Of each scenario.
+        about: ``planner``, ``traffic``, ``seeds``, ``test`` (hash of the set), ``when``, ``versions``.
+    """
+
+    values: Metrics
+    segments: np.ndarray[Any, Any]
+    about: Mapping[str, Any]
+
+
+def learned() -> dict[str, list[Path]]:
+    """The folders of every seed of every learned planner."""
+    return {path.name: sorted(path.glob("seed-*")) for path in sorted(POLICIES.glob("*")) if path.is_dir()}
+
+
+def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
+    """What is called so: one planner, or one for each seed."""
+    if name == BOX:
+        return [(RandomActions(), Task(actions=Published()))]
+    folders = learned().get(name)
+    if not folders:
+        return [find_planner(name, bank)]
+    # Of one name, all seeds are driven by one program.
+    loaded = [load_policy(folder, bank) for folder in folders]
+    return [(replace(planner, name=name), task) for planner, task in loaded]
+
+
+def until_failure(results: EpisodeTable) -> Metrics:
+    """Steps until the first collision, off-road step or red light (else to the end), and metres driven until then."""
+    driven = results.trajectories
+    events = np.stack([*driven.events.values()])
+    last = driven.ego.shape[1] - 1
+    steps = np.where(events < 0, last, events - driven.start).min(axis=0)
+    moved = np.hypot(*np.moveaxis(np.diff(driven.ego[:, :, :2], axis=1), -1, 0))
+    within = np.arange(last) < steps[:, None]
+    return {"steps_until_failure": steps, "metres_until_failure": np.where(within, moved, 0.0).sum(axis=1)}
+
+
+def drive(args: argparse.Namespace) -> None:
+    """Drives every planner asked for in every kind of traffic, and stores the episodes."""
+    stored = ScenarioSet.open(args.data / "test")
+    scenarios = list(stored)
+    bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
+    EPISODES.mkdir(parents=True, exist_ok=True)
+    tags = {tag: np.array([entry["tags"][tag] for entry in stored.entries]) for tag in TAGS}
+    np.savez_compressed(EPISODES / STRATA, allow_pickle=False, test=np.array(stored.hash), **tags)
+    for name in args.planner or (*PLANNERS, *learned()):
+        for kind in args.traffic:
+            found = [
+                evaluate(planner, bank, names, task=task, traffic=find_traffic(kind))
+                for planner, task in drivers(name, bank)
+            ]
+            about = {
+                "planner": name,
+                "traffic": kind,
+                "seeds": len(found),
+                "test": stored.hash,
+                "when": datetime.now(UTC).isoformat(timespec="minutes"),
+                "versions": versions(),
+            }
+            values = {metric: [results.metrics[metric] for results in found] for metric in found[0].metrics}
+            for results in found:
+                for metric, row in until_failure(results).items():
+                    values.setdefault(metric, []).append(row)
+            np.savez_compressed(
+                file_of(name, kind),
+                allow_pickle=False,
+                about=np.array(json.dumps(about)),
+                segment=np.array([row["segment"] for row in names]),
+                **{metric: np.array(rows, np.float32) for metric, rows in values.items()},
+            )
+            print(name, kind, *(round(float(results.metrics["accuracy"].mean()), 3) for results in found))
+
+
+def file_of(name: str, kind: str) -> Path:
+    """Where the episodes are kept."""
+    return EPISODES / f"{name.replace(' ', '_')}-{kind}.npz"
+
+
+def episodes(name: str, kind: str) -> Driven | None:
+    """What is stored of a planner; None where it has not driven."""
+    file = file_of(name, kind)
+    if not file.is_file():
+        return None
+    with np.load(file, allow_pickle=False) as found:
+        values = {key: found[key] for key in found.files if key not in ("about", "segment")}
+        return Driven(values, found["segment"], json.loads(str(found["about"])))
+
+
+def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval:
+    """Mean, or mean difference scenario by scenario; several seeds are drawn by chance as segments are."""
+    own, segments = driven.values[metric].astype(np.float64), driven.segments
+    if against is None:
+        if len(own) == 1:
+            return interval_of(metric, own[0], segments)
+        return seeds_interval(own, segments, share=metric in SHARES)
+    other = against.values[metric].astype(np.float64)
+    if len(own) == len(other) == 1:
+        return paired_bootstrap(own[0], other[0], segments, seed=0)
+    return difference_interval(own, other, segments)[0]
+
+
+def change(driven: Driven, metric: str, before: Driven) -> Interval:
+    """Mean of what changes, scenario by scenario, for the very same agents."""
+    apart = driven.values[metric].astype(np.float64) - before.values[metric]
+    if len(apart) == 1:
+        return bootstrap_mean(apart[0], driven.segments, seed=0)
+    return seeds_interval(apart, driven.segments)
+
+
+def judged() -> dict[str, Any]:
+    """Everything that the page shows, of what has driven."""
+    driven = {
+        (name, kind): found
+        for name in (*PLANNERS, *learned())
+        for kind in TRAFFIC
+        if (found := episodes(name, kind)) is not None
+    }
+    tests = {found.about["test"] for found in driven.values()}
+    if len(tests) != 1:
+        raise SystemExit(f"{len(tests)} test sets: drive all planners on one")
+    planners: dict[str, Any] = {}
+    for (name, kind), found in driven.items():
+        metrics = (*COLUMNS, *UNTIL) if name in (BOX, "expert") else COLUMNS
+        planners.setdefault(name, {"seeds": found.about["seeds"]})[kind] = {
+            metric: mean(found, metric).as_dict() for metric in metrics
+        }
+    return {
+        "command": "python -m experiments.learning.benchmark judge",
+        "test": {"hash": tests.pop(), "scenarios": len(next(iter(driven.values())).segments)},
+        "planners": planners,
+        "reactive": {
+            name: {
+                metric: change(driven[name, "idm"], metric, driven[name, "log"]).as_dict()
+                for metric in COLUMNS
+            }
+            for name in planners
+            if name != BOX and {(name, kind) for kind in TRAFFIC} <= driven.keys()
+        },
+        "differences": {
+            kind: {
+                f"{name} - {other}": {
+                    metric: mean(driven[name, kind], metric, driven[other, kind]).as_dict()
+                    for metric in COMPARED
+                }
+                for other in AGAINST
+                for name in ("expert", *(name for name in ("pdm",) if name != other), *learned())
+                if {(name, kind), (other, kind)} <= driven.keys()
+            }
+            for kind in TRAFFIC
+        },
+        "strata": strata(driven),
+        "driven": {f"{name}, {kind}": dict(found.about) for (name, kind), found in driven.items()},
+    }
+
+
+def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
+    """Accuracy in recorded traffic by tag of the scenarios and its value, of every planner."""
+    with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
+        tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
+    if any(one.about["test"] != of for one in driven.values()):
+        raise SystemExit("the tags are those of another test set: drive a planner anew")
+    planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
+    found = []
+    for tag, values in tags.items():
+        for value in np.unique(values):
+            rows = values == value
+            some = {
+                name: mean(
+                    replace(
+                        one, values={"accuracy": one.values["accuracy"][:, rows]}, segments=one.segments[rows]
+                    ),
+                    "accuracy",
+                )
+                for name, one in planners.items()
+            }
+            told = {name: one.as_dict() for name, one in some.items()}
+            found.append({"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": told})
+    return found
+
+
+def page(result: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Lines of the tables of the page, by what its places are called."""
+    planners = result["planners"]
+    order = sorted(
+        (name for name in planners if name != BOX and "log" in planners[name]),
+        key=lambda name: -planners[name]["log"]["vmax_score"]["mean"],
+    )
+    heads = ("planner", "seeds", *COLUMNS.values())
+    found = {
+        kind: table(
+            heads,
+            [
+                (f"`{name}`", str(planners[name]["seeds"]), *cells(planners[name][kind], COLUMNS))
+                for name in order
+                if kind in planners[name]
+            ],
+        )
+        for kind in TRAFFIC
+    }
+    rows = [
+        (f"`{name}`", *cells(result["reactive"][name], COLUMNS, signed=True))
+        for name in order
+        if name in result["reactive"]
+    ]
+    found["reactive"] = table(("planner", *COLUMNS.values()), rows)
+    found["differences"] = table(
+        ("difference", "traffic", *(COLUMNS[metric] for metric in COMPARED)),
+        [
+            (pair, f"`{kind}`", *cells(one, COMPARED, signed=True))
+            for kind, pairs in result["differences"].items()
+            for pair, one in pairs.items()
+        ],
+    )
+    shown = {**UNTIL, "collision": "collision", "offroad": "off-road"}
+    rows = [
+        (name, f"`{kind}`", *cells(planners[name][kind], shown))
+        for name in (BOX, "expert")
+        for kind in TRAFFIC
+        if kind in planners.get(name, {})
+    ]
+    found["random"] = table(("planner", "traffic", *shown.values()), rows)
+    names = [name for name in order if name in result["strata"][0]["planners"]]
+    found["strata"] = table(
+        ("tag", "value", "scenarios", *(f"`{name}`" for name in names)),
+        [
+            (
+                one["tag"],
+                one["value"],
+                f"{one['scenarios']:,}",
+                *(interval(one["planners"][n]) for n in names),
+            )
+            for one in result["strata"]
+        ],
+    )
+    return found
+
+
+def cells(
+    found: Mapping[str, Any], metrics: Sequence[str] | Mapping[str, str], signed: bool = False
+) -> list[str]:
+    """Means with intervals; metres with one digit."""
+    return [
+        interval(found[metric], signed=signed, digits=1 if "progress" in metric or metric in UNTIL else 3)
+        for metric in metrics
+    ]
+
+
+def filled(text: str, result: Mapping[str, Any]) -> str:
+    """The page with what is stored in its places."""
+    for what, lines in page(result).items():
+        begin, end = f"<!-- benchmark.py: {what} -->", "<!-- benchmark.py: end -->"
+        before, rest = text.split(begin)
+        shown = "\n".join(lines)
+        text = f"{before}{begin}\n\n{shown}\n\n{end}{rest.split(end, 1)[1]}"
+    return text
+
+
+def main() -> None:
+    """Drives, judges, or shows what is stored."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    driving = commands.add_parser("drive")
+    driving.add_argument("--data", type=Path, required=True)
+    driving.add_argument("--planner", nargs="+", default=())
+    driving.add_argument("--traffic", nargs="+", choices=TRAFFIC, default=TRAFFIC)
+    commands.add_parser("judge")
+    commands.add_parser("table")
+    args = parser.parse_args()
+    if args.command != "table":
+        fetched("benchmarks/policies", POLICIES)
+        fetched("benchmarks/results/benchmark", EPISODES)
+    if args.command == "drive":
+        drive(args)
+        return
+    if args.command == "judge":
+        RESULT.write_text(json.dumps(judged(), indent=1) + "\n")
+    PAGE.write_text(filled(PAGE.read_text(), json.loads(RESULT.read_text())))
+
+
+if __name__ == "__main__":
+    main()

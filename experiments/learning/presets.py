@@ -1,0 +1,170 @@
+"""What our presets reach on the built-in world's benchmark: trained with several seeds, judged on the test split.
+
+python -m experiments.learning.presets train PRESET --data BENCHMARK --runs RUNS [--seeds 3] [--first 0]
+    [--key value ...]
+python -m experiments.learning.benchmark drive --data BENCHMARK --planner PRESET --traffic log
+python -m experiments.learning.presets judge     (what was driven, as means with intervals)
+python -m experiments.learning.presets table     (the stored results into the pages, and the curves of docs/algorithms)
+
+BENCHMARK is what `drivax generate BENCHMARK --benchmark` made; RUNS holds a run folder per preset. Checkpoints are
+chosen on the split `validation`, and everything is judged once on `test`. Intervals of means over seeds and differences
+resample seeds and segments of the world, both with replacement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax import settings
+from drivax.learning.config import TrainConfig
+from drivax.learning.loop import train
+from drivax.learning.policies import export_policy
+from drivax.report.runs import read_runs
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.tracking.run_folder import RunFolder, seed_folders, versions
+from drivax.tracking.workers import one_core_each
+from experiments.learning.benchmark import EPISODES, POLICIES, Driven, episodes, learned, mean
+from experiments.learning.tables import COLUMNS, CURVES, drawn, filled, pages, picture
+from experiments.repository import RESULTS, fetched, save_picture
+
+RESULT = RESULTS / "learning.json"
+SPEEDS = RESULT.with_name("training.json")
+#: What is kept of a training beside its policies.
+TRAINING = "training.json"
+REFERENCES = ("expert", "idm", "constant_velocity")
+
+
+def trained(args: argparse.Namespace, overrides: list[str]) -> None:
+    """Trains one preset, each seed by itself on one core, as many side by side as there are cores.
+
+    Store their policies in experiments/state/policies, with the longest training time and their curves. With --first
+    they join those of the seeds before it.
+    """
+    config = settings.load(TrainConfig, args.preset, overrides)
+    name = args.preset.replace("/", "-")
+    out, kept = args.runs / name, POLICIES / name
+    data, validation = (ScenarioSet.open(args.data / split) for split in ("train", "validation"))
+    notes: dict[str, Any] = {"kind": "seeds", "seeds": args.seeds, "validation": validation.hash}
+    RunFolder.create(out, config, [data], overwrite=True, **notes)
+    seeds = range(config.seed + args.first, config.seed + args.first + args.seeds)
+    agents = [replace(config, seed=seed) for seed in seeds]
+    took = [seconds for _, seconds in one_core_each(partial(_trained_alone, args.data, out), agents)]
+    about: dict[str, Any] = {"seconds": max(took), "curves": learning_curves(out)}
+    if args.first:
+        before = json.loads((kept / TRAINING).read_text())
+        about["seconds"] = max(about["seconds"], before["seconds"])
+        about["curves"] = {
+            metric: before["curves"][metric] | lines for metric, lines in about["curves"].items()
+        }
+    else:
+        shutil.rmtree(kept, ignore_errors=True)
+    bank = ScenarioBank.from_scenarios([data[0]])
+    for folder in seed_folders(out):
+        export_policy(folder, kept / folder.name, bank, overwrite=True)
+    (kept / TRAINING).write_text(json.dumps(about | {"seeds": len(learned()[name])}, indent=1) + "\n")
+
+
+def _trained_alone(data: Path, out: Path, config: TrainConfig) -> int:
+    """Seconds that one agent took."""
+    began = time.perf_counter()
+    splits = {split: ScenarioSet.open(data / split) for split in ("train", "validation")}
+    train(config, splits["train"], out / f"seed-{config.seed}", validation=splits["validation"], log=print)
+    return round(time.perf_counter() - began)
+
+
+def judged() -> dict[str, Any]:
+    """Every preset that `benchmark.py drive` has driven, and the references, with differences in pairs."""
+    found = {name: episodes(name, "log") for name in (*REFERENCES, *learned())}
+    driven = {name: one for name, one in found.items() if one is not None}
+    tests = {one.about["test"] for one in driven.values()}
+    if len(tests) != 1:
+        raise SystemExit(f"{len(tests)} test sets instead of one: drive the others anew (benchmark.py drive)")
+    told = {
+        name: json.loads((POLICIES / name / TRAINING).read_text()) for name in learned() if name in driven
+    }
+    return {
+        "command": "python -m experiments.learning.presets judge",
+        "test": {"scenarios": len(next(iter(driven.values())).segments), "hash": tests.pop()},
+        "training": {name: {key: one[key] for key in ("seconds", "seeds")} for name, one in told.items()},
+        "planners": {
+            name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
+        },
+        "differences": {
+            f"{name} - {other}": {
+                metric: mean(driven[name], metric, driven[other]).as_dict() for metric in CURVES
+            }
+            for name in told
+            for other in ("idm", "bc")
+            if other in driven and other != name
+        },
+        "curves": {name: one["curves"] for name, one in told.items()},
+        "versions": versions(),
+    }
+
+
+def _mean(driven: Driven, metric: str) -> dict[str, Any]:
+    each = [round(float(np.nanmean(row)), 4) for row in driven.values[metric]]
+    return mean(driven, metric).as_dict() | {"by_seed": each}
+
+
+def learning_curves(run: Path) -> dict[str, dict[str, list[list[float]]]]:
+    """Quantity -> seed -> points (step, value), of every validation of a run or of the agents in it."""
+    _, agents = read_runs([run])
+    return {
+        metric: {
+            agent.name: [
+                [int(step), round(float(value), 4)] for step, value in agent.curves[f"validation/{metric}"]
+            ]
+            for agent in agents
+        }
+        for metric in CURVES
+    }
+
+
+def tabled() -> None:
+    """Puts what is stored into the pages, and draws its learning curves."""
+    learning, training = (json.loads(path.read_text()) for path in (RESULT, SPEEDS))
+    for name, curves in learning.get("curves", {}).items():
+        save_picture(drawn(name, curves), picture(name))
+    for page in pages():
+        page.write_text(filled(page, learning, training))
+
+
+def main() -> None:
+    """Trains, judges, or shows what is stored."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    training = commands.add_parser("train")
+    training.add_argument("preset")
+    training.add_argument("--seeds", type=int, default=3)
+    training.add_argument("--first", type=int, default=0, help="how many seeds were trained before")
+    training.add_argument("--data", type=Path, required=True)
+    training.add_argument("--runs", type=Path, required=True)
+    commands.add_parser("judge")
+    commands.add_parser("table")
+    args, overrides = parser.parse_known_args()
+    if args.command != "table":
+        fetched("benchmarks/policies", POLICIES)
+        fetched("benchmarks/results/benchmark", EPISODES)
+    if args.command == "train":
+        trained(args, overrides)
+    elif args.command == "judge":
+        RESULT.write_text(json.dumps(judged(), indent=1) + "\n")
+    else:
+        tabled()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""What ``presets.py`` and ``training.py`` stored, as tables and learning curves in the pages of the docs.
+
+A page shows what stands between ``<!-- presets.py: WHAT -->`` and ``<!-- presets.py: end -->``; see :func:`written`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from drivax.report.charts.curves import compact
+from drivax.report.pictures.palette import LIGHT, SERIES
+from experiments.repository import DOCS
+
+FOLDER = DOCS / "algorithms"
+COLUMNS = (
+    "success", "accuracy", "accuracy_at_fault", "vmax_score", "collision", "offroad", "progress_ratio",
+)  # fmt: skip
+#: What curves show, of every validation.
+CURVES = ("success", "vmax_score")
+#: What the best preset is to reach, and how fast PPO is to train on two cores, in environment steps a second.
+AIMS, SPEED = {"success": 0.80, "accuracy_at_fault": 0.90}, 8_000
+_BLOCK = re.compile(r"(<!-- presets\.py: (?!end)(?P<what>[^>]+?) -->\n).*?(<!-- presets\.py: end -->)", re.S)
+
+Result = dict[str, Any]
+
+
+def pages() -> Iterator[Path]:
+    """Pages with something to fill in."""
+    for page in (DOCS / "results" / "learning.md", *sorted(FOLDER.glob("*.md"))):
+        if _BLOCK.search(page.read_text()):
+            yield page
+
+
+def filled(page: Path, learning: Result, training: Result) -> str:
+    """The text of a page with the stored results in their places."""
+
+    def block(found: re.Match[str]) -> str:
+        what, *names = found["what"].split()
+        text = written(what, names, learning, training, page)
+        return f"{found[1]}\n{text}\n\n{found[3]}"
+
+    return _BLOCK.sub(block, page.read_text())
+
+
+def written(what: str, names: list[str], learning: Result, training: Result, page: Path) -> str:
+    """One block: ``reached``, ``differences``, ``aims``, ``training``, ``speed``, or ``curves`` of presets."""
+    parts: dict[str, Callable[[], list[str]]] = {
+        "reached": lambda: reached(learning),
+        "differences": lambda: differences(learning),
+        "aims": lambda: aims(learning, training),
+        "training": lambda: times(learning),
+        "speed": lambda: speeds(training),
+        "curves": lambda: pictures(learning, names, page),
+    }
+    return "\n".join(parts[what]())
+
+
+def reached(learning: Result) -> list[str]:
+    """A row per driver, the highest score first."""
+    planners = learning["planners"]
+    order = sorted(planners, key=lambda name: -planners[name]["vmax_score"]["mean"])
+    rows = [[name, *(interval(planners[name][column]) for column in COLUMNS)] for name in order]
+    return table(["driver", *(f"`{column}`" for column in COLUMNS)], rows)
+
+
+def differences(learning: Result) -> list[str]:
+    """A row per pair of drivers."""
+    rows = [
+        [pair, *(interval(found[column], signed=True) for column in CURVES)]
+        for pair, found in learning["differences"].items()
+    ]
+    return table(["difference", *(f"`{column}`" for column in CURVES)], rows)
+
+
+def best(learning: Result) -> str:
+    """The preset with the highest success."""
+    return max(learning["training"], key=lambda name: learning["planners"][name]["success"]["mean"])
+
+
+def aims(learning: Result, training: Result) -> list[str]:
+    """Every aim beside what was measured of the best preset."""
+    name = best(learning)
+    rows = []
+    for metric, aim in AIMS.items():
+        found = learning["planners"][name][metric]
+        rows.append([f"`{metric}` of `{name}`", f"{aim:.2f}", interval(found), found["mean"] >= aim])
+    for other in ("idm", "bc"):
+        for metric in CURVES:
+            found = learning["differences"].get(f"{name} - {other}", {}).get(metric)
+            nothing = "it is the best itself" if other == name else "not measured"
+            told = nothing if found is None else interval(found, signed=True)
+            above = found is not None and found["low"] is not None and found["low"] > 0
+            rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", told, above])
+    speed = training["training"]["ppo"]["steps_per_second"]
+    rows.append(["steps per second of training, `ppo`", f"{SPEED:,}", f"{speed:,}", speed >= SPEED])
+    cells = [[*row[:3], "yes" if row[3] else "**no**"] for row in rows]
+    return table(["what", "aim", "measured", "reached"], cells)
+
+
+def times(learning: Result) -> list[str]:
+    """How long each preset trained."""
+    rows = [
+        [f"`{name}`", str(one["seeds"]), f"{one['seconds']:,}"] for name, one in learning["training"].items()
+    ]
+    return table(["preset", "seeds", "each trained on one core for at most (s)"], rows)
+
+
+def speeds(training: Result) -> list[str]:
+    """How fast each kind trains, and on what it spends its time."""
+    rows = []
+    for name, one in training["training"].items():
+        shares = [f"{share:.0%}" for share in one["share"].values()]
+        rows.append([name, f"{one['steps_per_second']:,}", *shares])
+    first = next(iter(training["training"].values()))
+    return table(["training", "steps/s", *first["share"]], rows)
+
+
+def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
+    """The curves of these presets (of all, where none is named), with what came of each on the test split."""
+    stored = learning.get("curves", {})
+    lines = []
+    for name in names or stored:
+        if name not in stored:
+            lines += [f"No curves of preset `{name}` are stored yet.", ""]
+            continue
+        found, count = learning["planners"][name], learning["training"][name]["seeds"]
+        told = ", ".join(f"`{metric}` {interval(found[metric])}" for metric in CURVES)
+        where = Path("../algorithms" if page.parent != FOLDER else "") / picture(name).name
+        lines += [
+            f"![Learning curves of {name}]({where.as_posix()})",
+            "",
+            f"Preset `{name}`, {count} seeds, in validation on the way. On the test split: {told}.",
+            "",
+        ]
+    return lines[:-1]
+
+
+def picture(name: str) -> Path:
+    """Where the curves of a preset are drawn."""
+    return FOLDER / f"curve-{name}.png"
+
+
+def drawn(name: str, curves: Mapping[str, Mapping[str, list[list[float]]]]) -> Figure:
+    """Learning curves of one preset: a panel per quantity, a line per seed.
+
+    Args:
+        name: The preset.
+        curves: Quantity -> seed -> points (step, value).
+    """
+    figure = Figure(figsize=(8.4, 2.9), dpi=100, facecolor="white", layout="constrained")
+    figure.suptitle(name, fontsize=11, color=LIGHT["ink"])
+    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+    for axes, (metric, lines) in zip(panels, curves.items(), strict=True):
+        for number, (seed, points) in enumerate(sorted(lines.items())):
+            steps, values = zip(*points, strict=True)
+            axes.plot(
+                steps, values, marker=".", linewidth=1.4, color=SERIES[number % len(SERIES)], label=seed
+            )
+        axes.set(xlabel="steps", ylabel=f"validation {metric}", xlim=(0, None))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: compact(value)))
+        axes.grid(color=LIGHT["crosswalk"])
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[-1].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def interval(found: Mapping[str, Any], signed: bool = False, digits: int = 3) -> str:
+    """A mean with its interval."""
+    numbers = [found[name] for name in ("mean", "low", "high")]
+    if numbers[0] is None:
+        return "-"
+    mean, *ends = (f"{number:{'+' if signed else ''}.{digits}f}" for number in numbers if number is not None)
+    return f"{mean} [{', '.join(ends)}]" if ends else mean
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown."""
+    lines = [f"| {' | '.join(line)} |" for line in (heads, *rows)]
+    return [lines[0], "|---" * len(heads) + "|", *lines[1:]]

@@ -1,0 +1,38 @@
+"""Paths of docs and stored results, and files that are only in the history of the repository."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import tarfile
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+#: JSON summaries, at most 300 kB each.
+RESULTS = ROOT / "experiments" / "results"
+#: Resumable state of long experiments; it may be committed while they run, and is removed when they end.
+STATE = ROOT / "experiments" / "state"
+#: The last commit whose tree holds episodes, score tables and the weights of every seed.
+STORED = "03b904f"
+
+
+def fetched(path: str, out: Path) -> Path:
+    """Return ``out``; where it does not exist, extract the folder ``path`` of commit ``STORED`` into it first."""
+    if not out.exists():
+        archive = subprocess.run(
+            ["git", "archive", f"{STORED}:{path}"], cwd=ROOT, check=True, capture_output=True
+        ).stdout
+        with tarfile.open(fileobj=io.BytesIO(archive)) as packed:
+            packed.extractall(out, filter="data")
+    return out
+
+
+def save_picture(figure: Figure, out: Path) -> None:
+    """Write a figure as a PNG of 256 colours, a third of the size of one in true colour."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png")
+    Image.open(drawn).convert("RGB").quantize(dither=Image.Dither.NONE).save(out, optimize=True)

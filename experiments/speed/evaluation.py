@@ -1,0 +1,109 @@
+"""How long evaluations take: every planner in recorded and in reactive traffic, compilation aside.
+
+An evaluation works batch by batch and compiles in the first; what is timed are the others, and the time of all batches
+follows from theirs. Nothing else may run on the machine.
+
+python -m experiments.speed.evaluation --data SET [--planner NAME ...] [--write]     SET: at least 1,024 scenarios
+python -m experiments.speed.evaluation --table                                       what is stored, into the page
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from drivax.api import find_planner
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.runner import evaluate, lanes
+from drivax.learning.policies import find_traffic
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.schema import CURRENT_STEP
+from drivax.scenario.store import ScenarioSet
+from drivax.tracking.run_folder import versions
+from experiments.repository import DOCS, RESULTS
+from experiments.speed.simulator import machine_ms
+
+RESULT = RESULTS / "evaluation.json"
+PAGE = DOCS / "results" / "speed.md"
+BEGIN, END = "<!-- evaluation.py: begin -->", "<!-- evaluation.py: end -->"
+#: Whole batches, so that their times are alike.
+SCENARIOS = 1024
+#: Seconds that 1,000 scenarios x 80 steps may take in recorded traffic, and how many times that in reactive traffic.
+AIMS, REACTIVE = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pdm": 600}, 3
+TRAFFIC = ("log", "idm")
+
+
+def timed(planner: str, traffic: str, bank: ScenarioBank, names: list[dict[str, str]]) -> float:
+    """Seconds for 1,000 scenarios x 80 steps."""
+    driver, task = find_planner(planner, bank, False)
+    ends: list[float] = []
+    evaluate(
+        driver,
+        bank,
+        names,
+        task=task,
+        traffic=find_traffic(traffic),
+        progress=lambda done, whole: ends.append(time.perf_counter()),
+    )
+    batch = (ends[-1] - ends[0]) / (len(ends) - 1)
+    return 1000 / lanes() * batch * 80 / (bank.steps - 1 - CURRENT_STEP)
+
+
+def measured(data: Path, planners: list[str]) -> dict[str, Any]:
+    """Seconds by planner and traffic."""
+    stored = ScenarioSet.open(data)
+    scenarios = [stored[row] for row in range(SCENARIOS)]
+    bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
+    seconds: dict[str, dict[str, float]] = {}
+    for planner in planners:
+        seconds[planner] = {kind: round(timed(planner, kind, bank, names), 2) for kind in TRAFFIC}
+        print(planner, seconds[planner], flush=True)
+    return {
+        "command": "python -m experiments.speed.evaluation --data SET --write",
+        "when": datetime.now(UTC).isoformat(timespec="minutes"),
+        "machine_ms": machine_ms(),
+        "seconds": seconds,
+        "versions": versions(),
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """Beside what each may take."""
+    lines = [
+        "| planner | `log` (s) | may take (s) | `idm` (s) | `idm` / `log` |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for planner, found in result["seconds"].items():
+        log, idm = (found[kind] for kind in TRAFFIC)
+        lines.append(f"| `{planner}` | {log:,.1f} | {AIMS[planner]} | {idm:,.1f} | {idm / log:.2f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measures as asked, stores and shows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--planner", nargs="+", choices=list(AIMS), default=list(AIMS))
+    parser.add_argument("--write", action="store_true", help="store the result")
+    parser.add_argument("--table", action="store_true", help="put what is stored into the page")
+    args = parser.parse_args()
+    if args.table:
+        before, rest = PAGE.read_text().split(BEGIN)
+        found = table(json.loads(RESULT.read_text()))
+        PAGE.write_text(f"{before}{BEGIN}\n\n{found}\n\n{END}{rest.split(END)[1]}")
+        return
+    if args.data is None:
+        parser.error("the following arguments are required: --data")
+    result = measured(args.data, args.planner)
+    if args.write:
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""How fast offline learning is: updates of every preset ``offline/*``, scouts alone and side by side, and draws.
+
+Nothing else may run on the machine.
+
+python -m experiments.speed.offline --data SET --write
+python -m experiments.speed.offline --table     (what is stored, into docs/algorithms/offline.md)
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from drivax import settings
+from drivax.curation.ensemble import EnsembleConfig, train_ensemble
+from drivax.learning.algorithm import training_data
+from drivax.learning.config import TrainConfig
+from drivax.learning.experience import draw, sampler
+from drivax.learning.program import Program, Seeds
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.traffic.log import LogTraffic
+from drivax.tracking.run_folder import versions
+from experiments.repository import DOCS, RESULTS
+
+RESULT = RESULTS / "offline.json"
+PAGE = DOCS / "algorithms" / "offline.md"
+BEGIN, END = "<!-- offline.py: begin -->", "<!-- offline.py: end -->"
+ALGORITHMS = ("bc", "cql", "cql_bc", "iql", "td3_bc")
+SCENARIOS, DRAWS = 10_000, 1_000_000
+
+
+def seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Median time of a call, the first of which is not counted."""
+    return statistics.median([elapsed(call) for _ in range(repeats + 1)][1:])
+
+
+def elapsed(call: Callable[[], Any]) -> float:
+    """Seconds that a call takes."""
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - began
+
+
+def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
+    """What runs an iteration of a training, and its size: gradients change so many parameters."""
+    environment, bank = config.environment(LogTraffic()), ScenarioBank.from_scenarios(data)
+    learner = config.algorithm.build(environment, bank, config.iterations)
+    began = time.perf_counter()
+    weights = np.ones((len(bank), bank.steps))
+    made = jax.block_until_ready(training_data(config.algorithm, environment, bank, weights))
+    prepared = time.perf_counter() - began
+    program = Program(Seeds(learner, (0,)), made, 1)
+    state = [program.first_state()]
+    trained = state[0].parameters, getattr(state[0], "rest", ())
+    size = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(trained))
+
+    def iterate() -> Any:
+        state[0], logs = program.step(state[0])
+        return logs
+
+    algorithm: Any = config.algorithm
+    return iterate, {
+        "batch": algorithm.batch,
+        "parameters": size,
+        "seconds_to_prepare": round(prepared, 1),
+    }
+
+
+def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
+    """Of every algorithm, by turns: updates per second with the slowest and quickest, and its size."""
+    configs = {name: replace(settings.load(TrainConfig, f"offline/{name}"), devices=1) for name in ALGORITHMS}
+    made = {name: training(config, data) for name, config in configs.items()}
+    rates = {name: list[float]() for name in ALGORITHMS}
+    for turn in range(repeats + 1):
+        for name, (iterate, _) in made.items():
+            took = elapsed(iterate)
+            if turn:  # the first time it is compiled
+                algorithm: Any = configs[name].algorithm
+                rates[name].append(algorithm.updates / took)
+    return {
+        name: {
+            "updates_per_second": round(statistics.median(rates[name]), 1),
+            "range": [round(min(rates[name]), 1), round(max(rates[name]), 1)],
+            **size,
+        }
+        for name, (_, size) in made.items()
+    }
+
+
+def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
+    """Seconds per iteration of the default ensemble and of one of its scouts alone, by turns."""
+    config = EnsembleConfig()
+    iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
+    config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
+    began, all_of_them, alone = [0.0], list[float](), list[float]()
+
+    def turn(done: int, total: int) -> None:
+        ended = time.perf_counter()
+        jax.block_until_ready(iterate())
+        if done > 1:
+            all_of_them.append(ended - began[0])
+            alone.append(time.perf_counter() - ended)
+        began[0] = time.perf_counter()
+
+    train_ensemble(config, data, turn)
+    one, together = statistics.median(alone), statistics.median(all_of_them)
+    return {
+        "scouts": config.folds,
+        "parameters_of_one": size["parameters"],
+        "batch": config.cloning.batch,
+        "updates": config.cloning.updates,
+        "seconds_of_one": round(one, 3),
+        "seconds_of_all": round(together, 3),
+        "ratio": round(together / one, 2),
+    }
+
+
+def draws() -> int:
+    """Places drawn per second among 10,000 scenarios of 91 steps, by uneven weights."""
+    made = sampler(np.random.default_rng(0).gamma(0.5, size=(SCENARIOS, 91)))
+    call = partial(jax.jit, static_argnums=2)(draw)
+    return round(DRAWS / seconds(lambda: call(made, jax.random.key(0), (DRAWS,)), 5))
+
+
+def table(result: dict[str, Any]) -> str:
+    """What the page shows."""
+    rows = [
+        "| algorithm | updates/s | slowest to quickest | batch | parameters |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    rows += [
+        f"| `offline/{name}` | {one['updates_per_second']:.0f} | {one['range'][0]:.0f} to {one['range'][1]:.0f} | "
+        f"{one['batch']} | {one['parameters']:,} |"
+        for name, one in result["algorithms"].items()
+    ]
+    one = result["scouts"]
+    return "\n".join(rows) + (
+        f"\n\n{one['scouts']} scouts of {one['parameters_of_one']:,} parameters, batch {one['batch']}: "
+        f"{one['seconds_of_all']} s for {one['updates']} updates side by side, {one['ratio']} times as long as one "
+        f"alone. Steps are drawn {result['draws_per_second']:,} times per second ({', '.join(result['devices'])})."
+    )
+
+
+def main() -> None:
+    """Measures, shows and stores."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--write", action="store_true", help="store the result")
+    parser.add_argument("--table", action="store_true", help="put what is stored into the page")
+    args = parser.parse_args()
+    if args.table:
+        before, rest = PAGE.read_text().split(BEGIN)
+        shown = table(json.loads(RESULT.read_text()))
+        PAGE.write_text(f"{before}{BEGIN}\n\n{shown}\n\n{END}{rest.split(END)[1]}")
+        return
+    if args.data is None:
+        parser.error("--data is needed")
+    data = ScenarioSet.open(args.data)
+    result = {
+        "command": "python -m experiments.speed.offline --data SET --write",
+        "when": datetime.now(UTC).isoformat(timespec="minutes"),
+        "devices": [device.device_kind for device in jax.devices()],
+        "scenarios": len(data),
+        "draws_per_second": draws(),
+        "scouts": scouts(data, args.repeats),
+        "algorithms": updates(data, args.repeats),
+        "versions": versions(),
+    }
+    print(json.dumps(result, indent=1))
+    if args.write:
+        RESULT.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,337 @@
+"""The built-in world, measured: the expert, the others, the events, how difficult it is, and how much it covers.
+
+Two sets are written (or read, where an earlier run kept them): one at the configured rate of rare events, and one in
+which every scenario has an event. Everything is driven through the simulator and its metrics, on the tracks as
+recorded, with their perception noise: the generator judged its expert on the tracks without noise, with 10 cm to
+spare. The comparison with real recordings is ``experiments/world/resemblance.py``.
+
+Run: python -m experiments.world.targets --scenarios 256 --workers 2 [--domain ring] [--keep FOLDER] [--write]
+     python -m experiments.world.targets --timed 1000   (scenarios per second, on a machine that does nothing else)
+     python -m experiments.world.targets --table        (results of both domains into the guide)
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivax.api import evaluate, load
+from drivax.files import write_text
+from drivax.scenario.schema import Scenario
+from drivax.scenario.store import ScenarioSet
+from drivax.synthetic.domains import DOMAINS
+from drivax.synthetic.events import EventKind
+from drivax.synthetic.events.kinds import SEVERITY_MPS2
+from drivax.synthetic.expert.comfort import LIMITS
+from drivax.synthetic.generate import Generation, generate
+from drivax.synthetic.world import WORLD_VERSION, WorldConfig
+from drivax.tracking.run_folder import versions
+from experiments.repository import RESULTS
+from experiments.world.measures import (
+    NEAR_S,
+    against,
+    constant_speed_ttc_s,
+    largest_noise_m,
+    overlapping_pairs,
+    share,
+    uncomfortable,
+)
+from experiments.world.tables import into_guide, lines
+
+#: Planners whose success says how difficult the world is.
+DRIVERS = {name: name for name in ("constant_velocity", "random", "idm")} | {
+    "search": "search_planner:SearchPlanner"
+}
+EXPERT_METRICS = ("accuracy", "collision", "offroad", "red_light", "comfortable", "success")
+#: Scenarios that are on the device at once.
+CHUNK = 512
+#: Errors of the others' recorded poses.
+NOISE = WorldConfig().noise
+
+
+def written(folder: Path, scenarios: int, seed: int, workers: int, world: WorldConfig) -> dict[str, Any]:
+    """Generates a set if it is not there, and tells how that went."""
+    note = folder.with_suffix(".json")
+    if note.is_file():
+        source = json.loads((folder / "manifest.json").read_text())["source"]
+        if (source["world"], source["config"]) != (WORLD_VERSION, json.loads(json.dumps(asdict(world)))):
+            raise SystemExit(f"{folder} is of another world; remove it")
+    else:
+        made = generate(folder, scenarios, seed, Generation(workers=workers, world=world, overwrite=True))
+        families = {
+            name: {
+                "kept": c.kept,
+                "rejection_rate": c.rejection_rate,
+                "causes": c.rejected,
+                "unsuited": c.unsuited,
+            }
+            for name, c in made.families.items()
+        }
+        note.write_text(json.dumps({"families": families}))
+    return json.loads(note.read_text())
+
+
+def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
+    """Wall time of the command for a set that is thrown away, from its start to its end, at the default rare rate."""
+    with tempfile.TemporaryDirectory() as folder:
+        call = ["generate", str(Path(folder) / "set"), "--domain", domain, "--seed", "3"]
+        call += ["--scenarios", str(scenarios), "--workers", str(workers)]
+        begin = time.monotonic()
+        subprocess.run([sys.executable, "-m", "drivax", *call], check=True, capture_output=True)
+        seconds = time.monotonic() - begin
+    return {"scenarios": scenarios, "workers": workers, "scenarios_per_second": scenarios / seconds}
+
+
+def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
+    """One row per scenario: tags, what its arrays show, how the expert drove it, and the planners the first ones."""
+    data, rows = ScenarioSet.open(folder), []
+    for first in range(0, len(data), CHUNK):
+        scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
+        rows += _chunk(scenarios, planners if driven is None or first < driven else ())
+        print(f"  {folder.name}: {len(rows)} of {len(data)} scenarios", flush=True)
+    return rows
+
+
+def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[str, Any]]:
+    loaded = load(scenarios)
+    rows = [
+        {
+            "family": scenario.tags["family"],
+            "event": scenario.tags.get("event"),
+            "critical": "critical" in scenario.tags,
+            "segment": name["segment"],
+            "broken_limits": uncomfortable(scenario),
+            "noise_m": largest_noise_m(scenario, NOISE),
+            "severity_mps2": float(scenario.tags.get("severity_mps2", "nan")),
+            "overlaps": overlapping_pairs(scenario),
+            "ttc_s": constant_speed_ttc_s(scenario) if "event" in scenario.tags else None,
+        }
+        for scenario, name in zip(scenarios, loaded.names, strict=True)
+    ]
+    for planner in ("expert", *planners):
+        metrics = evaluate(DRIVERS.get(planner, planner), loaded).metrics
+        wanted = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
+        for i, row in enumerate(rows):
+            row |= {f"{planner}.{name}": float(metrics[name][i]) for name in wanted}
+    return rows
+
+
+def rate_of(rows: list[dict[str, Any]], column: str) -> dict[str, float | int]:
+    """Share of rows in which a metric is 1, where it was measured and is defined."""
+    values = [row[column] for row in rows if np.isfinite(row.get(column, np.nan))]
+    return share(int(sum(value > 0.5 for value in values)), len(values))
+
+
+def difficulty(rows: list[dict[str, Any]], rare: list[dict[str, Any]], planner: str) -> dict[str, Any]:
+    """Success of a planner over all, common and rare scenarios, and how much more often it fails in rare ones."""
+    column = f"{planner}.success"
+    common = rate_of([row for row in rows if row["event"] is None], column)
+    in_rare = rate_of([row for row in rare if row["event"] is not None], column)
+    fails, fails_rare = 1.0 - common["share"], 1.0 - in_rare["share"]
+    return {
+        "all": rate_of(rows, column),
+        "common": common,
+        "rare": in_rare,
+        "failure_ratio": fails_rare / fails if fails else None,
+    }
+
+
+def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
+    """Families, events and their rate beside what was configured.
+
+    Families are counted over the maps of common scenarios: a rare one takes roads that give occasion to its event, and
+    scenarios on the same map have their family from one draw. Kinds of events are counted over all rare scenarios.
+    """
+    maps = {row["segment"]: row["family"] for row in rows if row["event"] is None}
+    labelled = [row for row in (*rows, *rare) if row["event"] is not None]
+    families, events = Counter(maps.values()), Counter(row["event"] for row in labelled)
+    table: dict[str, Counter[str]] = {}
+    for row in labelled:
+        table.setdefault(row["event"], Counter())[row["family"]] += 1
+    wanted = {family.name: p for family, p in DOMAINS[world.domain].families}
+    kinds = [kind.name.lower() for kind in EventKind if kind]
+    count = len(wanted) + len(kinds) + 1
+    staged = sum(row["event"] is not None for row in rows)
+    return {
+        "families": {
+            name: against(p, families[name], len(maps), count) for name, p in sorted(wanted.items())
+        },
+        "rare_rate": against(world.rare_rate, staged, len(rows), count),
+        "events": {name: against(1 / len(kinds), events[name], len(labelled), count) for name in kinds},
+        "family_by_event": {event: dict(counts) for event, counts in sorted(table.items())},
+    }
+
+
+def severity(labelled: list[dict[str, Any]]) -> dict[str, Any]:
+    """How the required decelerations of rare events spread over thirds of their range; medians per kind."""
+    values = np.array([row["severity_mps2"] for row in labelled])
+    edges = np.linspace(*SEVERITY_MPS2, 4)
+    third = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, 2)
+    return {
+        "thirds": {
+            f"{edges[k]:.1f} to {edges[k + 1]:.1f}": share(int((third == k).sum()), len(values))
+            for k in range(3)
+        },
+        "medians": {
+            name: float(np.median([row["severity_mps2"] for row in labelled if row["event"] == name]))
+            for name in sorted({row["event"] for row in labelled})
+        },
+    }
+
+
+def near_misses(labelled: list[dict[str, Any]]) -> dict[str, Any]:
+    """In how many rare scenarios an ego that keeps its speed comes near the actor: of all, and of each kind."""
+    kinds = {"all": labelled}
+    for row in labelled:
+        kinds.setdefault(row["event"], []).append(row)
+    return {
+        name: share(sum(row["ttc_s"] < NEAR_S for row in of), len(of)) for name, of in sorted(kinds.items())
+    }
+
+
+def summary(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
+    """Everything that the table shows, from the rows of both sets."""
+    both = [*rows, *rare]
+    common = [row for row in rows if row["event"] is None]
+    labelled = [row for row in both if row["event"] is not None]
+    planners = [name for name in DRIVERS if f"{name}.success" in rows[0]]
+    return {
+        "expert": {name: rate_of(both, f"expert.{name}") for name in EXPERT_METRICS},
+        "expert_comfortable_common": rate_of(common, "expert.comfortable"),
+        "within_limits_common": {
+            name: share(sum(name not in row["broken_limits"] for row in common), len(common))
+            for name in LIMITS
+        },
+        "critical": share(sum(row["critical"] for row in common), len(common)),
+        "background_overlap": share(sum(row["overlaps"] > 0 for row in both), len(both)),
+        "largest_noise_m": max(row["noise_m"] for row in both),
+        "difficulty": {name: difficulty(rows, rare, name) for name in planners},
+        "near_at_constant_speed": near_misses(labelled),
+        "severity_mps2": severity(labelled),
+        "coverage": coverage(rows, rare, world),
+    }
+
+
+def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Generates, drives and sums up."""
+    world = replace(WorldConfig(), domain=args.domain, rare_rate=args.rare_rate)
+    rare_world = replace(world, rare_rate=1.0)
+    name = f"{args.domain}-{args.seed}-{args.scenarios}"
+    all_count, rare_count = args.scenarios, args.rare or max(args.scenarios // 4, 1)
+    sets = {
+        "all": (folder / name, all_count, args.seed, world),
+        "rare": (folder / f"{name}-rare-{rare_count}", rare_count, args.seed + 1, rare_world),
+    }
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
+    planners = tuple(DRIVERS)
+    made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
+    rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
+    return {
+        "command": command(),
+        "scenarios": all_count,
+        "rare_scenarios": rare_count,
+        "seed": args.seed,
+        "domain": args.domain,
+        **summary(rows["all"], rows["rare"], world),
+        "generation": made,
+        "versions": made_with(),
+    }
+
+
+def made_with() -> dict[str, Any]:
+    """What a result was made with."""
+    processor = platform.processor() or platform.machine()
+    return {**versions(), "world": WORLD_VERSION, "processor": processor, "cores": os.cpu_count()}
+
+
+def stored(name: str, result: dict[str, Any]) -> None:
+    """Writes a result."""
+    write_text(RESULTS / name, json.dumps(result, indent=1) + "\n")
+
+
+def tabulate() -> None:
+    """The stored results of both domains into the guide."""
+    rates = json.loads((RESULTS / "world_speed.json").read_text())
+    results = {name: json.loads((RESULTS / f"world_{name}.json").read_text()) for name in DOMAINS}
+    for name, result in results.items():
+        result["speed"] = rates[name]
+    print(into_guide(results))
+
+
+def clock(scenarios: int, workers: int) -> None:
+    """Times both domains, prints and stores that."""
+    rates = {name: speed(name, scenarios, workers) for name in DOMAINS}
+    for name, rate in rates.items():
+        print(f"{name}: {rate['scenarios_per_second']:.1f}/s")
+    stored("world_speed.json", {"command": command(), **rates, "versions": made_with()})
+
+
+def command() -> str:
+    """How this was called."""
+    return " ".join(["python", "experiments/world/targets.py", *sys.argv[1:]])
+
+
+def main() -> None:
+    """Measures, prints the table, and writes the JSON."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenarios", type=int, default=256)
+    parser.add_argument(
+        "--rare", type=int, default=None, help="scenarios of the rare set; a quarter by default"
+    )
+    parser.add_argument(
+        "--timed",
+        type=int,
+        default=None,
+        help="only time sets of so many scenarios of both domains, and store that; nothing else may run",
+    )
+    parser.add_argument(
+        "--driven",
+        type=int,
+        default=None,
+        help="scenarios that planners other than the expert drive (of each set)",
+    )
+    parser.add_argument("--rare-rate", type=float, default=0.05)
+    parser.add_argument("--domain", choices=sorted(DOMAINS), default="grid")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--keep", type=Path, default=None, help="where sets are kept, and looked for")
+    parser.add_argument("--write", action="store_true", help="store experiments/results/world_DOMAIN.json")
+    parser.add_argument(
+        "--table", action="store_true", help="put the stored results of both domains into the guide, no more"
+    )
+    args = parser.parse_args()
+    if args.table:
+        tabulate()
+        return
+    if args.timed is not None:
+        clock(args.timed, args.workers)
+        return
+    if args.keep is not None:
+        args.keep.mkdir(parents=True, exist_ok=True)
+        result = measure(args, args.keep)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            result = measure(args, Path(folder))
+    table = lines(result)
+    width = max(len(name) for name, _ in table)
+    print("\n".join(f"{name:<{width}}  {value}" for name, value in table))
+    if args.write:
+        stored(f"world_{args.domain}.json", result)
+
+
+if __name__ == "__main__":
+    main()

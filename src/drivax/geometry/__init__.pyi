@@ -1,0 +1,14 @@
+from .boxes import corners as corners
+from .boxes import gap as gap
+from .boxes import overlap as overlap
+from .boxes import passage as passage
+from .boxes import time_to_overlap as time_to_overlap
+from .polylines import arc_lengths as arc_lengths
+from .polylines import headings as headings
+from .polylines import point_to_segment as point_to_segment
+from .polylines import project as project
+from .polylines import resample as resample
+from .vectors import norm as norm
+from .vectors import root as root
+from .vectors import rotate as rotate
+from .vectors import wrap as wrap

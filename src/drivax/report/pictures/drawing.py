@@ -1,0 +1,302 @@
+"""What is drawn of an episode: one record behind player, videos, still pictures and Gymnasium rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from drivax.geometry.boxes import corners
+from drivax.report.pictures.palette import agent_colour, light_colour, road_layer
+from drivax.scenario.schema import Scenario
+
+Array = np.ndarray[Any, Any]
+Box = tuple[float, float, float, float]
+Lines = list[Float[Array, "_ 2"]]
+#: Layers of the map in drawing order.
+LAYERS = ("crosswalk", "lane", "bike", "line", "edge")
+#: Colours of lights, in the order of their codes.
+LIGHTS = ("unknown", "red", "amber", "green")
+#: Widths of lines by colour, pixels.
+WIDTHS: Mapping[str, float] = {
+    "lane": 1.0, "bike": 1.0, "line": 1.0, "edge": 1.8, "route": 2.0, "goal": 2.0, "ego": 2.0, "log": 1.4, "ink": 1.4,
+    "outline": 0.8, "red": 5.0, "amber": 4.0, "green": 2.5, "unknown": 2.0,
+}  # fmt: skip
+#: Events that are marked, and their words.
+EVENT_WORDS: Mapping[str, str] = {
+    "collision": "collision", "offroad": "off-road", "red_light": "red light", "crashed": "planner crashed",
+}  # fmt: skip
+#: Map and agents further than this from every ego path are left out, metres.
+MARGIN_M = 90.0
+#: Radii of a stop sign and of the ring around the goal, metres.
+STOP_M, GOAL_M = 0.9, 2.0
+#: Segments of one feature with ends closer than this are one line, metres.
+_JOINT_M = 0.02
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One planner's episode in a scenario.
+
+    Attributes:
+        planner: Its name.
+        ego: Position [m], heading [rad], speed [m/s] at every step, local frame; NaN where the agent is absent.
+        start: Step at which the planner took over.
+        events: Step of the first event by name, -1 for none.
+        outcome: Its outcome in words.
+        action: The first two numbers of its actions, NaN where there are none; None for the log.
+        others: Position [m] and heading [rad] of every agent in reactive traffic, NaN where absent; None for the log's.
+    """
+
+    planner: str
+    ego: Float[Array, "step 4"]
+    start: int
+    events: dict[str, int]
+    outcome: str
+    action: Float[Array, "step 2"] | None = None
+    others: Float[Array, "step agent 3"] | None = None
+
+
+def with_traffic_of(rollout: Rollout, scenario: Scenario) -> Scenario:
+    """Return the scenario with all agents but ego as they moved in a rollout, from its start on."""
+    if rollout.others is None:
+        return scenario
+    pose = rollout.others[rollout.start :]
+    steps, known = slice(rollout.start, rollout.start + len(pose)), slice(1, pose.shape[1])
+    present = np.asarray(np.isfinite(pose[:, known]).all(axis=-1))
+    filled = np.where(present[..., None], pose[:, known], 0.0)
+    record = scenario.record.copy()
+    record["agent_valid"][steps, 1:] = False
+    record["agent_valid"][steps, known] = present
+    record["agent_xy"][steps, known], record["agent_heading"][steps, known] = filled[..., :2], filled[..., 2]
+    return replace(scenario, record=record)
+
+
+def surroundings(scenario: Scenario, rollouts: Sequence[Rollout]) -> Box:
+    """Return the bounding box of all ego paths with a margin, metres."""
+    paths = [scenario.agent_xy[:, 0][scenario.agent_valid[:, 0]]]
+    paths += [rollout.ego[np.isfinite(rollout.ego).all(axis=1), :2] for rollout in rollouts]
+    points = np.concatenate(paths).astype(np.float64)
+    low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Lines or polygons of one style, metres.
+
+    Attributes:
+        lines: Points ``[n, 2]`` of each.
+        line: Colour of the outline, None for none.
+        fill: Colour of the inside, None for none.
+        dash: Lengths of dashes and gaps, pixels.
+        level: Drawing order.
+    """
+
+    lines: Sequence[Array]
+    line: str | None = None
+    fill: str | None = None
+    dash: tuple[float, ...] = ()
+    level: float = 0.0
+
+    @property
+    def width(self) -> float:
+        """Width of the outline, pixels."""
+        return WIDTHS[self.line] if self.line else 0.0
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Agents.
+
+    Attributes:
+        xy, heading: Pose at every step.
+        size: Length and width, metres.
+        colour: Name of the colour of each.
+        valid: Where they are present.
+    """
+
+    xy: Float[Array, "step agent 2"]
+    heading: Float[Array, "step agent"]
+    size: Float[Array, "agent 2"]
+    colour: Sequence[str]
+    valid: Bool[Array, "step agent"]
+
+    def shapes(self, step: int) -> Iterator[Shape]:
+        """Yield the agents at a step, one shape per colour."""
+        rows: list[int] = np.flatnonzero(self.valid[step]).tolist()
+        for colour in dict.fromkeys(self.colour[row] for row in rows):
+            outlines = [
+                _outline(self.xy[step, row], self.heading[step, row], self.size[row])
+                for row in rows
+                if self.colour[row] == colour
+            ]
+            yield Shape(outlines, "outline", colour, level=4)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A scenario as it is drawn, local frame, metres.
+
+    Attributes:
+        layers: Polylines of the map by layer.
+        stops: Positions of stop signs.
+        route, goal: Points of the route to the goal; the goal, if it is near.
+        light_line, light_state: Stop line of each light, and its code (:data:`LIGHTS`) at every step, -1 unobserved.
+        agents, parked: All agents but ego.
+        log: The logged ego.
+    """
+
+    layers: Mapping[str, Lines]
+    stops: Float[Array, "sign 2"]
+    route: Float[Array, "point 2"]
+    goal: Float[Array, "_ 2"]
+    light_line: Float[Array, "light 2 2"]
+    light_state: Int[Array, "step light"]
+    agents: Boxes
+    parked: Boxes
+    log: Boxes
+
+    @classmethod
+    def of(cls, scenario: Scenario, box: Box) -> Drawing:
+        """Return what is drawn of a scenario inside (low x, low y, high x, high y)."""
+        signs = scenario.stop_xy[(scenario.stop_xy != 0).any(axis=1)]
+        line, state = _lights(scenario)
+        near = _within(line[:, 0], box)
+        route = scenario.route_xy[0, : int(scenario.route_points[0])]
+        goal = np.asarray(scenario.goal_xy)[None]
+        return cls(
+            road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
+            goal[_within(goal, box)], line[near], state[:, near],
+            _agents(scenario, box), _parked(scenario, box), _box_of(scenario, slice(0, 1), None),
+        )  # fmt: skip
+
+    def ground(self) -> Iterator[Shape]:
+        """Yield what never changes: map, stop signs, route and goal."""
+        yield Shape(self.layers["crosswalk"], fill="crosswalk")
+        for name in LAYERS[1:]:
+            yield Shape(self.layers[name], name, level=1)
+        yield Shape([ring(sign, STOP_M) for sign in self.stops], fill="stop", level=2)
+        yield Shape([self.route] if len(self.route) else [], "route", dash=(7.0, 5.0), level=2)
+        yield Shape([ring(point, GOAL_M) for point in self.goal], "goal", level=2)
+
+    def traffic(self, step: int) -> Iterator[Shape]:
+        """Yield lights and all agents but ego at a step."""
+        for code, name in enumerate(LIGHTS):
+            yield Shape(list(self.light_line[self.light_state[step] == code]), name, level=3)
+        yield from self.parked.shapes(step)
+        yield from self.agents.shapes(step)
+
+    def ego(self, path: Float[Array, "step _"], step: int, logged: bool = True) -> Iterator[Shape]:
+        """Yield ego at a step: its path so far, the dashed box of the log, its box and its arrow.
+
+        Args:
+            path: Position and heading at every step, NaN where ego is absent.
+            step: The step.
+            logged: Whether to draw the log's box.
+        """
+        path, size = path[: step + 1], self.log.size[0]
+        yield Shape([path[np.isfinite(path).all(axis=1), :2]], "ego", level=4.5)
+        if logged and self.log.valid[step, 0]:
+            box = _outline(self.log.xy[step, 0], self.log.heading[step, 0], size)
+            yield Shape([box], "log", dash=(4.0, 3.0), level=5)
+        if np.isfinite(path[-1]).all():
+            x, y, heading = path[-1, :3]
+            yield Shape([_outline((x, y), heading, size)], "ink", "ego", level=6)
+            ahead = np.array((np.cos(heading), np.sin(heading)))
+            left = np.array((-ahead[1], ahead[0]))
+            tip, base, side = 0.38 * size[0] * ahead, 0.05 * size[0] * ahead, 0.32 * size[1] * left
+            yield Shape(
+                [np.array((x, y)) + np.array((tip, base + side, base - side))], fill="outline", level=7
+            )
+
+
+def _outline(xy: Any, heading: Any, size: Any) -> Float[Array, "5 2"]:
+    """Return the closed outline of a box."""
+    shape = corners(np.array((xy[0], xy[1], np.cos(heading), np.sin(heading), size[0], size[1])))
+    return np.concatenate((shape, shape[:1]))
+
+
+def ring(xy: Array, radius: float) -> Float[Array, "25 2"]:
+    """Return a circle."""
+    angle = np.linspace(0.0, 2 * np.pi, 25)
+    return xy + radius * np.column_stack((np.cos(angle), np.sin(angle)))
+
+
+def _within(xy: Array, box: Box) -> Bool[Array, "..."]:
+    """Return which points are inside a box."""
+    return np.all((xy >= box[:2]) & (xy <= box[2:]), axis=-1)
+
+
+def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
+    """Return the polylines of every layer, joined again from the stored segments.
+
+    Segments are stored by grid cell; within a feature they are ordered by arc length and chained where ends meet.
+
+    Args:
+        scenario: The scenario.
+        box: Keep segments with a midpoint in (low x, low y, high x, high y), metres, local frame.
+    """
+    used = int(scenario.segment_blocks[3])
+    rows = np.lexsort((scenario.segment_start_m[:used], scenario.segment_feature[:used]))
+    a, b = scenario.segment_a[rows, :2], scenario.segment_b[rows, :2]
+    if box is not None:
+        inside = _within((a + b) / 2, box)
+        rows, a, b = rows[inside], a[inside], b[inside]
+    layers: dict[str, Lines] = {name: [] for name in LAYERS}
+    if not len(rows):
+        return layers
+    feature = scenario.segment_feature[rows]
+    joined = (feature[1:] == feature[:-1]) & (np.abs(a[1:] - b[:-1]).max(axis=1) < _JOINT_M)
+    starts = np.flatnonzero(np.concatenate(([True], ~joined)))
+    for begin, end in zip(starts, [*starts[1:], len(rows)], strict=True):
+        line = np.concatenate((a[begin:end], b[end - 1 : end]))
+        layers[road_layer(int(scenario.segment_kind[rows[begin]]))].append(line)
+    return layers
+
+
+def _lights(scenario: Scenario) -> tuple[Float[Array, "light 2 2"], Int[Array, "step light"]]:
+    """Return stop lines and codes of the lights that have a stop line and at least one observed state."""
+    line, steps = scenario.light_line, int(scenario.steps)
+    drawn = np.abs(line[:, :2] - line[:, 2:]).max(axis=1, initial=0.0) > 0
+    rows = np.flatnonzero(drawn & (scenario.light_state >= 0).any(axis=0))
+    states = scenario.light_state[:steps, rows]
+    codes = np.full(states.shape, -1, np.int8)
+    for state in np.unique(states[states >= 0]):
+        codes[states == state] = LIGHTS.index(light_colour(int(state)))
+    return line[rows].reshape(-1, 2, 2), codes
+
+
+def _box_of(scenario: Scenario, rows: Any, valid: Any) -> Boxes:
+    steps = int(scenario.steps)
+    colours = [agent_colour(int(kind)) for kind in scenario.agent_kind[rows]]
+    return Boxes(
+        scenario.agent_xy[:steps, rows], scenario.agent_heading[:steps, rows], scenario.agent_size[rows, :2], colours,
+        scenario.agent_valid[:steps, rows] if valid is None else valid,
+    )  # fmt: skip
+
+
+def _agents(scenario: Scenario, box: Box) -> Boxes:
+    """Return all moving agents but ego, present while they are inside the box."""
+    steps = int(scenario.steps)
+    near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
+    near[:, 0] = False
+    rows = np.flatnonzero(near.any(axis=0))
+    return _box_of(scenario, rows, near[:, rows])
+
+
+def _parked(scenario: Scenario, box: Box) -> Boxes:
+    steps = int(scenario.steps)
+    rows = np.flatnonzero(
+        scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box)
+    )  # fmt: skip
+    colours = [agent_colour(int(kind)) for kind in scenario.parked_kind[rows]]
+    shape = (steps, len(rows))
+    return Boxes(
+        np.broadcast_to(scenario.parked_xy[rows], (*shape, 2)), np.broadcast_to(scenario.parked_heading[rows], shape),
+        scenario.parked_size[rows, :2], ["parked" if name == "vehicle" else name for name in colours],
+        scenario.parked_valid[:steps, rows],
+    )  # fmt: skip

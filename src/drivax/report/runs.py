@@ -1,0 +1,97 @@
+"""Run folders for a report: evaluations (episodes, trajectories) and trainings (learning curves)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.errors import DataError, UsageError
+from drivax.evaluation.episode_table import EpisodeTable
+from drivax.tracking.run_folder import RunFolder, seed_folders
+
+Array = np.ndarray[Any, Any]
+Evaluation = EpisodeTable
+
+
+@dataclass(frozen=True)
+class Training:
+    """The log of one training run.
+
+    Attributes:
+        folder: The run folder.
+        name: The run's name in charts.
+        info: ``run.json``.
+        curves: Quantity -> points (environment steps, value).
+    """
+
+    folder: Path
+    name: str
+    info: Mapping[str, Any]
+    curves: Mapping[str, Float[Array, "point 2"]]
+
+
+def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]]:
+    """Read run folders of either kind; repeated names get the folder's name as a suffix.
+
+    A folder with one run per seed stands for all of them.
+
+    Raises:
+        DataError: A folder or file is missing or damaged, or is no run.
+        UsageError: No folder was given, or one was given twice.
+    """
+    folders = [inside for folder in folders for inside in seed_folders(folder)]
+    resolved = [folder.resolve() for folder in folders]
+    if not folders or len(set(resolved)) < len(resolved):
+        raise UsageError("name every run once, and at least one", cure="drivax report RUN [RUN ...]")
+    evaluations, trainings = [], []
+    # A training and the evaluation of its policy may share a name: no table holds both.
+    names: set[str] = set()
+    charts: set[str] = set()
+    for folder in folders:
+        run = RunFolder.open(folder)
+        if run.kind == "training":
+            trainings.append(Training(folder, _unique(folder.name, folder, charts), run.info, _curves(run)))
+        elif run.kind == "evaluation":
+            table = EpisodeTable.read(folder)
+            table = replace(table, name=_unique(table.name, folder, names))
+            _ = table.trajectories  # read now, so that damage is reported before any work
+            evaluations.append(table)
+        else:
+            raise DataError(
+                f"is of kind {run.kind!r}, not evaluation or training",
+                file=folder / "run.json",
+                cure="give folders written by drivax evaluate or drivax train",
+            )
+    return evaluations, trainings
+
+
+def read_evaluations(folders: Sequence[Path]) -> list[Evaluation]:
+    """Read run folders, at least one of them an evaluation; see :func:`read_runs`."""
+    evaluations, _ = read_runs(folders)
+    if not evaluations:
+        raise UsageError("no evaluation was given", cure="name run folders of drivax evaluate")
+    return evaluations
+
+
+def _unique(name: str, folder: Path, names: set[str]) -> str:
+    candidate, number = name, 2
+    while candidate in names:
+        candidate = f"{name} ({folder.name})" if number == 2 else f"{name} ({folder.name} {number - 1})"
+        number += 1
+    names.add(candidate)
+    return candidate
+
+
+def _curves(run: RunFolder) -> dict[str, Array]:
+    points: dict[str, list[tuple[float, float]]] = {}
+    for row in run.read_metrics():
+        for name, value in row.items():
+            if name not in ("step", "time_s") and isinstance(value, int | float) and math.isfinite(value):
+                points.setdefault(name, []).append((float(row["step"]), float(value)))
+    return {name: np.array(values) for name, values in points.items()}

@@ -1,0 +1,118 @@
+"""Tables of evaluations as files: CSV with all digits for programs, Markdown and LaTeX for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from drivax.errors import UsageError, did_you_mean
+from drivax.evaluation.episode_table import ADDED, ScenarioKey
+from drivax.evaluation.pairing import comparable
+from drivax.evaluation.tables import (
+    STRATA,
+    collisions_table,
+    differences_table,
+    headline,
+    metric_names,
+    ordered,
+    results_table,
+    set_key,
+    strata_table,
+    summarise,
+    transfer_table,
+)
+from drivax.files import check_output, write_text
+from drivax.metrics.catalogue import METRICS, SETS
+from drivax.report.episodes import EvaluatedSet
+from drivax.report.runs import Evaluation, read_evaluations
+from drivax.table import Table
+
+#: Columns of a breakdown: what tells planners apart, few enough for a page.
+KEY_METRICS = (
+    "success", "accuracy", "collision", "at_fault_collision", "offroad", "red_light", "progress_ratio", "vmax_score",
+)  # fmt: skip
+#: Metrics of a transfer matrix.
+TRANSFERRED = ("success", "vmax_score")
+Tags = Mapping[ScenarioKey, Mapping[str, str]]
+
+
+def write_tables(
+    runs: Sequence[Path],
+    out: Path,
+    data: Path | None = None,
+    overwrite: bool = False,
+    metrics: Sequence[str] = (),
+) -> list[Path]:
+    """Write every table of a report into a folder, each as ``.csv``, ``.md`` and ``.tex``; returns the files.
+
+    ``results`` and, of several runs, ``differences``; ``collisions`` where kinds of collision are known; ``by-TAG`` for
+    the tags of the scenarios; ``transfer-METRIC`` where runs were evaluated on several data sets.
+
+    Args:
+        runs: Run folders; the last evaluation is the policy.
+        out: The folder.
+        data: The scenario set of the evaluation, where it has moved.
+        overwrite: Replace existing files.
+        metrics: Further metrics (columns of ``episodes.csv``, or a set) for ``results``, ``differences``, ``by-TAG``.
+
+    Raises:
+        DataError: A run folder or the scenario set is missing, damaged, or not that of the evaluation.
+        UsageError: A file exists, no evaluation was given, or none has one of the metrics.
+    """
+    texts = {}
+    for table in _tables(read_evaluations(runs), data, metrics):
+        texts[f"{table.name}.csv"] = table.csv()
+        texts[f"{table.name}.md"] = table.markdown()
+        texts[f"{table.name}.tex"] = table.latex()
+    for name in texts:
+        check_output(out / name, overwrite)
+    for name, text in texts.items():
+        write_text(out / name, text)
+    return [out / name for name in texts]
+
+
+def exported_metrics(runs: Sequence[Evaluation], more: Sequence[str] = ()) -> list[str]:
+    """Return the metrics of the files: the headline, progress in metres, the user's own, and ``more``.
+
+    Raises:
+        UsageError: No run has such a column.
+    """
+    names = ordered(metric_names(runs))
+    requested = {"progress"}
+    for entry in more:
+        if entry not in SETS and entry not in names:
+            raise UsageError(f"no run has a mean of {entry!r}", cure=did_you_mean(entry, names))
+        requested.update(SETS.get(entry, (entry,)))
+    first = headline(names)
+    rest = [name for name in names if name in requested or name not in (*METRICS, *ADDED)]
+    return [*first, *(name for name in rest if name not in first)] or names
+
+
+def _tables(runs: Sequence[Evaluation], data: Path | None, more: Sequence[str]) -> list[Table]:
+    usual, metrics = exported_metrics(runs), exported_metrics(runs, more)
+    tables = [results_table(runs, metrics)]
+    if len(runs) > 1:
+        others = [run for run in runs[:-1] if comparable(runs[-1], run)]
+        tables.append(differences_table(runs[-1], others, metrics))
+    if any("collision_type" in run.metrics for run in runs):
+        tables.append(collisions_table(runs))
+    added = [name for name in metrics if name not in usual]
+    tables += strata_tables(runs, EvaluatedSet(runs[-1], data).tags(), added)
+    return tables + transfer_tables(runs)
+
+
+def strata_tables(runs: Sequence[Evaluation], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
+    """Return a table for each tag of the scenarios, over the runs on these scenarios; with ``more`` metrics."""
+    evaluated = [run for run in runs if any(key in tags for key in run.scenarios)]
+    known = {name for values in tags.values() for name in values}
+    names = dict.fromkeys((*KEY_METRICS, *more))
+    metrics = [name for name in names if any(name in run.metrics for run in evaluated)]
+    return [strata_table(evaluated, tags, tag, metrics) for tag in STRATA if tag in known]
+
+
+def transfer_tables(runs: Sequence[Evaluation]) -> list[Table]:
+    """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
+    if len({set_key(run.data) for run in runs}) < 2:
+        return []
+    known = [name for name in TRANSFERRED if any(summarise(run, name).n for run in runs)]
+    return [transfer_table(runs, name) for name in known]

@@ -1,0 +1,12 @@
+from .selection import FINDINGS as FINDINGS
+from .selection import Filter as Filter
+from .selection import Quantity as Quantity
+from .selection import Selection as Selection
+from .selection import read_names as read_names
+from .selection import select_scenarios as select_scenarios
+from .selection import tag_words as tag_words
+from .selection import vocabulary as vocabulary
+from .splits import split_of as split_of
+from .splits import write_splits as write_splits
+from .tags import TAGS as TAGS
+from .tags import scenario_tags as scenario_tags

@@ -1,0 +1,365 @@
+"""Selections of scenarios by filters on the manifest, by name, and by number.
+
+A filter is ``NAME=VALUE`` or ``NAME!=VALUE``, with alternatives ``VALUE|VALUE``, or a comparison with a number (``<``,
+``<=``, ``>``, ``>=``). A selected scenario satisfies all filters. An unknown value satisfies no filter, neither ``=``
+nor ``!=``; :meth:`Selection.unknown` counts such scenarios.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import operator
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+from drivax.errors import DataError, DrivaxError, UsageError, did_you_mean
+from drivax.scenario.schema import Flag
+from drivax.scenario.select.tags import TAGS
+
+#: Number of missing names in an error message.
+_SHOWN = 3
+_Kind = Literal["number", "truth", "word"]
+#: Counters of overflow; zeros are not stored.
+OVERFLOWS = (
+    "agents", "parked", "segments", "edge_run", "lane_run", "features", "lanes", "lane_links", "lights",
+    "lights_without_lane", "stops", "stop_lanes", "road_rows", "events", "event_actors",
+)  # fmt: skip
+_NAMES = ("dataset", "segment", "scenario_id")
+#: Tags with words of the source; several words are joined by ``|``.
+_OPEN_TAGS = ("place", "location", "scenario_types", "source_format", "domain", "family", "event")
+_MAP_FEATURES = ("lane", "road_line", "road_edge", "crosswalk", "speed_bump", "stop_sign", "driveway")
+#: Counts of the source before capping, by their path in a manifest entry.
+_COUNTS: Mapping[str, tuple[str, ...]] = {
+    "agents": ("source", "tracks_valid_now"),
+    **{name: ("source", name) for name in ("steps", "tracks", "tracks_valid_now", "map_points", "lights")},
+    **{f"map_features.{name}": ("source", "map_features", name) for name in _MAP_FEATURES},
+    "segments": ("segments",),
+}
+_FILTER = re.compile(r"\s*([A-Za-z_][\w.]*)\s*(>=|<=|!=|=|>|<)\s*(.*?)\s*", re.DOTALL)
+_COMPARED: Mapping[str, Callable[[Any, Any], bool]] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
+}  # fmt: skip
+_TRUTHS = {"true": True, "false": False}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that filters compare.
+
+    Attributes:
+        kind: A number, a truth (``true`` or ``false``) or a word.
+        meaning: Description of a line.
+        words: Possible words; empty for any.
+    """
+
+    kind: _Kind
+    meaning: str
+    words: tuple[str, ...] = ()
+
+
+#: Findings of the audit (``evaluation.audit``); filters write ``audit.NAME``.
+FINDINGS: Mapping[str, Quantity] = {
+    "log_collides": Quantity("truth", "the logged ego overlaps an agent that it did not overlap at first"),
+    "first_collision_step": Quantity("number", "step at which that overlap begins"),
+    "log_offroad_fraction": Quantity("number", "share of the evaluated steps with a corner off the road"),
+    "first_offroad_step": Quantity("number", "first such step"),
+    "first_onroad_step": Quantity("number", "first step, from the current one on, that is on the road"),
+    "log_left_map": Quantity("truth", "the log leaves the mapped area"),
+    "log_runs_red": Quantity("truth", "the log runs a red light"),
+    "distance_m": Quantity("number", "distance that the log drives after the current step"),
+    "route_deviation_mean_m": Quantity("number", "mean distance of the log to the route"),
+    "route_deviation_max_m": Quantity("number", "largest distance of the log to the route"),
+    "route_reaches_goal": Quantity("truth", "the route ends within 3 m of where the log ends"),
+    "lights_seen": Quantity("number", "lights with an observed state"),
+    "ignored_overlaps": Quantity(
+        "number", "largest number of agents that overlapped ego from the beginning and are ignored"
+    ),
+    "clipped_physical": Quantity(
+        "number",
+        "share of steps at which following the log exceeds the limits of `physical` and `discrete`",
+    ),
+    "clipped_published": Quantity(
+        "number", "share of steps at which following the log exceeds the limits of `published`"
+    ),
+    "default_sizes": Quantity("truth", "some box sizes are those of the class"),
+    "velocity": Quantity("word", "where velocities come from", ("measured", "differentiated")),
+    "dt_jitter": Quantity("truth", "some step differs from the median step by more than 2 ms"),
+    "clean": Quantity("truth", "no collision, never off the road, no red light run"),
+}
+
+
+def tag_words(entry: Mapping[str, Any], name: str) -> frozenset[str]:
+    """Return the words of a tag: one, none, or several (``scenario_types``)."""
+    return frozenset(entry["tags"].get(name, "").split("|")) - {""}
+
+
+def vocabulary() -> dict[str, Quantity]:
+    """Return all quantities of filters by name, except user tags (``tag.NAME``)."""
+    known = {name: Quantity("word", "") for name in (*_NAMES, *_OPEN_TAGS)}
+    known |= {name: Quantity("word", "", words) for name, words in TAGS.items()}
+    # Where a tag has the name of a count (lights), a number compares the count and a word the tag.
+    known |= {name: Quantity("number", "", TAGS.get(name, ())) for name in _COUNTS}
+    known |= {f"overflow.{name}": Quantity("number", "") for name in OVERFLOWS}
+    known |= {f"audit.{name}": finding for name, finding in FINDINGS.items()}
+    known["flag"] = Quantity("word", "", tuple(str(flag.name) for flag in Flag if flag))
+    return known
+
+
+@dataclass(frozen=True)
+class Filter:
+    """One condition on a scenario.
+
+    Attributes:
+        text: The filter as written by the user.
+        name: Name of the quantity.
+        operator: ``=``, ``!=``, ``<``, ``<=``, ``>`` or ``>=``.
+        values: The alternatives: words, numbers or truths; one number where the operator compares.
+    """
+
+    text: str
+    name: str
+    operator: str
+    values: tuple[str | float | bool, ...]
+
+    @classmethod
+    def parse(cls, text: str) -> Filter:
+        """Parse ``NAME=VALUE|VALUE``, ``NAME!=VALUE`` or a comparison of NAME with a number.
+
+        Raises:
+            UsageError: The form, the name, the operator or a value is invalid.
+        """
+        form = _FILTER.fullmatch(text)
+        if form is None or form[3].startswith("="):
+            raise _refusal(text, "is no filter", "write NAME=VALUE, NAME!=VALUE or NAME>=NUMBER")
+        name, sign, words = form[1], form[2], tuple(word.strip() for word in form[3].split("|"))
+        quantity = _known(text, name)
+        if not all(words):
+            raise _refusal(text, "names no value", "write NAME=VALUE or NAME=VALUE|VALUE")
+        if sign in _COMPARED and (quantity.kind != "number" or len(words) > 1):
+            raise _refusal(text, f"cannot be compared with {sign}", "use = or !=, or a number of something")
+        if name == "flag":
+            words = tuple(word.upper() for word in words)
+        values = tuple(_value(text, name, quantity, word) for word in words)
+        if len({isinstance(value, str) for value in values}) > 1:
+            raise _refusal(text, "mixes words and numbers", "write two filters or ask for one of them")
+        if sign in _COMPARED and isinstance(values[0], str):
+            raise _refusal(text, f"{values[0]!r} is no number", f"give a number after {sign}")
+        return cls(text, name, sign, values)
+
+    def matches(self, entry: Mapping[str, Any]) -> bool:
+        """Return whether a manifest entry satisfies the filter; false for unknown values."""
+        value = self.find(entry)
+        if value is None:
+            return False
+        if self.operator in _COMPARED:
+            return _COMPARED[self.operator](value, self.values[0])
+        values = value if isinstance(value, frozenset) else {value}
+        return values.isdisjoint(self.values) == (self.operator == "!=")
+
+    def find(self, entry: Mapping[str, Any]) -> Any:
+        """Return the value in a manifest entry: a number, a word, a truth or a set of words; None if unknown."""
+        group, _, name = self.name.partition(".")
+        if group == "flag":
+            return frozenset(entry["flags"])
+        if group == "audit":
+            return entry["audit"].get(name)
+        if group == "overflow":
+            return entry["overflow"].get(name, 0)
+        if group == "tag":
+            return tag_words(entry, name) or None
+        if group in _NAMES:
+            return entry[group]
+        if self.name in _COUNTS and not isinstance(self.values[0], str):
+            value: Any = entry
+            for key in _COUNTS[self.name]:
+                value = value.get(key, 0)
+            return value
+        return tag_words(entry, self.name) or None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Filters that must all hold; without filters every scenario is selected."""
+
+    filters: tuple[Filter, ...] = ()
+
+    @classmethod
+    def parse(cls, filters: Sequence[str]) -> Selection:
+        """Parse filters such as ``type=turn_left|turn_right`` or ``audit.distance_m>5``.
+
+        Raises:
+            UsageError: A filter is invalid.
+        """
+        return cls(tuple(Filter.parse(text) for text in filters))
+
+    def matches(self, entry: Mapping[str, Any]) -> bool:
+        """Return whether a scenario is selected, by its manifest entry."""
+        return all(condition.matches(entry) for condition in self.filters)
+
+    def rows(self, entries: Iterable[Mapping[str, Any]]) -> list[int]:
+        """Return the indices of the selected scenarios, in order."""
+        return [row for row, entry in enumerate(entries) if self.matches(entry)]
+
+    def unknown(self, entries: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+        """Nonzero numbers of scenarios without the value of a filter, by filter."""
+        counts = dict.fromkeys((condition.text for condition in self.filters), 0)
+        for entry in entries:
+            for condition in self.filters:
+                counts[condition.text] += condition.find(entry) is None
+        return {text: count for text, count in counts.items() if count}
+
+
+@runtime_checkable
+class Listing(Protocol):
+    """The part of a scenario set that selections read."""
+
+    @property
+    def path(self) -> Path:
+        """Folder of the set."""
+        ...
+
+    @property
+    def entries(self) -> Sequence[Mapping[str, Any]]:
+        """Manifest entries."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Name:
+    """A scenario id, or data set, tab and id, with its place in a file."""
+
+    text: str
+    file: Path | None = None
+    line: int = 0
+
+    @property
+    def shown(self) -> str:
+        """The id for messages."""
+        return repr(self.text.rpartition("\t")[2])
+
+
+def select_scenarios(
+    data: Listing, filters: Sequence[str] = (), names: Sequence[str | Path] = (), limit: int | None = None
+) -> list[int]:
+    """Return the indices of the selected scenarios, in order of the set.
+
+    Args:
+        data: The set.
+        filters: Conditions that must all hold.
+        names: Ids, or data set, tab and id; paths of files with one name per line. Empty selects all.
+        limit: Largest number of scenarios; the first are selected.
+
+    Raises:
+        DataError: A name is not in the set, a file cannot be read, or no scenario is selected.
+        UsageError: A filter or the limit is invalid.
+    """
+    if limit is not None and limit < 1:
+        raise UsageError(f"--limit {limit} leaves no scenario", cure="use 1 or more")
+    selection = Selection.parse(filters)
+    named = _named_rows(data, names) if names else None
+    rows = [row for row in selection.rows(data.entries) if named is None or row in named]
+    if not rows:
+        raise _nothing_left(data, selection)
+    return rows[:limit]
+
+
+def read_names(file: Path) -> list[_Name]:
+    """Read names from a file, one per line; empty lines are skipped.
+
+    Raises:
+        DataError: The file cannot be read or is no text.
+    """
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise DataError(error.strerror or "cannot be read", file=file, cure="check the path") from error
+    except UnicodeDecodeError as error:
+        raise DataError("is no text", file=file, cure="give one scenario id per line") from error
+    return [_Name(text, file, row) for row, line in enumerate(lines, start=1) if (text := line.strip())]
+
+
+def _named_rows(data: Listing, names: Sequence[str | Path]) -> set[int]:
+    """Indices of named scenarios; an id without a data set selects it in all of them."""
+    rows: dict[str, set[int]] = {}
+    for row, entry in enumerate(data.entries):
+        for text in (entry["scenario_id"], f"{entry['dataset']}\t{entry['scenario_id']}"):
+            rows.setdefault(text, set()).add(row)
+    requested: list[_Name] = []
+    for name in names:
+        is_id = isinstance(name, str) and (name in rows or not Path(name).exists())
+        requested += [_Name(str(name))] if is_id else read_names(Path(name))
+    missing = [name for name in requested if name.text not in rows]
+    if missing:
+        raise _missing(data, missing)
+    return set[int]().union(*(rows[name.text] for name in requested))
+
+
+def _missing(data: Listing, missing: Sequence[_Name]) -> DataError:
+    first, others = missing[0], missing[1:]
+    ids = [str(entry["scenario_id"]) for entry in data.entries]
+    near = difflib.get_close_matches(first.text.rpartition("\t")[2], ids, n=1)
+    cure = f"did you mean {near[0]!r}?" if near and not others else "use ids that drivax inspect --json lists"
+    more = "".join(f", {name.shown}" for name in others[: _SHOWN - 1])
+    more += f" and {len(others) - _SHOWN + 1} more" if len(others) >= _SHOWN else ""
+    which = "are" if others else "is"
+    if first.file is None:
+        return DataError(f"{first.shown}{more} {which} not in the set", file=data.path, cure=cure)
+    problem = f"line {first.line} names {first.shown}{more}, which {which} not in the set {data.path}"
+    return DataError(problem, file=first.file, cure=cure)
+
+
+def _nothing_left(data: Listing, selection: Selection) -> DrivaxError:
+    """Return the error for an empty selection, with the filter that no scenario satisfies."""
+    for condition in selection.filters:
+        if condition.operator == "=" and not any(condition.matches(entry) for entry in data.entries):
+            tag = condition.name.removeprefix("tag.")
+            words = {word for entry in data.entries for word in tag_words(entry, tag)}
+            cure = did_you_mean(str(condition.values[0]), sorted(words)) if words else "loosen it"
+            return DataError(f"no scenario is selected by {condition.text!r}", file=data.path, cure=cure)
+    return DataError("no scenario is selected", file=data.path, cure="loosen the filters, or name others")
+
+
+def _known(text: str, name: str) -> Quantity:
+    """Return the quantity of a name."""
+    if name.startswith("tag.") and len(name) > len("tag."):
+        return Quantity("word", "a tag of the user's own")
+    known = vocabulary()
+    if name in known:
+        return known[name]
+    # Suggest names without their group too: log_collides for audit.log_collides.
+    by_end = {full.rpartition(".")[2]: full for full in known} | {full: full for full in known}
+    near = difflib.get_close_matches(name, by_end, n=1, cutoff=0.7)
+    cure = f"did you mean {by_end[near[0]]!r}?" if near else f"a tag of your own is asked for as tag.{name}"
+    raise _refusal(text, f"asks for {name!r}, which no scenario has", cure)
+
+
+def _value(text: str, name: str, quantity: Quantity, word: str) -> str | float | bool:
+    """Parse a word of a filter as a value of its quantity."""
+    if quantity.kind == "truth":
+        if word.lower() not in _TRUTHS:
+            raise _refusal(text, f"{word!r} is neither true nor false", f"write {name}=true or {name}=false")
+        return _TRUTHS[word.lower()]
+    if quantity.kind == "number":
+        number = _number(word)
+        if number is None and word not in quantity.words:
+            raise _refusal(text, f"{word!r} is no number", f"write {name}>=10, say")
+        return word if number is None else number
+    if quantity.words and word not in quantity.words:
+        raise _refusal(text, f"{name} is never {word!r}", did_you_mean(word, quantity.words))
+    return word
+
+
+def _number(word: str) -> float | None:
+    try:
+        number = float(word)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _refusal(text: str, problem: str, cure: str) -> UsageError:
+    return UsageError(f"filter {text!r}: {problem}", cure=cure)

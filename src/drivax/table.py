@@ -1,0 +1,309 @@
+"""One table for every output: text for a terminal, Markdown, HTML, LaTeX, and CSV with all digits."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from drivax.stats.intervals import Interval
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
+#: Stands for a missing number.
+MISSING = "–"
+#: Columns of an interval in a CSV file.
+_NUMBERS = ("metric", "mean", "low", "high", "n")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column.
+
+    Attributes:
+        heading: Its heading, with unit and direction.
+        key: Its name in CSV files; the heading where it is empty.
+        label: Whether its cells say what a row is about: row headings, never wrapped.
+        left: Whether text is aligned left; labels always are.
+        title: An explanation, shown in HTML where the pointer rests.
+        most: Characters in a terminal at most.
+        picture: Whether its cells are pictures, which only HTML shows.
+    """
+
+    heading: str
+    key: str = ""
+    label: bool = False
+    left: bool = False
+    title: str = ""
+    most: int | None = None
+    picture: bool = False
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell.
+
+    Attributes:
+        text: What it shows.
+        bounds: Its interval in words, on a line of its own.
+        note: Small print, left out in a terminal.
+        interval: The number behind the text, for CSV files.
+        metric: The metric of the interval.
+        mark: A verdict next to the text, in HTML.
+        style: Its class in HTML; ``group`` makes a bold row in a terminal.
+        title: An explanation, shown in HTML where the pointer rests.
+        link: What the page's list of episodes is filtered by when the number is clicked.
+        html: A picture.
+    """
+
+    text: str = MISSING
+    bounds: str = ""
+    note: str = ""
+    interval: Interval | None = None
+    metric: str = ""
+    mark: str = ""
+    style: str = ""
+    title: str = ""
+    link: Mapping[str, Any] | None = None
+    html: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells under headings, with a renderer for every output.
+
+    Attributes:
+        name: Name of its file, and its class in HTML.
+        columns: The columns.
+        rows: One cell per column in each row.
+        caption: One line about its numbers.
+        across: What the columns of numbers stand for in a CSV file: ``metric``, ``planner``, ...
+    """
+
+    name: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    caption: str = ""
+    across: str = "metric"
+
+    def rich(self, *below: Table) -> RichTable:
+        """Return a table for a terminal, with other tables of as many columns below it in the same widths."""
+        from rich.table import Table as RichTable
+
+        shown = [at for at, column in enumerate(self.columns) if not column.picture]
+        headed = any(self.columns[at].heading for at in shown)
+        grid = RichTable(
+            box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0), show_header=headed
+        )
+        for column in (self.columns[at] for at in shown):
+            align = "left" if column.label or column.left else "right"
+            style = "bold" if column.label and not headed else ""
+            grid.add_column(
+                column.heading, justify=align, no_wrap=column.label, max_width=column.most,
+                overflow="ellipsis" if column.label else "fold", style=style,
+            )  # fmt: skip
+        for table in (self, *below):
+            if table is not self:
+                grid.add_row()
+                grid.add_row(*(table.columns[at].heading for at in shown), style="bold")
+            for row in table.rows:
+                lines = ("\n".join(filter(None, (row[at].text, row[at].bounds))) for at in shown)
+                grid.add_row(*lines, style="bold" if row[0].style == "group" else "")
+        return grid
+
+    def text(self, *below: Table, width: int = 100) -> str:
+        """Return plain text of at most ``width`` columns; see :meth:`rich`."""
+        from rich.console import Console
+
+        stream = io.StringIO()
+        Console(file=stream, width=width, highlight=False, markup=False, emoji=False).print(self.rich(*below))
+        return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
+
+    def markdown(self) -> str:
+        """Return Markdown: number, interval and n in each cell."""
+        lines = [
+            _markdown_row([column.heading for column in self.columns]),
+            _markdown_row(["---" if column.label else "---:" for column in self.columns]),
+            *(_markdown_row([" ".join(_words(cell)) for cell in row]) for row in self.rows),
+        ]
+        return f"{_escape_markdown(self.caption)}.\n\n" + "\n".join(lines) + "\n"
+
+    def latex(self) -> str:
+        r"""Return a ``tabular`` to ``\input``; it needs no package."""
+        align = "".join("l" if column.label else "r" for column in self.columns)
+        heads = " & ".join(escape_latex(column.heading) for column in self.columns)
+        rows = (" & ".join(_latex_cell(_words(cell)) for cell in row) for row in self.rows)
+        lines = [
+            f"% {re.sub(r'[^ -~]', '-', self.caption)}",
+            rf"\begin{{tabular}}{{{align}}}",
+            r"\hline",
+            rf"{heads} \\",
+            r"\hline",
+            *(rf"{row} \\" for row in rows),
+            r"\hline",
+            r"\end{tabular}",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def csv(self) -> str:
+        """Return one line per number: labels, metric, mean, low, high, n; undefined numbers are empty."""
+        stream = io.StringIO()
+        lines = csv.writer(stream, lineterminator="\n")
+        labels = [at for at, column in enumerate(self.columns) if column.label and column.key != "metric"]
+        keys = [self.columns[at].key or self.columns[at].heading for at in labels]
+        across = [] if self.across == "metric" else [self.across]
+        lines.writerow([*(key.replace(" ", "_") for key in (*keys, *across)), *_NUMBERS])
+        for row in self.rows:
+            for column, cell in zip(self.columns, row, strict=True):
+                if (interval := cell.interval) is not None:
+                    numbers = (
+                        "" if x is None else repr(x) for x in (interval.mean, interval.low, interval.high)
+                    )
+                    place = [*(row[at].text for at in labels), *([column.key] if across else [])]
+                    lines.writerow([*place, cell.metric, *numbers, interval.n])
+        return stream.getvalue()
+
+    def html(self) -> str:
+        """Return HTML that scrolls sideways by itself on narrow screens."""
+        heads = "".join(
+            f"<th scope=col{_attribute('title', column.title)}>{escape(column.heading)}</th>"
+            for column in self.columns
+        )
+        head = f"<thead><tr>{heads}</tr></thead>" if any(column.heading for column in self.columns) else ""
+        rows = "".join(
+            f"<tr>{''.join(map(_html_cell, self.columns, row))}</tr>"
+            for row in self.rows
+        )  # fmt: skip
+        return (
+            f'<div class=scroll tabindex=0 role=region aria-label="{escape(self.name)}"><table class="'
+            f'{escape(self.name)}">{head}<tbody>{rows}</tbody></table></div>'
+        )
+
+
+def interval_cell(interval: Interval, unit: str, metric: str = "", signed: bool = False, **more: Any) -> Cell:
+    """Return the cell of an estimate: mean, interval and n.
+
+    Args:
+        interval: The estimate.
+        unit: Unit of the metric, as :func:`number` takes it.
+        metric: Name of the metric.
+        signed: Whether it is a difference.
+        more: Other fields of the cell.
+    """
+    if interval.mean is None:
+        more = {"style": "undefined", "title": "undefined in every episode"} | more
+        return Cell(note="n 0", interval=interval, metric=metric, **more)
+    mean = number(interval.mean, unit, signed) + suffix(unit, signed)
+    words = bounds(interval, unit, signed)
+    return Cell(mean, words, f"n {interval.n}", interval, metric, **more)
+
+
+def number(value: float | None, unit: str, signed: bool = False) -> str:
+    """Return a number as tables print it.
+
+    Args:
+        value: The number; None is missing.
+        unit: ``rate`` (percent, one digit), ``share`` (three digits), or a physical unit (three figures).
+        signed: Whether to write a plus sign.
+    """
+    if value is None:
+        return MISSING
+    sign = "+" if signed else ""
+    if unit == "rate":
+        text = f"{100 * value:{sign}.1f}"
+    elif unit == "share":
+        text = f"{value:{sign}.3f}"
+    else:
+        digits = 2 if abs(value) < 10 else 1 if abs(value) < 1000 else 0
+        text = f"{value:{sign}.{digits}f}"
+    if not any(digit in text for digit in "123456789"):
+        text = text.lstrip("+-")
+    return text.replace("-", "−")
+
+
+def suffix(unit: str, signed: bool = False) -> str:
+    """Return what follows a number: percent for rates, points for differences of rates."""
+    return "" if unit != "rate" else " points" if signed else " %"
+
+
+def bounds(interval: Interval, unit: str, signed: bool = False) -> str:
+    """Return an interval in words: ``low–high``, or ``low to high`` where signs would be confused with the dash.
+
+    A bootstrap of equal values has no width; the words say so instead of claiming certainty.
+    """
+    if interval.low is None or interval.high is None:
+        return "no interval" if interval.n else ""
+    if interval.low == interval.high:
+        return "all equal"
+    low, high = number(interval.low, unit, signed), number(interval.high, unit, signed)
+    between = " to " if signed or "−" in low + high else "–"
+    return f"{low}{between}{high}"
+
+
+def _words(cell: Cell) -> list[str]:
+    """Return the texts of a cell on paper, the interval in brackets."""
+    if cell.interval is None:
+        return [cell.text]
+    return [cell.text, *([f"({cell.bounds})"] if cell.interval.mean is not None else []), cell.note]
+
+
+def _attribute(name: str, value: str) -> str:
+    return f' {name}="{escape(value)}"' if value else ""
+
+
+def _html_cell(column: Column, cell: Cell) -> str:
+    title = _attribute("title", cell.title)
+    lines = [text for text in (cell.bounds, cell.note) if text]
+    lines = [", ".join(lines)] if cell.mark else lines
+    notes = "".join(f"<small>{escape(text)}</small>" for text in lines)
+    if column.label:
+        return f"<th scope=row{title}>{escape(cell.text)}{notes}</th>"
+    link = "" if cell.link is None else _attribute("data-link", json.dumps(cell.link))
+    mark = f"<em>{escape(cell.mark)}</em>" if cell.mark else ""
+    text = f"<b>{escape(cell.text)}</b>" if cell.bounds or cell.link is not None else escape(cell.text)
+    style = _attribute("class", cell.style)
+    return f"<td{style}{title}{link}>{cell.html or text}{mark}{notes}</td>"
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(map(_escape_markdown, cells)) + " |"
+
+
+def _escape_markdown(text: str) -> str:
+    """Return plain text as a cell of Markdown: nothing in it is markup, an HTML element or the end of the cell."""
+    return re.sub(r"([\\`*_~\[\]<|])", r"\\\1", text.replace("\n", " ").replace("&", "&amp;"))
+
+
+def _latex_cell(words: Sequence[str]) -> str:
+    first, *rest = map(escape_latex, words)
+    lines = r" \\ ".join([first, *(rf"\scriptsize {text}" for text in rest)])
+    return rf"\shortstack[r]{{{lines}}}" if rest else first
+
+
+_LATEX: Mapping[str, str] = MappingProxyType(
+    {
+        "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+        "[": "{[}",  # after the end of a row it would start an option
+        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+        "|": r"\textbar{}", '"': "''", "−": r"$-$", "–": "--", "²": "$^2$", "³": "$^3$", "±": r"$\pm$",
+        "↑": r"$\uparrow$", "↓": r"$\downarrow$", "“": "``", "”": "''", "’": "'", "≥": r"$\geq$", "≤": r"$\leq$",
+    }
+)  # fmt: skip
+
+
+def escape_latex(text: str) -> str:
+    """Return plain text as LaTeX; a character that its fonts lack is named by its number."""
+    return "".join(_LATEX.get(letter) or _latex_letter(letter) for letter in text)
+
+
+def _latex_letter(letter: str) -> str:
+    # The letters of Latin-1 are in every font of LaTeX; control characters, emoji and other scripts are not.
+    known = " " <= letter <= "~" or ("À" <= letter <= "ÿ" and letter not in "×÷")
+    return letter if known else rf"\texttt{{U+{ord(letter):04X}}}"

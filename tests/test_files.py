@@ -1,0 +1,142 @@
+"""Output files and folders: refusals, atomic writes, and folders that can be resumed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from drivax.errors import UsageError
+from drivax.files import (
+    PartialFolder,
+    atomic_write,
+    can_resume,
+    check_output,
+    replace_folder,
+    write_json,
+    write_text,
+)
+
+
+def names(folder: Path) -> set[str]:
+    return {entry.name for entry in folder.iterdir()}
+
+
+def test_check_output_accepts_a_new_name_and_what_may_be_overwritten(tmp_path: Path):
+    (tmp_path / "file").touch()
+    check_output(tmp_path / "new", overwrite=False)
+    check_output(tmp_path / "new", overwrite=False, folder=True)
+    check_output(tmp_path / "file", overwrite=True)
+    check_output(tmp_path, overwrite=True, folder=True)
+
+
+@pytest.mark.parametrize(
+    ("folder", "overwrite", "message"),
+    [
+        (False, False, "output file already exists; choose another or pass --overwrite"),
+        (True, True, "output is a file; name a folder to write"),
+        (True, False, "output is a file; name a folder to write"),
+    ],
+)
+def test_check_output_refuses_an_existing_file(tmp_path: Path, folder: bool, overwrite: bool, message: str):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError) as error:
+        check_output(tmp_path / "file", overwrite, folder=folder)
+    assert message in str(error.value)
+
+
+def test_check_output_refuses_an_existing_folder(tmp_path: Path):
+    with pytest.raises(UsageError, match="output folder already exists"):
+        check_output(tmp_path, overwrite=False, folder=True)
+    with pytest.raises(UsageError, match="output is a folder; name a file to write"):
+        check_output(tmp_path, overwrite=True)
+
+
+def test_an_atomic_write_appears_when_it_is_complete(tmp_path: Path):
+    file = tmp_path / "new" / "file"
+    with atomic_write(file) as opened:
+        opened.write(b"content")
+        assert not file.exists()
+    assert file.read_bytes() == b"content"
+    assert names(file.parent) == {"file"}
+
+
+def test_a_failed_atomic_write_keeps_the_old_file(tmp_path: Path):
+    write_text(tmp_path / "file", "old")
+    with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "file") as opened:
+        opened.write(b"new")
+        raise ZeroDivisionError
+    assert (tmp_path / "file").read_text() == "old"
+    assert names(tmp_path) == {"file"}
+
+
+def test_json_is_strict(tmp_path: Path):
+    write_json(tmp_path / "file", {"a": [1, 0.5, None]})
+    assert json.loads((tmp_path / "file").read_text()) == {"a": [1, 0.5, None]}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "file", float("nan"))
+    assert names(tmp_path) == {"file"}
+
+
+def test_replace_folder_replaces_the_whole_folder(tmp_path: Path):
+    write_text(tmp_path / "run" / "old", "")
+    with replace_folder(tmp_path / "run") as partial:
+        write_text(partial / "new", "")
+        assert names(tmp_path / "run") == {"old"}
+    assert names(tmp_path / "run") == {"new"}
+    assert names(tmp_path) == {"run"}
+
+
+def test_replace_folder_keeps_the_old_one_after_an_error(tmp_path: Path):
+    write_text(tmp_path / "run" / "old", "")
+    with pytest.raises(ZeroDivisionError), replace_folder(tmp_path / "run"):
+        raise ZeroDivisionError
+    assert names(tmp_path / "run") == {"old"}
+    assert names(tmp_path) == {"run"}
+
+
+def started(path: Path, identity: dict[str, int] | None = None) -> PartialFolder:
+    """A folder with one finished part, closed before it was published."""
+    folder = PartialFolder(path, identity)
+    assert folder.open() == []
+    (folder.content / "part").touch()
+    folder.note(0, {"part": "first"})
+    folder.close()
+    return folder
+
+
+def test_a_partial_folder_resumes_after_its_finished_parts(tmp_path: Path):
+    started(tmp_path / "set", {"seed": 1})
+    assert can_resume(tmp_path / "set")
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    assert folder.open() == [{"part": "first"}]
+    folder.publish()
+    folder.close()
+    assert names(tmp_path) == {"set"}
+    assert names(tmp_path / "set") == {"part"}
+    assert not can_resume(tmp_path / "set")
+
+
+def test_a_partial_folder_without_identity_leaves_nothing_behind(tmp_path: Path):
+    started(tmp_path / "set")
+    assert names(tmp_path) == set()
+
+
+def test_a_partial_folder_of_another_identity_needs_a_restart(tmp_path: Path):
+    started(tmp_path / "set", {"seed": 1})
+    folder = PartialFolder(tmp_path / "set", {"seed": 2})
+    with pytest.raises(UsageError, match=r"started with other data or other options \(seed\)"):
+        folder.open()
+    assert folder.open(restart=True) == []
+    assert names(folder.content) == set()
+    folder.close()
+
+
+def test_a_partial_folder_has_one_writer_at_a_time(tmp_path: Path):
+    folder = PartialFolder(tmp_path / "set", {"seed": 1})
+    folder.open()
+    with pytest.raises(UsageError, match="another process is writing it"):
+        PartialFolder(tmp_path / "set", {"seed": 1}).open()
+    folder.close()
+    assert names(tmp_path) == set()
