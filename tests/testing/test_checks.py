@@ -201,8 +201,8 @@ class WrongConfig:
 @pytest.mark.parametrize(
     ("fault", "words"),
     {
-        "width": "its width being 3", "state": "no parameters", "seed": "other parameters every time",
-        "batch": "alone and in a batch", "constant": "all observations alike", "mask": "what masked rows hold",
+        "width": "with width 3", "state": "not parameters", "seed": "other initial parameters",
+        "batch": "differs in a batch", "constant": "all observations equally", "mask": "changes with masked rows",
         "nobody": "without any row is not finite", "gradient": "gradients that are not finite",
     }.items(),
 )  # fmt: skip

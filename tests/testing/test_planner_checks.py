@@ -56,7 +56,7 @@ def refused(planner, words):
 def test_forms_are_checked_before_anything_runs():
     refused(ConstantVelocity, "is not a planner")
     refused(Wrong(fault="size"), r"gives float32\[3\] as an action; return float32\[2\]")
-    refused(Wrong(fault="form"), "changes the form of what it carries")
+    refused(Wrong(fault="form"), "changes the shape of its carry")
     refused(Wrong(fault="python"), "cannot be compiled")
 
 

@@ -68,7 +68,8 @@ class Wrong(own_terms.Drift):
     ("fault", "words"),
     {
         "form": "changes the shape of its state", "size": "carries 36000 bytes", "random": "is not deterministic",
-        "shape": r"float32\[40, 7\]", "nan": "is not finite", "half": "fractional valid", "unit": "directions of length 1.1",
+        "shape": r"float32\[40, 7\]", "nan": "is not finite", "half": "fractional valid",
+        "unit": "directions of length 1.1",
         "past": "changes past rows", "leap": "moves an agent by", "order": "order of agents changes",
         "padding": "empty slots are added", "litter": "rows of absent agents change", "turn": "rotated and shifted",
     }.items(),

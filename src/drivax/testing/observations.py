@@ -53,12 +53,12 @@ def check_feature(feature: Feature | str) -> None:
         def frames(back: int) -> Frame:
             return simulator.frame(bank, context, alone(context), back)
 
-        _check_form(what, function(bank, scene, frames))
-        return group.observe(bank, scene, frames)
+        _check_form(what, function(bank, context, frames))
+        return group.observe(bank, context, frames)
 
     program = Program(what, seen, (None, 0))
-    bank, scenes = worlds.worlds(), worlds.moments().situation.scene
-    results = program.check_pure(bank, scenes)
+    bank, contexts = worlds.worlds(), worlds.moments().situation.context
+    results = program.check_pure(bank, contexts)
     check_numbers(what, results)
     largest = max(float(np.abs(leaf).max()) for leaf in jax.tree.leaves(results))
     expect(
@@ -66,7 +66,7 @@ def check_feature(feature: Feature | str) -> None:
         f"{what} reaches {largest:g}",
         "scale it to about [-1, 1] (units: tasks.view)",
     )
-    check_numbers(what, program(worlds.without_others(bank), scenes))
+    check_numbers(what, program(worlds.without_others(bank), contexts))
     variants = (
         (worlds.scattered, "the rows of absent agents change", "mask with frame.valid first"),
         (
@@ -85,11 +85,11 @@ def check_feature(feature: Feature | str) -> None:
     present = np.asarray(contexts.step) == _NOW
     now, later = (
         jax.tree.map(lambda leaf: leaf[present], result)
-        for result in (results, program(worlds.other_future(bank, _NOW), scenes))
+        for result in (results, program(worlds.other_future(bank, _NOW), contexts))
     )
-    cure = "read the scene and its frames; of the bank only map, route 0, goal and the current step"
+    cure = "read the context and its frames; of the bank only map, route 0, goal and the current step"
     check_same(what, now, later, "the log's future changes", cure)
-    turned = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).situation.scene)
+    turned = program(worlds.worlds(ANGLE), worlds.moments(ANGLE).situation.context)
     check_turned(what, results, turned)
 
 
@@ -98,7 +98,7 @@ def _check_form(what: str, rows: Any) -> None:
     value, mask = rows if isinstance(rows, tuple) else (rows, None)
     expect(
         value.dtype == jnp.float32 and value.ndim >= 1,
-        f"{what} gives {value.dtype}{list(value.shape)} for a scene",
+        f"{what} gives {value.dtype}{list(value.shape)} for a context",
         "return float32 with features on the last axis",
     )
     if mask is not None:

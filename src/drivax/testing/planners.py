@@ -85,7 +85,7 @@ def check_planner(planner: Planner | str, *, task: Task | None = None, privilege
                 program(bank, index, at), program(worlds.other_future(bank, _CHANGES + 1), index, at), CLOSE
             ),
             f"{what} changes with the log's future",
-            "read nothing later than scene.step, or pass privileged=True",
+            "read nothing later than context.step, or pass privileged=True",
         )
 
 

@@ -121,7 +121,7 @@ def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
             rows, remembered = traffic.agents(bank, context, 0), traffic.agents(bank, moved, 1)
             return moved, _Seen(rows, remembered, View.of(context))
 
-        return jax.lax.scan(step, simulator.scene(bank, index, _START), None, _STEPS)[1]
+        return jax.lax.scan(step, simulator.context(bank, index, _START), None, _STEPS)[1]
 
     return drive
 
@@ -130,7 +130,7 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     simulator = Simulator(Task(), traffic)
 
     def first_rows(bank: ScenarioBank) -> Any:
-        return traffic.agents(bank, simulator.scene(bank, 0, _START), 0)
+        return traffic.agents(bank, simulator.context(bank, 0, _START), 0)
 
     rows, shape = jax.eval_shape(first_rows, bank), bank.agents.shape[2:]
     expect(
@@ -140,9 +140,9 @@ def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     )
 
     def states(bank: ScenarioBank) -> tuple[Any, Any]:
-        scene = simulator.scene(bank, 0, _START)
-        frame = simulator.frame(bank, scene, alone(scene), 0)
-        return scene.traffic, traffic.advance(bank, scene, frame)
+        context = simulator.context(bank, 0, _START)
+        frame = simulator.frame(bank, context, alone(context), 0)
+        return context.traffic, traffic.advance(bank, context, frame)
 
     first, second = jax.eval_shape(states, bank)
     forms = [
@@ -177,7 +177,7 @@ def _check_rows(what: str, seen: _Seen) -> None:
         (remembered[..., AgentColumn.VALID] == valid).all()
         and np.allclose(remembered[there], rows[there], rtol=CLOSE, atol=1e-2),
         f"{what} changes past rows",
-        "let agents(bank, scene, back) return all agents 'back' steps ago",
+        "let agents(bank, context, back) return all agents 'back' steps ago",
     )
     both = there[:, 1:] & there[:, :-1]
     jump = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1)[both]

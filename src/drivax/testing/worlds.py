@@ -107,13 +107,13 @@ def _moments(bank: ScenarioBank) -> Moments:
 def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Situation:
     """Measure with ego's logged history offset, rotated and scaled in speed."""
     simulator = Simulator(Task())
-    scene = simulator.scene(bank, index, step)
-    x, y, heading, speed = jnp.moveaxis(scene.history, -1, 0)
+    context = simulator.context(bank, index, step)
+    x, y, heading, speed = jnp.moveaxis(context.history, -1, 0)
     left_m, turn_rad, pace = place
     shifted = jnp.stack([x - left_m * jnp.sin(heading), y + left_m * jnp.cos(heading)], axis=-1)
     moved = jnp.stack([wrap(heading + turn_rad), speed * pace], axis=-1)
-    scene = replace(scene, history=jnp.concatenate([shifted, moved], axis=-1))
-    now, previous = (simulator.frame(bank, scene, alone(scene), back) for back in (0, 1))
+    context = replace(context, history=jnp.concatenate([shifted, moved], axis=-1))
+    now, previous = (simulator.frame(bank, context, alone(context), back) for back in (0, 1))
     apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
     return measure(bank, context, now, previous, apart, remember_lights(bank, context), FACTS | ON_REQUEST)[0]
 
@@ -160,7 +160,7 @@ def with_frame(moments: Moments, frame: Frame) -> Moments:
     """Replace the frames of moments."""
     around = moments.situation.surroundings
     around = Surroundings(frame, around.lanes, around.route)
-    return replace(moments, situation=Situation(moments.situation.scene, moments.situation.facts, around))
+    return replace(moments, situation=Situation(moments.situation.context, moments.situation.facts, around))
 
 
 def extremes(moments: Moments) -> Moments:
@@ -183,7 +183,7 @@ def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
         )
 
     situation = Situation(
-        moments.situation.scene, only(moments.situation.facts), moments.situation.surroundings
+        moments.situation.context, only(moments.situation.facts), moments.situation.surroundings
     )
     return Moments(only(moments.before), situation, moments.start)
 
