@@ -203,7 +203,7 @@ class WrongConfig:
     {
         "width": "with width 3", "state": "not parameters", "seed": "other initial parameters",
         "batch": "differs in a batch", "constant": "all observations equally", "mask": "changes with masked rows",
-        "nobody": "without any row is not finite", "gradient": "gradients that are not finite",
+        "nobody": "without rows is not finite", "gradient": "non-finite gradients",
     }.items(),
 )  # fmt: skip
 def test_invalid_encoders_fail(fault, words):

@@ -67,16 +67,16 @@ def check_metric(metric: Metric | str) -> None:
     Raises:
         BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.text!r}"
+    what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
     spec: Any = find_named(metric) if isinstance(metric, str) else metric
     expect(isinstance(spec, Metric), f"{what} is not a Metric", "see metrics.catalogue.Metric")
     expect(
-        spec.unit and spec.text,
-        f"{what} has no unit or text",
+        spec.unit and spec.definition,
+        f"{what} has no unit or definition",
         "tables and reports print them; '-' is the unit of fractions",
     )
-    if spec.of is not None:
-        step = spec.of
+    if spec.step_value is not None:
+        step = spec.step_value
 
         def value(moment: Moments) -> tuple[Any, Any]:
             now = Moment(moment.situation, moment.start, jnp.ones((), bool))
@@ -118,7 +118,7 @@ def _check_moments(
 def _check_rows(what: str, value: Any) -> None:
     expect(
         np.asarray(value).ndim == 2,
-        f"{what} is late but returns no row of numbers",
+        f"{what} is delayed but returns no row of numbers",
         "return one number and one mask entry per step",
     )
 

@@ -71,7 +71,7 @@ def check_traffic(traffic: Traffic | str) -> None:
     there = seen.rows[..., AgentColumn.VALID] > 0
 
     def rows_of(change: Callable[[ScenarioBank], ScenarioBank]) -> Any:
-        return program(prepared(traffic, change(worlds.worlds())), index).rows
+        return program(prepare_bank(traffic, change(worlds.worlds())), index).rows
 
     check_numbers(what, rows_of(worlds.without_others))
     known = np.where(there[..., None], seen.rows, 0.0)
