@@ -25,6 +25,8 @@ from drivax.learning.policies import (
     load_policy,
     policy_traffic,
 )
+from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tracking.run_folder import RunFolder
