@@ -1,16 +1,24 @@
-"""The Python interface: load a scenario set, make a simulator, evaluate a planner."""
+"""The Python interface: one function per command of the command line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from drivax.curation.methods import Request
+from drivax.curation.methods import curate as curate_set
+from drivax.curation.scores import ScoreTable
+from drivax.datasets.convert import Conversion, Converted
+from drivax.datasets.convert import convert as convert_set
 from drivax.errors import UsageError
 from drivax.evaluation import runner
-from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.audit import audit, scenario_names
+from drivax.evaluation.comparison import Comparison
+from drivax.evaluation.comparison import compare as compare_evaluations
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.run_evaluation import with_metrics
 from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
@@ -23,6 +31,8 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import Start
 from drivax.simulator.types import Traffic
+from drivax.synthetic.generate import Generation
+from drivax.synthetic.generate import generate as generate_set
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import run_and_step
 from drivax.tracking.zoo import is_policy, zoo
@@ -143,3 +153,77 @@ def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[P
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
         raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
     return load_policy(folder, bank, step=step, samples=sample)
+
+
+def generate(
+    out: str | Path, scenarios: int = 256, seed: int = 0, *, options: Generation | None = None
+) -> ScenarioSet:
+    """Generate a scenario set of the built-in world, audited, and open it.
+
+    Args:
+        out: Folder to write.
+        scenarios: Number of scenarios.
+        seed: Scenario ``i`` of a seed is the same in every set.
+        options: World, workers and capacity.
+
+    Raises:
+        UsageError: ``out`` exists, or an option is impossible.
+    """
+    return ScenarioSet.open(generate_set(out, scenarios, seed, options, audit=audit).path)
+
+
+def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
+    """Convert recordings of a public data set to a scenario set, audited.
+
+    Args:
+        src: File, or folder that is searched to any depth.
+        out: Folder to write.
+        options: Fields of :class:`drivax.datasets.Conversion`.
+
+    Raises:
+        DataError: ``src`` holds nothing that can be converted.
+        UsageError: ``out`` exists, an option is impossible, or a package is missing.
+    """
+    return convert_set(src, out, Conversion(**options), audit=audit)
+
+
+def compare(
+    a: str | Path,
+    b: str | Path,
+    plan: ComparisonPlan | None = None,
+    data: Path | None = None,
+    **settings: Any,
+) -> Comparison:
+    """Compare two evaluations.
+
+    Args:
+        a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.
+        b: The other.
+        plan: Metrics and decision rule.
+        data: The evaluated set, for a stratified split, if it has moved.
+        settings: Fields of the plan to change, as ``primary="success"``.
+
+    Raises:
+        DataError: A run folder is missing or damaged.
+        UsageError: The evaluations cannot be compared, or a setting is impossible.
+    """
+    plan = replace(plan or ComparisonPlan(), **settings)
+    first, second = (EpisodeTable.read_seeds(Path(run)) for run in (a, b))
+    entries = first[0].open_set(data).entries if plan.split == "stratified" else ()
+    return compare_evaluations(plan, first, second, entries)
+
+
+def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> ScoreTable:
+    """Score how critical each step and scenario of a set is.
+
+    Args:
+        method: Name of a method, as ``kinematic``.
+        data: The set, or its folder.
+        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``.
+
+    Raises:
+        DataError: The method cannot score this set.
+        UsageError: Unknown method or impossible settings.
+    """
+    scenarios = data if isinstance(data, ScenarioSet) else ScenarioSet.open(data)
+    return curate_set(method, Request(scenarios, **options))

@@ -103,7 +103,9 @@ def test_invalid_metrics_fail():
     guarded = metric(lambda m: (1.0 / m.facts.speed_mps, m.facts.speed_mps > 0), frozenset({"speed_mps"}))
     check_metric(guarded)
     refused(
-        check_metric, metric(lambda m: (m.found.surroundings.frame.box[0, 0], True)), "rotated and shifted"
+        check_metric,
+        metric(lambda m: (m.situation.surroundings.frame.box[0, 0], True)),
+        "rotated and shifted",
     )
     refused(
         check_metric, Metric("m", "low", "text", compute=lambda e, v, k: v.value), "does not compute a Value"
