@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx
 
-from drivax.learning.collector import collect
+from drivax.learning.environment import collect
 from drivax.metrics.catalogue import Metric
 from drivax.metrics.steps import StepValue
 from drivax.networks.encoders import group_names
@@ -177,7 +177,7 @@ class Reinforce:
 
         def loss(parameters):
             policy = nnx.merge(self.graph, parameters)
-            error = (rollout.choice - policy(rollout.observation).loc) / 0.3
+            error = (rollout.raw_action - policy(rollout.observation).loc) / 0.3
             log_prob = -0.5 * jnp.sum(error * error, axis=-1)
             return -jnp.mean(rollout.alive * (gains - gains.mean()) * log_prob)
 

@@ -73,10 +73,10 @@ class Pendulum:
 
     observe_all = observe
 
-    def look(self, data, state):
+    def cache(self, data, state):
         return ()
 
-    def step(self, data, now, looked, action, key):
+    def step(self, data, now, cache, action, key):
         angle, rate, reward = swing(now.state.angle, now.state.rate, MAX_TORQUE * action[:, 0])
         moved = Swing(angle, rate, now.state.step + 1, now.state.earned + reward)
         fresh = self._begin(key, len(now.over))

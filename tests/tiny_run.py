@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ import numpy as np
 from drivax import settings
 from drivax.learning.config import TrainConfig
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
 
@@ -40,7 +40,7 @@ def write_run(path: Path, bank: ScenarioBank) -> RunFolder:
     folder = RunFolder.create(path, config, kind="training", validation="c0de")
     about = {"path": "/some/where/train", "hash": "f00d", "scenarios": 3}
     folder = folder.note(data=[about], command="drivax train tiny")
-    learner = config.algorithm.build(replace(config, traffic="log").environment(), bank, 1)
+    learner = config.algorithm.build(config.environment(LogTraffic()), bank, 1)
     shapes = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
     for step, score in ((4, 0.5), (8, 0.4)):
         rng = np.random.default_rng(step)

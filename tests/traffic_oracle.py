@@ -9,7 +9,8 @@ import pytest
 
 from drivax.geometry.boxes import overlap
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.agent_paths import PATH_X, PATH_Y, PROFILE_SPEED, PROFILE_Z
+from drivax.simulator.traffic.agent_paths import PATH_X, PATH_Y, PROFILE_SPEED, PROFILE_Z, AgentPaths
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.traffic.reactive import DRIVES, IdmTraffic
 from drivax.tasks.task import Task
@@ -90,7 +91,7 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
 
     One acceleration for each thing that may count as the nearest.
     """
-    path, slot = Path(bank.paths, index, row), int(bank.paths.slot[index, row])
+    path, slot = Path(data_of(bank, AgentPaths), index, row), int(data_of(bank, AgentPaths).slot[index, row])
     x, y, z, most = path.at(arc)
     length, width = np.asarray(bank.agent_box[index, slot, :2], np.float64)
     look = min(20 + 1.5 * speed + speed * speed / 6, 120)
@@ -121,7 +122,11 @@ def wanted(bank, index, row, arc, speed, ignored, frame, step):
     ]
     results = results or [law(speed, most, 1e4, 0.0)]
     state = np.asarray(bank.light_state[index, min(step, 90)])
-    for line, light in zip(bank.paths.stop_arc[index, row], bank.paths.stop_light[index, row], strict=True):
+    for line, light in zip(
+        data_of(bank, AgentPaths).stop_arc[index, row],
+        data_of(bank, AgentPaths).stop_light[index, row],
+        strict=True,
+    ):
         front = float(line) - arc - length / 2
         brakes = {1: 6.0, 4: 6.0, 2: 3.0, 5: 3.0}.get(int(state[light]))
         if brakes is None:
@@ -157,7 +162,7 @@ def compare(bank, index, frames, traffic, every=7):
 
 def meetings(bank, index, frames, traffic):
     """Pairs of slots, one of them reacting, whose boxes come to overlap after the first step; and those that react."""
-    slots = np.asarray(bank.paths.slot[index])
+    slots = np.asarray(data_of(bank, AgentPaths).slot[index])
     reacting = [int(s) for s in slots[(traffic.phase != 0).any(0) & (slots > 0)]]
     found = set()
     for slot in reacting:

@@ -8,10 +8,10 @@
 
 ``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
 ``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
-nobody had seen (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
+that were new (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
 as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
-``test`` alone says; scouts are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
+``test`` alone says; ensembles are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from typing import Any
 import numpy as np
 
 from drivax import settings
-from drivax.curation.controls import event_kinds, event_steps, matched
-from drivax.curation.ensemble import Scouts, ScoutsConfig, train_scouts
+from drivax.curation.controls import event_kinds, event_steps, permute_scores
+from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.methods import Wanted, curate, ensemble_table, table_of
+from drivax.curation.logged import BATCH, score_steps
+from drivax.curation.methods import Request, curate, ensemble_table, make_table
 from drivax.curation.published import PublishedConfig
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity
 from drivax.curation.scores import ScoreTable
-from drivax.curation.scoring import BATCH, score_steps
-from drivax.curation.weights import WeightConfig, draws_of, weights_of
+from drivax.curation.weights import WeightConfig, draw_statistics, sampling_weights
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.ranking import (
@@ -57,11 +57,11 @@ FORCED_MPS2 = 3.0
 SCORED = (
     "kinematic", "published", "ensemble", "ensemble_mixture", "action_rarity", "action_rarity_published"
 )  # fmt: skip
-#: Scouts of point estimates, and of mixtures, which can disagree about modes.
-SCOUTS = {
-    "ensemble": ScoutsConfig(),
+#: Ensemble of point estimates, and of mixtures, which can disagree about modes.
+ENSEMBLES = {
+    "ensemble": EnsembleConfig(),
     "ensemble_mixture": settings.load(
-        ScoutsConfig, {}, ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
+        EnsembleConfig, {}, ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
     ),
 }
 #: Share of scenarios with an event in an ordinary set (``WorldConfig.rare_rate``).
@@ -124,7 +124,7 @@ def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str,
 
 
 def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
-    """Methods, or all of them, on both test sets, beside those that are known."""
+    """Methods, or all of them, on both test sets, next to those that are stored."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
     if only and stored.get("sets") != hashes:
@@ -135,7 +135,9 @@ def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, An
         methods[name] = found_by(truth, both) | {"draws": draws(own)}
         methods[name] |= {key: value for key, value in own.config.items() if key.startswith("error_rank_")}
         if name == "kinematic":
-            methods["random_matched"] = found_by(truth, matched(both, 0)) | {"draws": draws(matched(own, 0))}
+            methods["random_matched"] = found_by(truth, permute_scores(both, 0)) | {
+                "draws": draws(permute_scores(own, 0))
+            }
         print(f"{name}: {methods[name]['events']['forced']['auc']:.3f}", flush=True)
     return {"sets": hashes, "forced_mps2": FORCED_MPS2, "natural": NATURAL, "methods": methods}
 
@@ -146,14 +148,14 @@ def scored(
     """By method: the table of the first set, and of all sets one after the other."""
     for name in ("kinematic", "published"):
         if name in names:
-            tables = [curate(name, Wanted(data)) for data in sets]
+            tables = [curate(name, Request(data)) for data in sets]
             yield name, tables[0], joined(tables)
     for name in ("ensemble", "ensemble_mixture"):
         if name in names:
-            scouts = train_scouts(SCOUTS[name], ScenarioSet.open(train))
-            first = ensemble_table(scouts, sets[0])
-            rest = [ensemble_table(scouts, data, scale=first.config["scale"]) for data in sets[1:]]
-            interval = {"error_rank_interval": error_interval(scouts, first, sets[0])}
+            ensemble = train_ensemble(ENSEMBLES[name], ScenarioSet.open(train))
+            first = ensemble_table(ensemble, sets[0])
+            rest = [ensemble_table(ensemble, data, scale=first.config["scale"]) for data in sets[1:]]
+            interval = {"error_rank_interval": error_interval(ensemble, first, sets[0])}
             yield name, replace(first, config={**first.config, **interval}), joined([first, *rest])
     rarities = {"action_rarity": KernelRarity(), "action_rarity_published": PublishedRarity()}
     if not rarities.keys() & set(names):
@@ -165,7 +167,7 @@ def scored(
         for data, found in zip(sets, actions, strict=True):
             known, steps = found["known"], np.zeros(found["known"].shape)
             steps[known] = config.scores(usual, found["action"][known].astype(np.float64))
-            tables.append(table_of(name, config, data, {"rarity": steps}))
+            tables.append(make_table(name, config, data, {"rarity": steps}))
         yield name, tables[0], joined(tables)
 
 
@@ -174,7 +176,7 @@ def checked(paths: list[Path]) -> dict[str, Any]:
     found = {}
     for path in paths:
         data = ScenarioSet.open(path)
-        truth, scores = Truth.of([data]), curate("kinematic", Wanted(data)).scenarios
+        truth, scores = Truth.of([data]), curate("kinematic", Request(data)).scenarios
         wanted = truth.groups()["forced"]
         rows = wanted | (truth.kind == 0)
         found[path.name] = {
@@ -187,10 +189,10 @@ def checked(paths: list[Path]) -> dict[str, Any]:
     return {"checks": found}
 
 
-def error_interval(scouts: Scouts, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
+def error_interval(ensemble: Ensemble, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
     """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
-    opinions = scouts.opinions(data)
-    error, known = opinions.error(scouts.deviation, None), opinions.known
+    predictions = ensemble.predictions(data)
+    error, known = predictions.error(ensemble.deviation, None), predictions.known
     return correlation_interval(table.steps[known], error[known], np.nonzero(known)[0])
 
 
@@ -218,13 +220,13 @@ def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
 def draws(table: ScoreTable) -> dict[str, Any]:
     """What the default weights of a table do."""
     return {
-        scale: vars(draws_of(weights_of(table, WeightConfig(), scale), table.drawn))
+        scale: vars(draw_statistics(sampling_weights(table, WeightConfig(), scale), table.drawable))
         for scale in ("step", "scenario")
     }
 
 
 def speed(paths: list[Path], count: int) -> dict[str, Any]:
-    """By set: seconds to score so many scenarios, reading and stacking included, compiling not; few are taken again."""
+    """Seconds to score ``count`` scenarios of each set, including reading and stacking, without compilation."""
     found: dict[str, Any] = {}
     for path in paths:
         known = list(ScenarioSet.open(path)[:count])
@@ -261,21 +263,21 @@ def events_table(stored: dict[str, Any]) -> str:
         for group, words in (("forced", "that force a reaction"), ("mild", "that do not"), ("all", "all")):
             one = found["events"][group]
             measures = (("auc", 3), ("precision", 2), ("step_auc", 3), ("step_precision", 2))
-            cells = " | ".join(told(one, *measure) for measure in measures)
+            cells = " | ".join(cell(one, *measure) for measure in measures)
             lines.append(f"| `{method}` | {words} ({one['scenarios']}) | {cells} |")
     return "\n".join(lines)
 
 
-def told(one: dict[str, Any], measure: str, digits: int) -> str:
+def cell(one: dict[str, Any], measure: str, digits: int) -> str:
     """A measure with its interval."""
     low, high = one[f"{measure}_interval"]
     return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def scouts_table(stored: dict[str, Any]) -> str:
-    """How far scouts disagree where they err."""
-    lines = ["| scouts | rank correlation of scores and errors, by step |", "|---|---|"]
-    for name in SCOUTS:
+def ensemble_checks_table(stored: dict[str, Any]) -> str:
+    """How far members disagree where they err."""
+    lines = ["| ensemble | rank correlation of scores and errors, by step |", "|---|---|"]
+    for name in ENSEMBLES:
         one = stored["methods"][name]
         low, high = one["error_rank_interval"]
         lines.append(f"| `{name}` | {one['error_rank_correlation']:.2f} [{low:.2f}, {high:.2f}] |")
@@ -286,7 +288,7 @@ def checks_table(stored: dict[str, Any]) -> str:
     """What ``kinematic`` finds in other sets."""
     lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
     for name, one in stored["checks"].items():
-        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {told(one, 'auc', 3)} |")
+        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {cell(one, 'auc', 3)} |")
     return "\n".join(lines)
 
 
@@ -298,7 +300,7 @@ def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
     lines.append("|---|---|" + "---|" * len(methods))
     for kind in kinds:
         ones = [found["events"][kind] for found in methods.values()]
-        cells = " | ".join(told(one, measure, digits) for one in ones)
+        cells = " | ".join(cell(one, measure, digits) for one in ones)
         lines.append(f"| `{kind}` | {ones[0]['scenarios']} | {cells} |")
     return "\n".join(lines)
 
@@ -342,7 +344,7 @@ def filled(text: str, stored: dict[str, Any]) -> str:
         "scenario precision": kinds_table(stored, "precision", 2),
         "step auc": kinds_table(stored, "step_auc", 3),
         "step precision": kinds_table(stored, "step_precision", 2),
-        "scouts": scouts_table(stored),
+        "ensembles": ensemble_checks_table(stored),
         "checks": checks_table(stored),
         "draws": draws_table(stored),
         "speed": speed_table(stored),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,8 +23,7 @@ from drivax.datasets.formats import detect, find_files
 from drivax.datasets.reader import BadRecord
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate
-from drivax.evaluation.stored import EpisodeTable
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.report.episodes import outcome
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
@@ -38,6 +38,8 @@ BEGIN, END = "<!-- real_files.py: begin -->", "<!-- real_files.py: end -->"
 PLANNERS = (
     "expert", "expert_actions", "pdm", "idm", "search", "zoo:aggressive", "constant_velocity", "random",
 )  # fmt: skip
+#: Planners outside of the package.
+MODULES = {"search": "search_planner:SearchPlanner"}
 TRAFFIC = ("log", "idm")
 
 
@@ -53,19 +55,19 @@ def scenarios_of(data: Path) -> Iterator[tuple[str, Scenario]]:
 
 def measured(data: Path) -> dict[str, Any]:
     """Outcome, score and progress of every planner, scenario by scenario."""
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
     sources, scenarios = zip(*scenarios_of(data), strict=True)
     bank, names = ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios)
     rows = [{"source": source, "scenario_id": one.id} for source, one in zip(sources, scenarios, strict=True)]
     found: dict[str, Any] = {kind: {} for kind in TRAFFIC}
     for planner in PLANNERS:
-        driver, task = find_planner(planner, bank, False)
+        driver, task = find_planner(MODULES.get(planner, planner), bank, False)
         for kind in TRAFFIC:
-            results = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
-            table = EpisodeTable.of(results)
+            table = evaluate(driver, bank, names, task=task, traffic=find_traffic(kind))
             found[kind][planner] = [
                 {
                     "outcome": outcome(table, row),
-                    **{name: _number(results.metrics[name][row]) for name in ("vmax_score", "progress")},
+                    **{name: _number(table.metrics[name][row]) for name in ("vmax_score", "progress")},
                 }
                 for row in range(len(rows))
             ]

@@ -31,12 +31,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results, interval_of
+from drivax.evaluation.episode_table import EpisodeTable, interval_of
 from drivax.evaluation.rollout import drive, judging
 from drivax.evaluation.runner import evaluate
 from drivax.evaluation.tables import paired_differences
-from drivax.learning.policies import load_policy, pack_policy
-from drivax.learning.policy_traffic import find_traffic, policy_traffic
+from drivax.learning.policies import export_policy, find_traffic, load_policy, policy_traffic
 from drivax.planners.catalogue import make_planner
 from drivax.planners.planner import Planner
 from drivax.planners.planner_traffic import with_driver
@@ -84,19 +83,19 @@ def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -
     return {"drivers": {name: _summary(found, wanted) for name, found in driven.items()}, "minus": against}
 
 
-def _summary(found: Results, wanted: tuple[str, ...]) -> dict[str, Any]:
+def _summary(found: EpisodeTable, wanted: tuple[str, ...]) -> dict[str, Any]:
     metrics = found.summary()["metrics"]
     return {name: metrics[name] for name in wanted}
 
 
 def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
-    """Both policies in the place of the vehicles nearest to ego, one at a time, everyone else as logged."""
+    """Both policies in the place of the vehicles nearest to ego, one at a time, all others as logged."""
     traffic = policy_traffic(runs / "aggressive", count=OTHERS)
     start = jax.jit(jax.vmap(lambda bank, row: traffic.start(bank, row, CURRENT_STEP), (None, 0)))
     table: Table = {}
     for name in ("clone", "aggressive"):
         planner, task = load_policy(runs / name, bank)
-        slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).scenes.slot)
+        slots = np.asarray(start(with_driver(bank, planner), jnp.arange(len(bank))).contexts.slot)
         row, place = np.nonzero(slots < bank.agents.shape[2])
         values = _driven(
             Simulator(judging(replace(task, metrics=OWN))), planner, bank, row, slots[row, place]
@@ -149,7 +148,7 @@ PARTS = {"ego": in_egos_place, "others": in_others_place, "traffic": in_traffic}
 
 
 def judged(args: argparse.Namespace) -> None:
-    """Measures, prints, and with --write stores what was measured beside what is stored of the other parts."""
+    """Measures, prints, and with --write stores what was measured next to what is stored of the other parts."""
     stored = ScenarioSet.open(args.data)
     scenarios = list(stored)
     bank, names = ScenarioBank.from_scenarios(scenarios), [dict(row) for row in scenario_names(scenarios)]
@@ -183,7 +182,7 @@ def packed(args: argparse.Namespace) -> None:
         "ego": _means(found["ego"]["drivers"]["aggressive"]),
         "others": _means(found["others"]["aggressive"]),
     }
-    folder = pack_policy(
+    folder = export_policy(
         args.runs / "aggressive", ZOO / "aggressive", bank, {"measured": measured}, overwrite=True
     )
     print(f"wrote {folder.path}")

@@ -22,16 +22,15 @@ import numpy as np
 
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import SHARES, Results, interval_of
+from drivax.evaluation.episode_table import SHARES, EpisodeTable, interval_of
 from drivax.evaluation.runner import evaluate
-from drivax.learning.policies import load_policy
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.planner import Planner
 from drivax.planners.simple import RandomActions
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.stats.intervals import Interval, bootstrap_mean, paired_bootstrap
-from drivax.stats.seeds import agents_interval, difference_interval
+from drivax.stats.seeds import difference_interval, seeds_interval
 from drivax.tasks.actions import Published
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import versions
@@ -54,7 +53,7 @@ COLUMNS = {
 }  # fmt: skip
 #: Whom every learned planner is compared with, and in what.
 AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
-#: Tags by which accuracy is told apart, and where those of the scenarios are kept.
+#: Tags by which accuracy is broken down, and where those of the scenarios are kept.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: What the table of random actions shows: until the first failure, as published episodes end there.
 UNTIL = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
@@ -94,12 +93,13 @@ def drivers(name: str, bank: ScenarioBank) -> list[tuple[Planner, Task]]:
     return [(replace(planner, name=name), task) for planner, task in loaded]
 
 
-def until_failure(results: Results) -> Metrics:
+def until_failure(results: EpisodeTable) -> Metrics:
     """Steps until the first collision, off-road step or red light (else to the end), and metres driven until then."""
-    events = np.stack([*results.events.values()])
-    last = results.motion.shape[1] - 1
-    steps = np.where(events < 0, last, events - results.start).min(axis=0)
-    moved = np.hypot(*np.moveaxis(np.diff(results.motion[:, :, :2], axis=1), -1, 0))
+    driven = results.trajectories
+    events = np.stack([*driven.events.values()])
+    last = driven.ego.shape[1] - 1
+    steps = np.where(events < 0, last, events - driven.start).min(axis=0)
+    moved = np.hypot(*np.moveaxis(np.diff(driven.ego[:, :, :2], axis=1), -1, 0))
     within = np.arange(last) < steps[:, None]
     return {"steps_until_failure": steps, "metres_until_failure": np.where(within, moved, 0.0).sum(axis=1)}
 
@@ -161,7 +161,7 @@ def mean(driven: Driven, metric: str, against: Driven | None = None) -> Interval
     if against is None:
         if len(own) == 1:
             return interval_of(metric, own[0], segments)
-        return agents_interval(own, segments, share=metric in SHARES)
+        return seeds_interval(own, segments, share=metric in SHARES)
     other = against.values[metric].astype(np.float64)
     if len(own) == len(other) == 1:
         return paired_bootstrap(own[0], other[0], segments, seed=0)
@@ -173,7 +173,7 @@ def change(driven: Driven, metric: str, before: Driven) -> Interval:
     apart = driven.values[metric].astype(np.float64) - before.values[metric]
     if len(apart) == 1:
         return bootstrap_mean(apart[0], driven.segments, seed=0)
-    return agents_interval(apart, driven.segments)
+    return seeds_interval(apart, driven.segments)
 
 
 def judged() -> dict[str, Any]:
@@ -227,7 +227,7 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
     with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
         tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
     if any(one.about["test"] != of for one in driven.values()):
-        raise SystemExit("the tags are those of another test set: drive a planner anew")
+        raise SystemExit("the tags are those of another test set: evaluate a planner again")
     planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
     found = []
     for tag, values in tags.items():
@@ -242,8 +242,10 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
                 )
                 for name, one in planners.items()
             }
-            told = {name: one.as_dict() for name, one in some.items()}
-            found.append({"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": told})
+            intervals = {name: one.as_dict() for name, one in some.items()}
+            found.append(
+                {"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": intervals}
+            )
     return found
 
 

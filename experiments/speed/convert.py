@@ -41,7 +41,7 @@ BATCH = 64
 
 
 def repeated(source: Path, target: Path, copies: int) -> Path:
-    """The first record of a TFRecord file of protos, so many times, each with an id of its own."""
+    """The first record of a TFRecord file of protos, repeated, each with an id of its own."""
     _, payload = next(read_records(source))
     message = scenario_class().FromString(payload)
     with target.open("wb") as file:

@@ -19,7 +19,7 @@ from typing import Any
 from drivax.api import find_planner
 from drivax.evaluation.audit import scenario_names
 from drivax.evaluation.runner import evaluate, lanes
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet
@@ -30,7 +30,7 @@ from experiments.speed.simulator import machine_ms
 RESULT = RESULTS / "evaluation.json"
 PAGE = DOCS / "results" / "speed.md"
 BEGIN, END = "<!-- evaluation.py: begin -->", "<!-- evaluation.py: end -->"
-#: Whole batches, so that their times are alike.
+#: Whole batches, so that their times are equal.
 SCENARIOS = 1024
 #: Seconds that 1,000 scenarios x 80 steps may take in recorded traffic, and how many times that in reactive traffic.
 AIMS, REACTIVE = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pdm": 600}, 3

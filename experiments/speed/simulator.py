@@ -26,8 +26,9 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
-from drivax.simulator.traffic.catalogue import make_traffic, prepared
-from drivax.simulator.traffic.override import OverrideTraffic, with_given
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.catalogue import make_traffic
+from drivax.simulator.traffic.override import OverrideTraffic, with_override
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.studies.bench import (
     BenchConfig,
@@ -72,7 +73,7 @@ SCENARIOS, MANY = 1024, 4096
 def speeds(bank: ScenarioBank, config: BenchConfig) -> dict[str, Any]:
     """Both tasks in both kinds of traffic, each at its best batch size, all timed by turns."""
     kinds = [(name, traffic, batch) for name in TASKS for traffic in ("log", "idm") for batch in BATCHES]
-    bank = spread(prepared(IdmTraffic(), bank))
+    bank = spread(prepare_bank(IdmTraffic(), bank))
     programs = [
         compiled(bank, replace(config, task=TASKS[name], traffic=traffic, batch=batch))
         for name, traffic, batch in kinds
@@ -114,7 +115,9 @@ def again(folder: Path, repeats: int) -> dict[str, Any]:
     """The speeds once more, at the batch sizes that were the best in the stored result, timed by turns."""
     use_all_cores()
     stored = ScenarioSet.open(folder)
-    bank = spread(prepared(IdmTraffic(), ScenarioBank.from_scenarios([stored[i] for i in range(SCENARIOS)])))
+    bank = spread(
+        prepare_bank(IdmTraffic(), ScenarioBank.from_scenarios([stored[i] for i in range(SCENARIOS)]))
+    )
     best = {name: one["batch"] for name, one in json.loads(RESULT.read_text())["speed"].items()}
     programs = []
     for name, batch in best.items():
@@ -163,7 +166,7 @@ def more_segments(bank: ScenarioBank) -> ScenarioBank:
 
 
 def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
-    """The bank with so many slots: of everyone the first ones, and empty ones where it has fewer."""
+    """The bank with this many slots: the first ones, and empty ones where it has fewer."""
     few = replace(
         bank,
         agents=bank.agents[:, :, :count],
@@ -189,13 +192,13 @@ def state_bytes(bank: ScenarioBank) -> dict[str, int]:
     banks = {
         "log": (some, None),
         "idm": (some, IdmTraffic()),
-        "override": (with_given(some, slots, motion), OverrideTraffic()),
-        "override+idm": (with_given(some, slots, motion), OverrideTraffic(IdmTraffic())),
+        "override": (with_override(some, slots, motion), OverrideTraffic()),
+        "override+idm": (with_override(some, slots, motion), OverrideTraffic(IdmTraffic())),
     }
     sizes = {}
     for name, (one, traffic) in banks.items():
         simulator = Simulator(TASKS["full"]) if traffic is None else Simulator(TASKS["full"], traffic)
-        ready = prepared(simulator.traffic, one)
+        ready = prepare_bank(simulator.traffic, one)
         state = jax.eval_shape(simulator.reset, ready, jnp.zeros((), jnp.int32))
         sizes[name] = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
     return sizes
@@ -306,7 +309,7 @@ def main() -> None:
         RUNS.write_text(json.dumps(runs, indent=1) + "\n")
         print("\n".join(runs_table(runs)))
         return
-    # The set by its name: where it lies on this machine is nobody's business.
+    # The set by its name: where it lies on this machine does not matter.
     command = (
         f"python -m experiments.speed.simulator --data {args.data.name} --repeats {args.repeats} --write"
     )

@@ -23,11 +23,12 @@ from jaxtyping import Array
 
 from drivax import settings
 from drivax.learning.algorithms.ppo import Ppo
-from drivax.learning.collector import collect
 from drivax.learning.config import TrainConfig
-from drivax.learning.program import Agents, Program
+from drivax.learning.environment import collect
+from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.run_folder import versions
 from experiments.repository import RESULTS
 
@@ -51,9 +52,9 @@ KINDS = {
 
 def programs(config: TrainConfig, bank: ScenarioBank) -> dict[str, Callable[[], Any]]:
     """What is timed: each call runs one iteration, or its part, from one and the same state."""
-    learner = config.algorithm.build(config.environment(), bank, config.iterations)
+    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
     assert isinstance(learner, Ppo)
-    program = Program(Agents(learner, (0,)), bank, config.devices)
+    program = Program(Seeds(learner, (0,)), bank, config.devices)
     steps = learner.config.unroll
 
     def collected(bank: ScenarioBank, state: Any, act: Any) -> Any:

@@ -29,7 +29,6 @@ import numpy as np
 
 from drivax.api import evaluate, load
 from drivax.files import write_text
-from drivax.planners.catalogue import PLANNERS
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 from drivax.synthetic.domains import DOMAINS
@@ -52,7 +51,9 @@ from experiments.world.measures import (
 from experiments.world.tables import into_guide, lines
 
 #: Planners whose success says how difficult the world is.
-DRIVERS = ("constant_velocity", "random", "idm", "search")
+DRIVERS = {name: name for name in ("constant_velocity", "random", "idm")} | {
+    "search": "search_planner:SearchPlanner"
+}
 EXPERT_METRICS = ("accuracy", "collision", "offroad", "red_light", "comfortable", "success")
 #: Scenarios that are on the device at once.
 CHUNK = 512
@@ -94,7 +95,7 @@ def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
 
 
 def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
-    """One row per scenario: tags, what its arrays show, how the expert drove it, and the planners the first ones."""
+    """One row per scenario: tags, what its arrays show, what the expert did, and the planners the first ones."""
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
@@ -120,7 +121,7 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
         for scenario, name in zip(scenarios, loaded.names, strict=True)
     ]
     for planner in ("expert", *planners):
-        metrics = evaluate(planner, loaded).metrics
+        metrics = evaluate(DRIVERS.get(planner, planner), loaded).metrics
         wanted = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
         for i, row in enumerate(rows):
             row |= {f"{planner}.{name}": float(metrics[name][i]) for name in wanted}
@@ -148,7 +149,7 @@ def difficulty(rows: list[dict[str, Any]], rare: list[dict[str, Any]], planner: 
 
 
 def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
-    """Families, events and their rate beside what was configured.
+    """Families, events and their rate and what was configured.
 
     Families are counted over the maps of common scenarios: a rare one takes roads that give occasion to its event, and
     scenarios on the same map have their family from one draw. Kinds of events are counted over all rare scenarios.
@@ -233,7 +234,8 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "all": (folder / name, all_count, args.seed, world),
         "rare": (folder / f"{name}-rare-{rare_count}", rare_count, args.seed + 1, rare_world),
     }
-    planners = tuple(planner for planner in DRIVERS if planner in PLANNERS)
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "planners"))
+    planners = tuple(DRIVERS)
     made = {key: written(path, n, seed, args.workers, w) for key, (path, n, seed, w) in sets.items()}
     rows = {key: measured(path, planners, args.driven) for key, (path, *_) in sets.items()}
     return {
@@ -294,7 +296,7 @@ def main() -> None:
         "--timed",
         type=int,
         default=None,
-        help="only time sets of so many scenarios of both domains, and store that; nothing else may run",
+        help="only time sets of this many scenarios of both domains, and store that; nothing else may run",
     )
     parser.add_argument(
         "--driven",

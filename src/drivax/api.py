@@ -1,19 +1,26 @@
-"""What users call from Python: load a set, make a simulator, drive a planner, in one line each."""
+"""The Python interface: one function per command of the command line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from drivax.curation.methods import Request
+from drivax.curation.methods import curate as curate_set
+from drivax.curation.scores import ScoreTable
+from drivax.datasets.convert import Conversion, Converted
+from drivax.datasets.convert import convert as convert_set
 from drivax.errors import UsageError
-from drivax.evaluation.audit import scenario_names
-from drivax.evaluation.results import Results
+from drivax.evaluation import runner
+from drivax.evaluation.audit import audit, scenario_names
+from drivax.evaluation.comparison import Comparison
+from drivax.evaluation.comparison import compare as compare_evaluations
+from drivax.evaluation.episode_table import EpisodeTable
+from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.run_evaluation import with_metrics
-from drivax.evaluation.runner import evaluate_scenarios
-from drivax.learning.policies import load_policy
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
 from drivax.planners.planner import Planner
 from drivax.plugins import is_dotted
@@ -22,8 +29,10 @@ from drivax.scenario.schema import Scenario
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.starts import Start
 from drivax.simulator.types import Traffic
+from drivax.synthetic.generate import Generation
+from drivax.synthetic.generate import generate as generate_set
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import run_and_step
 from drivax.tracking.zoo import is_policy, zoo
@@ -31,13 +40,13 @@ from drivax.tracking.zoo import is_policy, zoo
 
 @dataclass(frozen=True)
 class Loaded:
-    """Scenarios in both forms: as they are stored, and on the device.
+    """Scenarios as they are stored and as a bank on the device.
 
     Attributes:
         scenarios: The stored scenarios.
         bank: The same, stacked on the device; an argument of everything that simulates.
         names: ``dataset``, ``scenario_id`` and ``segment`` of each.
-        sizes: Of banks in which they are evaluated: those of the whole set, so that a part of it is driven alike.
+        sizes: Bank sizes of the whole set, so that a subset gives the same results bit for bit.
     """
 
     scenarios: Sequence[Scenario]
@@ -56,62 +65,62 @@ def load(
     filters: Sequence[str] = (),
     scenarios: Sequence[str | Path] = (),
 ) -> Loaded:
-    """Scenarios of a set, or of your own making, ready to simulate.
+    """Load scenarios of a set, or scenarios of your own, ready to simulate.
 
     Args:
         data: Folder of a scenario set, or scenarios.
-        limit: Only the first so many of those that the others leave.
-        filters: Only those of a set for which all of this holds, as ``type=turn_left`` (``scenario.select.selection``).
-        scenarios: Only those of a set that are named by their ids, or in files with one id per line.
+        limit: Only the first ``limit`` of those that the other options leave.
+        filters: Conditions that scenarios of a set must meet, as ``type=turn_left`` (``scenario.select.selection``).
+        scenarios: Ids of scenarios of a set, or files with one id per line.
 
     Raises:
-        DataError: The set is damaged, a name is not in it, or nothing is left.
-        UsageError: A filter or the limit cannot be meant.
+        DataError: The set is damaged, an id is not in it, or no scenario is left.
+        UsageError: A filter or the limit is impossible.
     """
     if isinstance(data, str | Path):
         stored = ScenarioSet.open(data)
         kept = [stored[row] for row in select_scenarios(stored, filters, scenarios, limit)]
-        # Checksums are tested where a scenario is loaded; this only looks at what each record uses.
+        # The scenarios that are loaded have been verified; of the others only the sizes are read.
         sizes = Sizes.used(ScenarioSet.open(data, verify=False))
     elif filters or scenarios:
-        raise UsageError("only a scenario set can be filtered", cure="leave out what is not wanted")
+        raise UsageError("only a scenario set can be filtered", cure="leave out filters= and scenarios=")
     else:
         kept, sizes = list(data[:limit]), Sizes.used(data)
     return Loaded(kept, ScenarioBank.from_scenarios(kept), scenario_names(kept), sizes)
 
 
 def make_simulator(task: Task | None = None, traffic: str | Traffic = "log") -> Simulator:
-    """A simulator of a task (the default one otherwise).
+    """Make a simulator.
 
     Args:
-        task: Action space, observation, reward and ends.
-        traffic: How the others move: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
-            ``zoo:NAME``), or a traffic. All but ``log`` may need their bank prepared:
-            ``bank = simulator.catalogue.prepared(simulator.traffic, bank)``.
+        task: Action space, observation, reward and termination; the default task if None.
+        traffic: Traffic model: ``log``, ``idm``, ``package.module:name``, a trained policy (its run folder or
+            ``zoo:NAME``), or a traffic object. All but ``log`` may need a prepared bank:
+            ``bank = simulator.traffic.bank_data.prepare_bank(simulator.traffic, bank)``.
     """
     return Simulator(task or Task(), _traffic(traffic))
 
 
-def _traffic(given: str | Traffic) -> Traffic:
-    return find_traffic(given) if isinstance(given, str) else given
+def _traffic(traffic: str | Traffic) -> Traffic:
+    return find_traffic(traffic) if isinstance(traffic, str) else traffic
 
 
 def evaluate(
     planner: str | Path | Planner | Callable[..., Any], data: str | Path | Loaded, *, task: Task | None = None,
     traffic: str | Traffic = "log", start: Start | None = None, sample: bool = False,
     metrics: Sequence[str] = (), **options: Any,
-) -> Results:  # fmt: skip
-    """Drives every scenario to the end of its log and measures it; writes nothing.
+) -> EpisodeTable:  # fmt: skip
+    """Evaluate a planner, given by name or as an object, on every scenario; writes nothing.
 
     Args:
-        planner: Name, run folder of a training run (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
-        data: Folder of a scenario set, or what :func:`load` returned (a part of a set, scenarios of your own).
-        task: Action space and observation of a planner of your own.
-        traffic: As of :func:`make_simulator`; it is prepared here.
-        start: How episodes begin: as logged by default, or ``simulator.starts.NoisyStart()``.
-        sample: Whether a policy, named by its folder, samples its actions rather than acting by the mode.
-        metrics: Metrics of your own as ``module:name``, beside all of ours.
-        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of ``evaluation.runner.evaluate_scenarios``.
+        planner: Name, run folder of a training (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
+        data: Folder of a scenario set, or scenarios from :func:`load`.
+        task: Action space and observation of a planner object.
+        traffic: As for :func:`make_simulator`; it is prepared here.
+        start: How episodes start: as logged by default, or ``simulator.starts.NoisyStart()``.
+        sample: Whether a policy given by name samples its actions instead of taking the mode.
+        metrics: User-defined metrics as ``module:name``, in addition to all built-in ones.
+        options: ``start_step``, ``seed``, ``batch`` and ``progress`` of :class:`drivax.evaluation.runner.Options`.
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
@@ -120,23 +129,101 @@ def evaluate(
         planner, task = find_planner(str(planner), loaded.bank, sample)
     elif sample:
         raise UsageError("only a policy by name can sample", cure="leave out sample=")
-    driver = as_planner(planner, getattr(planner, "__name__", "planner"))
-    task = with_metrics(task or Task(), tuple(metrics))
-    simulator = Simulator(task, _traffic(traffic), start or LogStart())
-    scenarios = data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data)
-    return evaluate_scenarios(simulator, driver, scenarios, sizes=loaded.sizes, **options)
+    return runner.evaluate(
+        as_planner(planner, getattr(planner, "__name__", "planner")),
+        data.scenarios if isinstance(data, Loaded) else ScenarioSet.open(data),
+        task=with_metrics(task or Task(), tuple(metrics)),
+        traffic=_traffic(traffic),
+        start=start,
+        sizes=loaded.sizes,
+        **options,
+    )
 
 
 def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
-    """The planner of a name, run folder or policy of the zoo, and the task that it was made for.
+    """Return the planner of a name, run folder or zoo policy, and its task.
 
     Raises:
-        UsageError: If there is no such planner, folder or policy.
+        UsageError: There is no such planner, folder or policy.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
         return make_planner(name), Task()
     folder, step = run_and_step(name)
     if not is_policy(folder):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
-        raise UsageError(f"there is no planner {name!r}", cure=f"use {', '.join(kinds)}")
+        raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
     return load_policy(folder, bank, step=step, samples=sample)
+
+
+def generate(
+    out: str | Path, scenarios: int = 256, seed: int = 0, *, options: Generation | None = None
+) -> ScenarioSet:
+    """Generate a scenario set of the built-in world, audited, and open it.
+
+    Args:
+        out: Folder to write.
+        scenarios: Number of scenarios.
+        seed: Scenario ``i`` of a seed is the same in every set.
+        options: World, workers and capacity.
+
+    Raises:
+        UsageError: ``out`` exists, or an option is impossible.
+    """
+    return ScenarioSet.open(generate_set(out, scenarios, seed, options, audit=audit).path)
+
+
+def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
+    """Convert recordings of a public data set to a scenario set, audited.
+
+    Args:
+        src: File, or folder that is searched to any depth.
+        out: Folder to write.
+        options: Fields of :class:`drivax.datasets.Conversion`.
+
+    Raises:
+        DataError: ``src`` holds nothing that can be converted.
+        UsageError: ``out`` exists, an option is impossible, or a package is missing.
+    """
+    return convert_set(src, out, Conversion(**options), audit=audit)
+
+
+def compare(
+    a: str | Path,
+    b: str | Path,
+    plan: ComparisonPlan | None = None,
+    data: Path | None = None,
+    **settings: Any,
+) -> Comparison:
+    """Compare two evaluations.
+
+    Args:
+        a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.
+        b: The other.
+        plan: Metrics and decision rule.
+        data: The evaluated set, for a stratified split, if it has moved.
+        settings: Fields of the plan to change, as ``primary="success"``.
+
+    Raises:
+        DataError: A run folder is missing or damaged.
+        UsageError: The evaluations cannot be compared, or a setting is impossible.
+    """
+    plan = replace(plan or ComparisonPlan(), **settings)
+    first, second = (EpisodeTable.read_seeds(Path(run)) for run in (a, b))
+    entries = first[0].open_set(data).entries if plan.split == "stratified" else ()
+    return compare_evaluations(plan, first, second, entries)
+
+
+def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> ScoreTable:
+    """Score how critical each step and scenario of a set is.
+
+    Args:
+        method: Name of a method, as ``kinematic``.
+        data: The set, or its folder.
+        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``.
+
+    Raises:
+        DataError: The method cannot score this set.
+        UsageError: Unknown method or impossible settings.
+    """
+    scenarios = data if isinstance(data, ScenarioSet) else ScenarioSet.open(data)
+    return curate_set(method, Request(scenarios, **options))

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import drivax
-from drivax.adapters import driving, gym
+from drivax.adapters import gym
 from drivax.adapters.gym import TASKS, DrivingEnv, VectorDrivingEnv
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.rollout import judging
@@ -184,7 +184,7 @@ def test_a_set_on_disk(tmp_path, data):
         seen, info = env.reset(options={"scenario": row})
         assert info["scenario_id"] == name
         np.testing.assert_allclose(seen["ego"][-1, 4] * SPEED_MPS, speed, rtol=1e-5)
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(DataError, match="folder not found"):
         DrivingEnv(tmp_path / "nowhere")
 
 
@@ -221,11 +221,11 @@ def test_steps_are_compiled_once(data):
     for env in (first, second):
         env.reset(seed=0)
         env.step(STILL)
-    compiled = driving.advance._cache_size()
+    compiled = gym._step._cache_size()
     third = DrivingEnv(data, SMALL)
     third.reset(options={"scenario": 1})
     third.step(STILL)
-    assert driving.advance._cache_size() == compiled
+    assert gym._step._cache_size() == compiled
     assert {device.platform for leaf in jax.tree.leaves(third._state) for device in leaf.devices()} == {"cpu"}
 
 
@@ -307,3 +307,13 @@ def test_pictures(data):
         vector.step(brake)
     for picture, wanted in zip(vector.render(), [first, second, first], strict=True):
         np.testing.assert_array_equal(picture, wanted)
+
+
+@pytest.mark.parametrize(("traffic", "name"), [("idm", "idm"), ("own_terms:Drift", "drift")])
+def test_environments_take_the_traffic_that_evaluation_takes(data, traffic, name):
+    env = gym.make(SMALL, data, traffic=traffic)
+    assert isinstance(env, DrivingEnv) and env._worlds.simulator.traffic.name == name
+    env.reset(options={"scenario": 1})
+    assert np.isfinite(env.step(STILL)[1])
+    with pytest.raises(UsageError, match="did you mean 'optimal'"):
+        gym.make("optmal", data)

@@ -204,7 +204,7 @@ def test_importance_of_features_to_a_trained_policy(sets, inspect):
         (["ONE", "--draw", "x.png"], "--draw needs --observations", 2),
         (["ONE", "--traffic", "idm"], "--traffic needs --observations", 2),
         (["ONE", "ONE", "--observations"], "one set", 2),
-        (["ONE", "--observations", "--planner", "nobody"], "there is no planner 'nobody'", 2),
+        (["ONE", "--observations", "--planner", "nobody"], "unknown planner 'nobody'", 2),
         (["ONE", "--json", "--html", "x.html"], "exclude", 2),
         (["gone"], "gone", 1),
     ],

@@ -50,9 +50,9 @@ def test_scores_weight_the_training_data(place, capsys):
     assert len(json.loads((place / "weighted" / "run.json").read_text())["weights"]) == 64
     capsys.readouterr()
     assert trained(place, "set-4", "other", *scores) != 0
-    assert "is of other data" in capsys.readouterr().err and not (place / "other").exists()
+    assert "scores are of other data" in capsys.readouterr().err and not (place / "other").exists()
     assert trained(place, "set-3", "missing", "--scores", str(place / "none.npz")) != 0
-    assert "there are no scores" in capsys.readouterr().err
+    assert "score table not found" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -65,28 +65,28 @@ def test_subset_trains_with_its_own_scores(place):
 
 def test_incompatible_flags_are_refused(place, capsys):
     assert trained(place, "set-3", "none", "--weighting.temperature", "2") == 2
-    assert "--weighting without scores to weight; pass --scores or --agent" in capsys.readouterr().err
-    assert trained(place, "set-3", "none", "--agent", "heuristic") == 2
-    assert "the agent heuristic is trained by cql, not " in capsys.readouterr().err
+    assert "--weighting without scores to weight; pass --scores or --arm" in capsys.readouterr().err
+    assert trained(place, "set-3", "none", "--arm", "heuristic") == 2
+    assert "arm heuristic is trained by cql, not " in capsys.readouterr().err
     rest = ["--data", str(place / "set-3"), "--out", str(place / "none")]
     call = ["train", "offline/cql", *rest]
-    assert main([*call, "--agent", "cql_bc"]) == 2
-    told = "the agent cql_bc is trained by cql with imitation, not cql; use offline/cql_bc"
+    assert main([*call, "--arm", "cql_bc"]) == 2
+    told = "arm cql_bc is trained by cql with imitation, not cql; use offline/cql_bc"
     assert told in capsys.readouterr().err
-    assert main(["train", "offline/cql_bc", *rest, "--agent", "baseline"]) == 2
+    assert main(["train", "offline/cql_bc", *rest, "--arm", "baseline"]) == 2
     assert "trained by cql, not cql with imitation; use offline/cql" in capsys.readouterr().err
     assert main([*call, "--scale", "scenario"]) == 2
     assert "--scale without scores to weight; pass --scores" in capsys.readouterr().err
-    assert main([*call, "--agent", "heuristic", "--scale", "scenario"]) == 2
-    assert "the agent heuristic has its own scale; leave out --scale" in capsys.readouterr().err
-    assert main([*call, "--agent", "oracle", "--weighting.uniform", "0"]) == 2
-    assert "the agent oracle has its own weights; leave out --weighting" in capsys.readouterr().err
-    assert main([*call, "--agent", "random_matched", "--seeds", "2"]) == 2
-    assert "2 agents random_matched in one program would share one lot" in capsys.readouterr().err
+    assert main([*call, "--arm", "heuristic", "--scale", "scenario"]) == 2
+    assert "arm heuristic has its own scale; leave out --scale" in capsys.readouterr().err
+    assert main([*call, "--arm", "oracle", "--weighting.uniform", "0"]) == 2
+    assert "arm oracle has its own weights; leave out --weighting" in capsys.readouterr().err
+    assert main([*call, "--arm", "random_matched", "--seeds", "2"]) == 2
+    assert "2 seeds of random_matched in one program would share one permutation" in capsys.readouterr().err
     other = place / "braking.npz"
     curate = ["curate", "kinematic", "--data", str(place / "set-3"), "--out", str(other)]
     assert main([*curate, "--weights", "braking", "1", "--overwrite"]) == 0
-    assert main([*call, "--agent", "heuristic", "--scores", str(other)]) == 1
+    assert main([*call, "--arm", "heuristic", "--scores", str(other)]) == 1
     assert "scores of 'kinematic' with combination" in capsys.readouterr().err
     assert not (place / "none").exists()
 
@@ -94,20 +94,20 @@ def test_incompatible_flags_are_refused(place, capsys):
 def test_scoring_for_training_shows_progress(place, monkeypatch, capsys):
     monkeypatch.setattr("drivax.cli.train.train", lambda *_, **__: types.SimpleNamespace(path="a-run"))
     call = ["train", "offline/cql", "--data", str(place / "set-3"), "--out", str(place / "none")]
-    assert main([*call, "--agent", "heuristic"]) == 0
+    assert main([*call, "--arm", "heuristic"]) == 0
     told = capsys.readouterr()
     assert "scoring: 2 scenarios in" in told.err and told.out == "wrote a-run\n"
 
-    def scouts(config, data, say):
+    def fail(config, data, say):
         say(3, 7)
-        raise UsageError("no scouts today", cure="stop here")
+        raise UsageError("no training today", cure="stop here")
 
     notes = []
-    monkeypatch.setattr(methods, "train_scouts", scouts)
+    monkeypatch.setattr(methods, "train_ensemble", fail)
     monkeypatch.setattr(Progress, "update", lambda _, done, note="": notes.append((done, note)))
-    assert main([*call, "--agent", "ensemble"]) == 2
-    assert notes == [(0, "training scouts, 3 of 7 iterations")]
-    assert "no scouts today" in capsys.readouterr().err
+    assert main([*call, "--arm", "ensemble"]) == 2
+    assert notes == [(0, "training the ensemble, 3 of 7 iterations")]
+    assert "no training today" in capsys.readouterr().err
 
 
 @pytest.mark.slow

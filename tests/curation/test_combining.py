@@ -33,7 +33,7 @@ def test_aggregators(name):
     )
 
 
-def test_a_weighted_mean():
+def test_step_scores_are_weighted_means():
     """Whatever the weights add up to, so that none is cut off."""
     parts = {"a": STEPS, "b": STEPS[::-1], "unused": STEPS}
     steps, scenarios = Combination({"a": 0.9, "b": 0.3}, "mean").combine(parts, VALID)
@@ -42,7 +42,7 @@ def test_a_weighted_mean():
     np.testing.assert_allclose(scenarios, aggregate(wanted, VALID, "mean"))
 
 
-def test_one_aggregator_for_each_component():
+def test_components_have_their_own_aggregators():
     parts = {"a": STEPS, "b": STEPS[::-1]}
     both = Combination({"a": 0.6, "b": 0.3}, {"a": "p90", "b": "std"})
     wanted = (2 * aggregate(STEPS, VALID, "p90") + aggregate(STEPS[::-1], VALID, "std")) / 3
@@ -56,13 +56,13 @@ def test_one_aggregator_for_each_component():
         (({"a": float("nan")},), "weight of 'a' is nan"),
         (({"a": 0.0},), "no component has a weight"),
         (({},), "no component has a weight"),
-        (({"a": 1.0}, "median"), "'median' aggregates no steps; use max, mean"),
-        (({"a": 1.0}, "p101"), "'p101' aggregates no steps"),
-        (({"a": 1.0}, "top0"), "'top0' aggregates no steps"),
+        (({"a": 1.0}, "median"), "unknown aggregator 'median'; use max, mean"),
+        (({"a": 1.0}, "p101"), "unknown aggregator 'p101'"),
+        (({"a": 1.0}, "top0"), "unknown aggregator 'top0'"),
         (({"a": 1.0, "b": 1.0}, {"a": "max"}), "no aggregator for 'b'"),
-        (({"a": 1.0}, {"a": "best"}), "'best' aggregates no steps"),
+        (({"a": 1.0}, {"a": "best"}), "unknown aggregator 'best'"),
     ],
 )
-def test_what_cannot_be_meant(given, words):
+def test_invalid_arguments_are_refused(given, words):
     with pytest.raises(UsageError, match=words):
         Combination(*given)

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.curation import scoring
+from drivax.curation import logged as scoring
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.logged import of_logs
+from drivax.curation.logged import score_bank, score_steps
 from drivax.curation.methods import KINEMATIC
-from drivax.curation.scoring import score_steps
 from drivax.errors import UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind, Capacity
@@ -75,7 +74,7 @@ SCENES = {
 def components():
     """By scene and name."""
     bank = bank_of(*(straight_road(cars) for cars in SCENES.values()))
-    found = {name: np.asarray(part) for name, part in of_logs(CONFIG, bank).items()}
+    found = {name: np.asarray(part) for name, part in score_bank(CONFIG, bank).items()}
     return {scene: {name: part[row] for name, part in found.items()} for row, scene in enumerate(SCENES)}
 
 
@@ -94,14 +93,14 @@ def expected(ttc_s, braking_mps2, config=CONFIG):
     return (urgent + min(braking_mps2 / config.full_braking_mps2, 1)) / 2
 
 
-def test_a_stopped_car_ahead_is_critical_and_an_oncoming_one_in_its_lane_is_not(steps):
+def test_stopped_car_ahead_is_critical_and_oncoming_car_is_not(steps):
     """The published heuristic scores these two 0.15 and 1.00."""
     assert steps["stopped"][NOW] == 1.0  # 5.2 m at 15 m/s: 0.35 s, 21.6 m/s2
     assert steps["oncoming"].max() < 0.01
     assert steps["free"].max() < 0.01
 
 
-def test_hand_computed_values(steps):
+def test_components_equal_hand_computed_values(steps):
     gap = 30.0 - 4.8
     assert steps["leader"][NOW] == pytest.approx(expected(5.0, 5.0**2 / (2 * gap)), abs=1e-3)
     # A second later 5 m nearer: 4.04 s and 0.62 m/s2.
@@ -119,13 +118,13 @@ def test_every_step_of_an_approach(steps):
     np.testing.assert_allclose(steps["far"][at], wanted, atol=1e-3)
 
 
-def test_who_is_not_in_the_way_does_not_count(steps):
+def test_agents_off_the_path_do_not_count(steps):
     assert steps["beside"].max() < 0.01
     assert steps["follower"][NOW] < 0.01
     assert steps["standing"].max() == 0.0
 
 
-def test_who_comes_nearer_counts_as_standing(components):
+def test_oncoming_agent_counts_as_standing(components):
     """No braking takes away what others bring to the closing speed, and who stands has nothing to brake."""
     for scene in ("waiting", "letting pass"):
         assert components[scene]["braking"].max() == components[scene]["urgency"].max() == 0.0
@@ -143,19 +142,19 @@ def test_nearer_and_faster_is_more_critical(steps):
 def test_invariant_to_shifting_and_turning_the_world(components):
     names = ("leader", "pedestrian", "far", "beside", "kerb")
     turned = bank_of(*(moved(straight_road(SCENES[name]), 2.1, 300.0, -70.0) for name in names))
-    for name, part in of_logs(CONFIG, turned).items():
+    for name, part in score_bank(CONFIG, turned).items():
         for row, scene in enumerate(names):
             np.testing.assert_allclose(
                 part[row], components[scene][name], atol=5e-3, err_msg=f"{scene} {name}"
             )
 
 
-def test_where_ego_is_not_its_last_motion_stands(steps):
+def test_last_motion_is_repeated_where_ego_is_missing(steps):
     np.testing.assert_allclose(steps["brief"][:12], steps["far"][:12], atol=1e-4)
     assert (steps["brief"][:12] > 0).all()
 
 
-def test_noise_of_a_centimetre_per_second_is_nearly_nothing(components):
+def test_speed_noise_of_one_cm_per_s_is_negligible(components):
     """Two least-squares windows of 1.5 s: the published heuristic scores the same noise 0.6."""
     assert components["noise"]["volatility"].max() < 0.02
 
@@ -171,23 +170,23 @@ BRAKING = 30.0 - 2.0 * (TIME + 1.0)
 
 @pytest.mark.parametrize("there", [range(5, 91), range(51), {*range(91)} - {*range(40, 50)}, range(2, 16)])
 @pytest.mark.parametrize(("speeds", "jerk"), [(BRAKING, 0.0), (20.0 + 4.13 / 2 * TIME**2, 0.5)])
-def test_where_ego_is_not_there_nothing_is_made_up(there, speeds, jerk):
+def test_volatility_ignores_steps_without_ego(there, speeds, jerk):
     """Constant deceleration, or jerk, up to the last step that is known; 0 where there are no 1.5 s on end."""
     valid = np.isin(np.arange(91), list(there))
     track = with_speeds(speeds)
     bank = bank_of(straight_road([track | {"valid": valid}]))
-    found = np.asarray(of_logs(CONFIG, bank)["volatility"][0])
+    found = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
     acts = valid & np.roll(valid, -1)
     acts[-1] = acts[-2]
     wanted = jerk if valid.sum() > 15 else 0.0
     np.testing.assert_allclose(found, np.where(acts, wanted, 0.0), atol=3e-3)
 
 
-def test_volatility_is_that_of_the_action_that_begins_now():
+def test_volatility_is_of_the_next_action():
     """Speed jumps between steps 50 and 51, which is the action of step 50: the window is centred there."""
     speeds = np.where(np.arange(91) <= 50, 10.0, 10.2)
     bank = bank_of(straight_road([with_speeds(speeds)]))
-    found = np.asarray(of_logs(CONFIG, bank)["volatility"][0])
+    found = np.asarray(score_bank(CONFIG, bank)["volatility"][0])
     # The slope of a line through 15 values of which one is 2 m/s2, k steps from the middle: 2 k / 280 per step.
     wanted = [2.0 * abs(k) / 280 / 0.1 / (2 * 4.13) if abs(k) <= 7 else 0.0 for k in range(-10, 11)]
     np.testing.assert_allclose(found[40:61], wanted, atol=1e-3)
@@ -205,15 +204,15 @@ def test_distances_are_to_segments(components):
     assert nowhere["off_road"].max() == 0.0 and nowhere["lane_deviation"].max() == 0.0
 
 
-def test_density_counts_everyone(components):
+def test_density_counts_all_agents(components):
     np.testing.assert_allclose(components["crowd"]["density"], 8 / 50)
 
 
-def test_who_overlaps_when_it_appears_counts_for_nothing(steps):
+def test_agents_that_appear_overlapping_are_ignored(steps):
     assert steps["appears inside"].max() == 0.0
 
 
-def test_the_default_weights_rank_the_stopped_car_above_the_oncoming_one(components):
+def test_default_weights_rank_stopped_above_oncoming_car(components):
     """The published heuristic ranks them the other way round."""
     valid = np.ones((2, 91), bool)
     both = {
@@ -226,7 +225,7 @@ def test_the_default_weights_rank_the_stopped_car_above_the_oncoming_one(compone
 
 
 @pytest.mark.slow
-def test_a_set_larger_than_a_batch_scores_the_same(tmp_path, components, monkeypatch):
+def test_batches_do_not_change_scores(tmp_path, components, monkeypatch):
     """Batched, against the bank of all."""
     monkeypatch.setattr(scoring, "BATCH", 4)
     names = list(SCENES)[:6]

@@ -9,11 +9,11 @@ import pytest
 from drivax.cli import main
 from drivax.cli.curate import Curate
 from drivax.cli.train import Train
-from drivax.curation.arms import AGENTS
+from drivax.curation.arms import ARMS
 from drivax.curation.combining import Combination
 from drivax.curation.controls import event_kinds, event_steps
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.methods import METHODS, Wanted, curate, refuse_stale
+from drivax.curation.methods import METHODS, Request, check_current, curate
 from drivax.curation.scores import read_scores, write_scores
 from drivax.curation.subset import top_rows, write_top
 from drivax.errors import DataError, UsageError
@@ -49,13 +49,13 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def tables(data, tmp_path_factory):
     like = tmp_path_factory.mktemp("tables") / "kinematic.npz"
-    write_scores(curate("kinematic", Wanted(data)), like)
+    write_scores(curate("kinematic", Request(data)), like)
     # An ensemble has to be trained first, and has tests of its own.
     names = [name for name in METHODS if name != "ensemble"]
-    return {name: curate(name, Wanted(data, like if name == "random_matched" else None)) for name in names}
+    return {name: curate(name, Request(data, like if name == "random_matched" else None)) for name in names}
 
 
-def test_every_method_scores_every_step_and_comes_back(data, tables, tmp_path):
+def test_every_method_scores_every_step_and_round_trips(data, tables, tmp_path):
     for name, table in tables.items():
         assert table.method == name and table.set_hash == data.hash
         assert table.steps.shape == table.valid.shape == (4, 91) and table.scenarios.shape == (4,)
@@ -65,32 +65,32 @@ def test_every_method_scores_every_step_and_comes_back(data, tables, tmp_path):
         np.testing.assert_allclose(read_scores(tmp_path / f"{name}.npz", data).steps, table.steps, atol=1e-6)
 
 
-def test_what_a_method_says_that_it_weighs_is_there(tables):
+def test_methods_return_their_declared_components(tables):
     for table in tables.values():
         method = METHODS[table.method]
         if table.components:
             weighed = method.combination(method.config).weights
-            assert set(table.components) == {*weighed, *method.beside(method.config)}
+            assert set(table.components) == {*weighed, *method.unweighted(method.config)}
 
 
-def test_the_command_offers_every_method():
+def test_commands_offer_every_method_and_arm():
     hints = get_type_hints(Curate, include_extras=True)
     assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)
-    assert {*get_args(get_args(get_type_hints(Train)["agent"])[0])} == set(AGENTS)
+    assert {*get_args(get_args(get_type_hints(Train)["arm"])[0])} == set(ARMS)
 
 
-def test_what_they_prefer(data, tables):
+def test_scores_of_methods(data, tables):
     assert tables["kinematic"].scenarios.argmax() == 1
     assert sorted(tables["published"].components) == [
         "density", "interaction", "lane_deviation", "off_road", "volatility"
     ]  # fmt: skip
     assert (tables["uniform"].steps == tables["uniform"].valid).all()
-    kinematic, lot = tables["kinematic"], tables["random_matched"]
-    np.testing.assert_allclose(np.sort(lot.scenarios), np.sort(kinematic.scenarios), atol=1e-6)
-    assert lot.config["like"] == "kinematic" and lot.config["like_config"]["urgent_s"] == 0.95
+    kinematic, control = tables["kinematic"], tables["random_matched"]
+    np.testing.assert_allclose(np.sort(control.scenarios), np.sort(kinematic.scenarios), atol=1e-6)
+    assert control.config["like"] == "kinematic" and control.config["like_config"]["urgent_s"] == 0.95
 
 
-def test_the_oracle_knows_the_labels(data, tables):
+def test_oracle_scores_are_labels(data, tables):
     step = np.arange(91)
     np.testing.assert_array_equal(event_steps(data)[1], (step >= 8) & (step <= 30))
     assert event_kinds(data).tolist() == [0, 3, 0, 0]
@@ -98,16 +98,14 @@ def test_the_oracle_knows_the_labels(data, tables):
     assert tables["oracle"].steps.sum() == 23
 
 
-def test_only_the_built_in_world_has_an_oracle(tmp_path):
+def test_oracle_refuses_sets_without_labels(tmp_path):
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         writer.add(assemble(straight_road([car()]), SMALL))
-    with pytest.raises(
-        DataError, match="only the built-in world knows its rare events, this set is of test; use"
-    ):
-        curate("oracle", Wanted(ScenarioSet.open(tmp_path / "set")))
+    with pytest.raises(DataError, match="only the built-in world has event labels, this set is of test; use"):
+        curate("oracle", Request(ScenarioSet.open(tmp_path / "set")))
 
 
-def test_a_subset_is_a_set_in_order_of_criticality(data, tables, tmp_path):
+def test_subset_is_a_set_in_order_of_criticality(data, tables, tmp_path):
     table = tables["kinematic"]
     rows = top_rows(table, 3)
     assert (np.diff(table.scenarios[rows]) <= 0).all() and rows[0] == 1
@@ -121,24 +119,22 @@ def test_a_subset_is_a_set_in_order_of_criticality(data, tables, tmp_path):
     assert main(["inspect", str(tmp_path / "top")]) == 0
 
 
-def test_what_cannot_be_meant(data, tmp_path):
+def test_invalid_arguments_are_refused(data, tmp_path):
     for name, like in (("random_matched", None), ("uniform", tmp_path / "x.npz")):
         with pytest.raises(UsageError, match="random_matched needs --like"):
-            curate(name, Wanted(data, like))
+            curate(name, Request(data, like))
     with pytest.raises(UsageError, match="no method 'kinematics'; did you mean 'kinematic'"):
-        curate("kinematics", Wanted(data))
-    with pytest.raises(DataError, match="there are no scores"):
-        curate("random_matched", Wanted(data, tmp_path / "none.npz"))
+        curate("kinematics", Request(data))
+    with pytest.raises(DataError, match="score table not found"):
+        curate("random_matched", Request(data, tmp_path / "none.npz"))
 
 
 def test_settings_of_a_method(data, tables, tmp_path, capsys):
-    table = curate("kinematic", Wanted(data, config=KinematicConfig(urgent_s=2.0)))
+    table = curate("kinematic", Request(data, config=KinematicConfig(urgent_s=2.0)))
     assert table.config["urgent_s"] == 2.0
     assert table.components["urgency"].max() >= tables["kinematic"].components["urgency"].max()
-    with pytest.raises(
-        UsageError, match="uniform has no settings of the kind KinematicConfig; leave them out"
-    ):
-        curate("uniform", Wanted(data, config=KinematicConfig()))
+    with pytest.raises(UsageError, match="uniform has no settings of type KinematicConfig; leave them out"):
+        curate("uniform", Request(data, config=KinematicConfig()))
     out = tmp_path / "scores.npz"
     assert main(["curate", "kinematic", "--data", str(data.path), "--out", str(out), "--urgent_s", "2"]) == 0
     np.testing.assert_allclose(read_scores(out, data).steps, table.steps, atol=1e-6)
@@ -146,7 +142,7 @@ def test_settings_of_a_method(data, tables, tmp_path, capsys):
     assert "oracle has no such setting; leave out --urgent_s 2" in capsys.readouterr().err
 
 
-def test_a_method_that_aggregates_each_component_can_be_told_otherwise(data, tmp_path):
+def test_weights_and_aggregators_can_be_changed(data, tmp_path):
     """The aggregators of components that are left out weigh nothing."""
     out = tmp_path / "scores.npz"
     call = [
@@ -170,13 +166,13 @@ def test_a_method_that_aggregates_each_component_can_be_told_otherwise(data, tmp
     np.testing.assert_allclose(read_scores(out, data).scenarios, top, rtol=1e-6)
 
 
-def test_a_table_that_the_method_would_not_make_now_is_stale(data, tables, tmp_path):
+def test_tables_with_other_settings_are_refused(data, tables, tmp_path):
     for name in ("kinematic", "action_rarity", "published", "uniform", "random_matched"):
         write_scores(tables[name], tmp_path / f"{name}.npz")
-        refuse_stale(read_scores(tmp_path / f"{name}.npz", data))
+        check_current(read_scores(tmp_path / f"{name}.npz", data))
     table = tables["kinematic"]
     with pytest.raises(DataError, match=r"with urgent_s 0\.95, which is 2\.0 here; score again"):
-        refuse_stale(table, KinematicConfig(urgent_s=2.0))
+        check_current(table, KinematicConfig(urgent_s=2.0))
     for other in (replace(table.combination, scenario="max"), Combination({"urgency": 1.0}, "top10")):
         with pytest.raises(DataError, match="scores of 'kinematic' with combination"):
-            refuse_stale(table.combined(other))
+            check_current(table.combined(other))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivax.curation.logged import of_logs
+from drivax.curation.logged import score_bank
 from drivax.curation.methods import PUBLISHED
 from drivax.curation.published import PublishedConfig
 from drivax.errors import UsageError
@@ -44,7 +44,7 @@ SCENES = {
 @pytest.fixture(scope="module")
 def found():
     bank = bank_of(*(straight_road(cars) for cars in SCENES.values()))
-    parts = {name: np.asarray(part) for name, part in of_logs(PublishedConfig(), bank).items()}
+    parts = {name: np.asarray(part) for name, part in score_bank(PublishedConfig(), bank).items()}
     return {scene: {name: part[row] for name, part in parts.items()} for row, scene in enumerate(SCENES)}
 
 
@@ -57,15 +57,15 @@ def test_volatility_is_two_backward_differences(found):
     assert yaw[60] == pytest.approx(0.6 / 1.5, abs=5e-3) and yaw[:40].max() < 5e-3
 
 
-def test_the_first_steps_know_no_difference():
+def test_differences_are_zero_at_the_start():
     """Speeds before the log count as those of its first step."""
     speeds = np.where(STEPS == 0, 10.0, 10.1)
     bank = bank_of(straight_road([ego(speeds)]))
-    volatility = np.asarray(of_logs(PublishedConfig(), bank)["volatility"][0])
+    volatility = np.asarray(score_bank(PublishedConfig(), bank)["volatility"][0])
     assert volatility[0] == 0.0 and volatility[1] == volatility[2] == 1.0 and volatility[3] < 2e-3
 
 
-def test_a_centimetre_per_second_of_noise_is_violent(found):
+def test_speed_noise_of_one_cm_per_s_scores_high(found):
     """The study's own functions gave 0.62; the second difference has sqrt(6) sigma / dt^2 = 2.4 m/s3."""
     wanted = np.abs(np.diff(np.diff(10.0 + NOISE))) / 0.01 / 2.5
     np.testing.assert_allclose(found["noise"]["volatility"][2:], np.minimum(wanted, 1.0), atol=2e-3)
@@ -84,7 +84,7 @@ def test_interaction_grows_with_distance(found):
 
 
 def test_distances_are_to_points(found):
-    """The nearest point of the lane is 0.5 m beside ego and up to 0.25 m along it, so that the distance wobbles."""
+    """The nearest point of the lane is 0.5 m off ego and up to 0.25 m along it, so that the distance wobbles."""
     deviation = found["aside"]["lane_deviation"] * 1.25
     assert deviation.min() == pytest.approx(0.5, abs=2e-2)
     assert deviation.max() == pytest.approx(np.hypot(0.5, 0.25), abs=1e-2)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.curation.logged import of_logs
+from drivax.curation.logged import score_bank
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
 from drivax.errors import DataError, UsageError
 from scenes import bank_of, car, straight_road
@@ -29,7 +29,7 @@ def test_density_integrates_to_one_at_the_bounds_too():
     assert KernelRarity().density(actions, grid).sum() / 128**2 == pytest.approx(1.0, rel=1e-9)
 
 
-def test_density_is_that_of_every_pair():
+def test_density_equals_the_sum_over_pairs():
     actions, at = RNG.uniform(-0.5, 0.5, (400, 2)), RNG.uniform(-0.5, 0.5, (60, 2))
     apart = ((at[:, None] - actions) ** 2).sum(axis=2)
     wanted = np.exp(-0.5 * apart / 0.05**2).mean(axis=1) / (2 * np.pi * 0.05**2)
@@ -71,7 +71,7 @@ def test_published_histogram():
     assert scores.max() < 1.764 / 3 + 0.01  # the cap of 3 never binds
 
 
-def test_actions_of_the_expert_and_where_they_are_known():
+def test_expert_actions_and_their_mask():
     """Constant speed, constant acceleration of 2 m/s2 (a third of the bound), and a log that ends early."""
     time = (np.arange(91) - 10) * 0.1
     faster = car() | {
@@ -83,7 +83,7 @@ def test_actions_of_the_expert_and_where_they_are_known():
         straight_road([faster]),
         straight_road([car(speed=5.0, steps=range(30))]),
     )
-    found = {name: np.asarray(part) for name, part in of_logs(ExpertActions(), bank).items()}
+    found = {name: np.asarray(part) for name, part in score_bank(ExpertActions(), bank).items()}
     np.testing.assert_allclose(found["action"][0, :89], 0.0, atol=1e-3)
     np.testing.assert_allclose(found["action"][1, :89], [[1 / 3, 0.0]] * 89, atol=2e-3)
     assert found["known"].sum(axis=1).tolist() == [89, 89, 28]
@@ -92,9 +92,9 @@ def test_actions_of_the_expert_and_where_they_are_known():
     assert steps[1, 20] > steps[0, 20]  # 90 steps against 118 without acceleration
 
 
-def test_what_cannot_be_meant():
+def test_invalid_arguments_are_refused():
     for name, wrong in (("bandwidth", 0.0), ("cells", 1), ("temper", 2.0), ("most", 0.5)):
         with pytest.raises(UsageError, match=name):
             replace(KernelRarity(), **{name: wrong})
-    with pytest.raises(DataError, match="no log has two steps on end"):
+    with pytest.raises(DataError, match="no log has three consecutive steps"):
         rarity_steps(KernelRarity(), np.zeros((1, 3, 2)), np.zeros((1, 3), bool))

@@ -9,7 +9,7 @@ import pytest
 from drivax.cli import main
 from drivax.curation import scores
 from drivax.curation.combining import Combination
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
@@ -47,7 +47,7 @@ def table(data):
     ).combined(PARTS)
 
 
-def test_what_is_written_comes_back(data, table, tmp_path):
+def test_tables_round_trip(data, table, tmp_path):
     out = tmp_path / "deep" / "scores"
     write_scores(table, out)
     found = read_scores(out, data)
@@ -70,7 +70,7 @@ def test_what_is_written_comes_back(data, table, tmp_path):
     assert [path.name for path in out.parent.iterdir()] == ["scores"]
 
 
-def test_other_weights_need_no_scoring(data, table, tmp_path):
+def test_components_can_be_combined_again(data, table, tmp_path):
     write_scores(table, tmp_path / "scores.npz")
     found = read_scores(tmp_path / "scores.npz", data)
     again = found.combined(Combination({"braking": 0.25, "urgency": 0.75}, "mean"))
@@ -84,7 +84,7 @@ def test_other_weights_need_no_scoring(data, table, tmp_path):
         found.combined(Combination({"brakes": 1.0}))
 
 
-def test_a_table_of_an_older_drivax(data, table, tmp_path, monkeypatch):
+def test_older_versions_are_refused(data, table, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(scores, "SCORES_VERSION", 1)
         write_scores(table, tmp_path / "old.npz")
@@ -94,7 +94,7 @@ def test_a_table_of_an_older_drivax(data, table, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def lively(tmp_path_factory):
-    """A drive that speeds up, brakes, swerves and is not seen for a second; somebody ahead, and an oncoming car."""
+    """A drive that speeds up, brakes, swerves and is not seen for a second; a car ahead, and an oncoming car."""
     t = (np.arange(91) - 10) * 0.1
     speed, swerve = 9.0 + 3.0 * np.sin(0.9 * t), 0.8 * np.sin(0.7 * t)
     along = np.cumsum(speed) * 0.1
@@ -122,28 +122,28 @@ FROZEN = {
 
 
 @pytest.mark.parametrize("method", ["kinematic", "published", "action_rarity", "action_rarity_published"])
-def test_what_scores_mean_changes_with_the_version_alone(lively, method):
+def test_scores_equal_stored_values_of_this_version(lively, method):
     """Tables of before would be taken for today's: where these change, raise SCORES_VERSION, too."""
-    found = curate(method, Wanted(lively))
+    found = curate(method, Request(lively))
     assert scores.SCORES_VERSION == 3
     np.testing.assert_allclose([*found.scenarios, *found.steps[0, ::12]], FROZEN[method], atol=5e-4)
 
 
-def test_a_missing_table(data, tmp_path):
+def test_missing_table_is_refused(data, tmp_path):
     with pytest.raises(DataError) as error:
         read_scores(tmp_path / "none.npz", data)
-    assert "none.npz: there are no scores; make them with `drivax curate METHOD" in str(error.value)
+    assert "none.npz: score table not found; write it with `drivax curate METHOD" in str(error.value)
 
 
-def test_a_stale_table(data, table, tmp_path):
+def test_table_of_other_data_is_refused(data, table, tmp_path):
     write_scores(replace(table, set_hash="0" * 64), tmp_path / "old.npz")
     with pytest.raises(DataError) as error:
         read_scores(tmp_path / "old.npz", data)
-    assert "is of other data (hash 000000000000" in str(error.value)
+    assert "scores are of other data (hash 000000000000" in str(error.value)
     assert str(error.value).endswith("; run `drivax curate` again")
 
 
-def test_damaged_tables(data, table, tmp_path):
+def test_damaged_tables_are_refused(data, table, tmp_path):
     file = tmp_path / "scores.npz"
     write_scores(table, file)
     whole = file.read_bytes()
@@ -155,7 +155,7 @@ def test_damaged_tables(data, table, tmp_path):
     others = [(tmp_path / name).read_bytes() for name in ("other.npz", "array.npy")]
     for content in (b"", b"text", half, bytes(flipped), *others):
         file.write_bytes(content)
-        with pytest.raises(DataError, match=r"no table of scores, or damaged .*; run `drivax curate` again"):
+        with pytest.raises(DataError, match=r"not a score table, or damaged .*; run `drivax curate` again"):
             read_scores(file, data)
 
 
@@ -169,7 +169,7 @@ def test_damaged_tables(data, table, tmp_path):
         ("component_urgency", np.zeros((2, 90), np.float32)),
     ],
 )
-def test_tables_that_do_not_fit(data, table, tmp_path, name, wrong):
+def test_tables_of_other_shapes_are_refused(data, table, tmp_path, name, wrong):
     file = tmp_path / "scores.npz"
     write_scores(table, file)
     with np.load(file) as stored:
@@ -181,7 +181,7 @@ def test_tables_that_do_not_fit(data, table, tmp_path, name, wrong):
 
 @pytest.mark.parametrize("value", [np.nan, -0.1, 1.1])
 @pytest.mark.parametrize("which", ["steps", "scenarios", "components"])
-def test_a_missing_score_is_an_error_and_leaves_no_file(table, tmp_path, which, value):
+def test_scores_outside_the_range_are_not_written(table, tmp_path, which, value):
     part = table.components["urgency"] if which == "components" else getattr(table, which)
     part[1, ...] = value
     with pytest.raises(DataError, match=r"record drive-1: has a score outside \[0, 1\]"):
@@ -189,18 +189,18 @@ def test_a_missing_score_is_an_error_and_leaves_no_file(table, tmp_path, which, 
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_overwritten_unasked(data, table, tmp_path):
+def test_existing_table_needs_overwrite(data, table, tmp_path):
     file = tmp_path / "scores.npz"
     write_scores(table, file)
-    with pytest.raises(UsageError, match="exists already; choose another name or pass --overwrite"):
+    with pytest.raises(UsageError, match="output file already exists; choose another or pass --overwrite"):
         write_scores(table, file)
     write_scores(replace(table, method="other"), file, overwrite=True)
     assert read_scores(file, data).method == "other"
-    with pytest.raises(UsageError, match="is a folder"):
+    with pytest.raises(UsageError, match="output is a folder"):
         write_scores(table, tmp_path, overwrite=True)
 
 
-def test_a_failure_leaves_the_old_table(table, tmp_path, monkeypatch):
+def test_failed_write_keeps_the_old_table(table, tmp_path, monkeypatch):
     file = tmp_path / "scores.npz"
     write_scores(table, file)
     before = file.read_bytes()
@@ -239,11 +239,11 @@ def test_the_command(data, tmp_path, capsys):
     capsys.readouterr()
     for wrong, words in (
         (["--weights", "urgencies", "1"], "there is no component 'urgencies'; did you mean 'urgency'"),
-        (["--scenario", "p101"], "'p101' aggregates no steps"),
+        (["--scenario", "p101"], "unknown aggregator 'p101'"),
         ([*weights, "--scenario", "urgency", "max"], "no aggregator for 'braking'; name one for each comp"),
         ([*weights, "--scenario", *apart, "densty", "max"], "'densty'; did you mean 'density'"),
-        ([*weights, "--scenario", "urgency", "max", "braking", "most"], "'most' aggregates no steps"),
-        (["--scenario", "urgency=max", "braking=p95"], "'braking=p95' aggregates no steps"),
+        ([*weights, "--scenario", "urgency", "max", "braking", "most"], "unknown aggregator 'most'"),
+        (["--scenario", "urgency=max", "braking=p95"], "unknown aggregator 'braking=p95'"),
     ):
         assert main([*anew, "--overwrite", *wrong]) == 2
         assert words in capsys.readouterr().err
@@ -252,7 +252,7 @@ def test_the_command(data, tmp_path, capsys):
     mixture = ["--cloning.loss", "likelihood", "--cloning.network.distribution", "mixture"]
     for wrong, words in (
         (["kinematic", "--weights", "urgency", "-1"], "the weight of 'urgency' is -1.0; use 0 or more"),
-        (["kinematic", "--scenario", "p101"], "'p101' aggregates no steps"),
+        (["kinematic", "--scenario", "p101"], "unknown aggregator 'p101'"),
         (["kinematic", "--scenario", "urgency", "max"], "there is no aggregator for 'braking'"),
         (["ensemble", "--weights", "actoin_0", "1"], "no component 'actoin_0'; did you mean 'action_0'"),
         (["ensemble", *mixture, "--weights", "action_0", "1"], "there is no component 'action_0'"),
@@ -261,15 +261,15 @@ def test_the_command(data, tmp_path, capsys):
         told = capsys.readouterr().err
         assert words in told and "scor" not in told.split(words)[0]
     assert main(["curate", "published", *anew[2:], "--overwrite"]) == 2
-    assert "is a table of kinematic; say curate kinematic" in capsys.readouterr().err
+    assert "is a table of kinematic; use curate kinematic" in capsys.readouterr().err
     for ignored in (["--seed", "1"], ["--like", str(out)]):
         assert main([*anew, "--overwrite", *ignored]) == 2
         assert f"has no such setting; leave out {ignored[0]}" in capsys.readouterr().err
     assert main([*command, "--out", str(tmp_path / "x"), "--seed", "1"]) == 2
     assert "kinematic has no such setting; leave out --seed" in capsys.readouterr().err
-    lot = ["curate", "random_matched", *command[2:], "--like", str(out), "--out", str(tmp_path / "x")]
-    assert main([*lot, "--scenario", "max"]) == 2
-    assert "which have no components; give --weights and --scenario to the method" in capsys.readouterr().err
+    control = ["curate", "random_matched", *command[2:], "--like", str(out), "--out", str(tmp_path / "x")]
+    assert main([*control, "--scenario", "max"]) == 2
+    assert "which have no components; pass --weights and --scenario to the method" in capsys.readouterr().err
     assert main([*command, "--out", str(out)]) == 2
     assert main(["curate", "kinematic", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "x")]) == 1
     assert main(["curate", "guesswork", "--data", str(data.path), "--out", str(tmp_path / "x")]) == 2

@@ -8,7 +8,7 @@ import pytest
 
 from drivax.cli import main
 from drivax.curation import subset
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable, read_scores, write_scores
 from drivax.curation.subset import check_top, top_rows, write_top
 from drivax.errors import DataError, UsageError
@@ -43,7 +43,7 @@ def hand_made(data, scenarios, means=None):
     return ScoreTable("kinematic", {}, data.hash, ids, valid, steps, np.asarray(scenarios, float), {})
 
 
-def test_equal_scenarios_are_told_apart_by_their_steps_and_then_by_the_set(data):
+def test_ties_are_ordered_by_mean_step_score_then_index(data):
     table = hand_made(data, [0.5, 0.5, 0.9, 0.5, 0.5, 0.1], [0.1, 0.2, 0.0, 0.3, 0.2, 0.9])
     # The second counts its 40 steps only: over all 91 its mean would be below that of the first.
     assert top_rows(table, 6) == [2, 3, 1, 4, 0, 5]
@@ -52,7 +52,7 @@ def test_equal_scenarios_are_told_apart_by_their_steps_and_then_by_the_set(data)
     assert ranks == ["5", "3", "1", "2", "4", "6"]
 
 
-def test_a_table_that_was_read_has_the_same_order(data, tmp_path):
+def test_order_survives_a_round_trip(data, tmp_path):
     """A file rounds to float32: what is equal there is equal before."""
     near = 0.5 + 1e-12 * np.arange(6)
     table = hand_made(data, near, [0.3, 0.1, 0.2, 0.6, 0.5, 0.4])
@@ -72,7 +72,7 @@ def test_the_most_critical_of_each_recording(data):
     assert top_rows(table, 6, recordings) == [1, 4, 5, 3, 2]
 
 
-def test_a_subset_holds_one_scenario_of_each_recording_unless_told_otherwise(data, tmp_path):
+def test_subset_holds_one_scenario_of_each_recording_by_default(data, tmp_path):
     table = hand_made(data, [0.8, 0.9, 0.1, 0.3, 0.7, 0.6])
     for all_windows, rows in ((False, [1, 4, 5]), (True, [1, 0, 4])):
         out = tmp_path / str(all_windows)
@@ -83,7 +83,7 @@ def test_a_subset_holds_one_scenario_of_each_recording_unless_told_otherwise(dat
         assert (part["most_critical"], part["all_windows"]) == (3, all_windows)
 
 
-def test_too_few_recordings(data, tmp_path, capsys):
+def test_count_beyond_the_recordings_is_refused(data, tmp_path, capsys):
     told = (
         "the 6 most critical of 5 recordings, one scenario of each; "
         "ask for 1 to 5, or pass --all-windows to choose among all 6 scenarios"
@@ -104,8 +104,8 @@ def test_too_few_recordings(data, tmp_path, capsys):
     assert len(ScenarioSet.open(tmp_path / "top")) == 6
 
 
-def test_a_subset_holds_its_scores(data, tmp_path):
-    table = curate("kinematic", Wanted(data))
+def test_subset_folder_holds_its_scores(data, tmp_path):
+    table = curate("kinematic", Request(data))
     rows = top_rows(table, 3, recordings_of(data.entries))
     write_top(table, data, 3, tmp_path / "top")
     top = ScenarioSet.open(tmp_path / "top")
@@ -123,11 +123,11 @@ def test_a_subset_holds_its_scores(data, tmp_path):
     assert own.config["urgent_s"] == table.config["urgent_s"]
     # Scores of the whole set are not those of the subset, and where those are is said.
     write_scores(table, tmp_path / "whole.npz")
-    with pytest.raises(DataError, match=r"is of other data .*; use .*top/scores\.npz"):
+    with pytest.raises(DataError, match=r"scores are of other data .*; use .*top/scores\.npz"):
         read_scores(tmp_path / "whole.npz", top)
 
 
-def test_a_subset_without_its_scores_is_not_left_behind(data, tmp_path, monkeypatch):
+def test_failed_subset_leaves_no_folder(data, tmp_path, monkeypatch):
     table = hand_made(data, [0.8, 0.9, 0.1, 0.3, 0.7, 0.6])
     write_top(table, data, 1, tmp_path / "top")
     monkeypatch.setattr(subset, "write_scores", lambda *_: 1 / 0)
@@ -139,7 +139,7 @@ def test_a_subset_without_its_scores_is_not_left_behind(data, tmp_path, monkeypa
     assert read_scores(tmp_path / "top" / "scores.npz", top).scenario_ids == ("drive-1",)
 
 
-def test_the_command_tells_the_most_critical(data, tmp_path, capsys):
+def test_command_prints_the_most_critical(data, tmp_path, capsys):
     out, top = tmp_path / "scores.npz", tmp_path / "top"
     command = ["curate", "kinematic", "--data", str(data.path), "--export", str(top), "3"]
     for lost in (top, top / "scores.npz"):
@@ -159,7 +159,7 @@ def test_the_command_tells_the_most_critical(data, tmp_path, capsys):
     ]
 
 
-def test_other_commands_take_the_subset_and_its_scores(data, tmp_path, capsys):
+def test_other_commands_accept_the_subset_and_its_scores(data, tmp_path, capsys):
     top = tmp_path / "top"
     begin = ["curate", "kinematic", "--data", str(data.path), "--out", str(tmp_path / "scores.npz")]
     assert main([*begin, "--export", str(top), "3"]) == 0
@@ -178,13 +178,21 @@ def test_other_commands_take_the_subset_and_its_scores(data, tmp_path, capsys):
     assert (
         main(["curate", "kinematic", "--data", str(top), "--out", str(again), "--overwrite", *best_of]) == 0
     )
-    lot = ["--like", str(own), "--out", str(tmp_path / "lot.npz"), "--export", str(tmp_path / "drawn"), "2"]
-    assert main(["curate", "random_matched", "--data", str(top), *lot]) == 0
+    control = [
+        "--like",
+        str(own),
+        "--out",
+        str(tmp_path / "control.npz"),
+        "--export",
+        str(tmp_path / "drawn"),
+        "2",
+    ]
+    assert main(["curate", "random_matched", "--data", str(top), *control]) == 0
     drawn = ScenarioSet.open(tmp_path / "drawn")
     assert read_scores(tmp_path / "drawn" / "scores.npz", drawn).method == "random_matched"
 
 
-def test_the_subset_can_be_driven(data, tmp_path):
+def test_subset_can_be_evaluated(data, tmp_path):
     top, run = tmp_path / "top", tmp_path / "run"
     write_top(hand_made(data, [0.8, 0.9, 0.1, 0.3, 0.7, 0.6]), data, 2, top)
     drive = ["evaluate", "--planner", "constant_velocity", "--data", str(top), "--out", str(run)]

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from drivax.curation.controls import matched
+from drivax.curation.controls import permute_scores
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import PUBLISHED, WeightConfig, draws_of, weights_of
+from drivax.curation.weights import PUBLISHED, WeightConfig, draw_statistics, sampling_weights
 from drivax.errors import UsageError
 from drivax.stats.intervals import effective_size
 
 RNG = np.random.default_rng(1)
 
 
-def table_of(steps, valid=None, scenarios=None):
+def make_table(steps, valid=None, scenarios=None):
     steps = np.asarray(steps, np.float64)
     valid = np.ones(steps.shape, bool) if valid is None else valid
     ids = tuple(map(str, range(len(steps))))
@@ -26,16 +26,16 @@ def plain(**given):
     )
 
 
-TABLE = table_of(RNG.permutation(2000 * 51).reshape(2000, 51) / (2000 * 51))
-DRAWN = TABLE.drawn
+TABLE = make_table(RNG.permutation(2000 * 51).reshape(2000, 51) / (2000 * 51))
+DRAWN = TABLE.drawable
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.5, 2.0])
 def test_quantiles_to_a_power(temperature):
     """Of u uniform in (0, 1), u^k has mean 1/(k+1) and mean square 1/(2k+1): an effective share of (2k+1)/(k+1)^2."""
     k = 1 / temperature
-    weights = weights_of(TABLE, plain(normalise="quantile", temperature=temperature), "step")
-    found = draws_of(weights, DRAWN)
+    weights = sampling_weights(TABLE, plain(normalise="quantile", temperature=temperature), "step")
+    found = draw_statistics(weights, DRAWN)
     assert found.effective == pytest.approx((2 * k + 1) / (k + 1) ** 2, rel=1e-3)
     assert found.tilt == pytest.approx((k + 1) * 0.99**k, rel=1e-2)
     assert found.largest == pytest.approx(k + 1, rel=1e-2)
@@ -45,31 +45,34 @@ def test_quantiles_to_a_power(temperature):
 def test_mixture_with_uniform():
     """(1 - m) w + m has the variance (1 - m)^2 var(w), so 1 / effective share - 1 shrinks by that factor."""
     before, after = (
-        effective_size(weights_of(TABLE, plain(uniform=m), "step")[DRAWN]) / DRAWN.sum() for m in (0.0, 0.3)
+        effective_size(sampling_weights(TABLE, plain(uniform=m), "step")[DRAWN]) / DRAWN.sum()
+        for m in (0.0, 0.3)
     )
     assert 1 / after - 1 == pytest.approx(0.7**2 * (1 / before - 1), rel=1e-6)
-    assert (weights_of(TABLE, plain(uniform=1.0), "step")[DRAWN] == 1.0).all()
+    assert (sampling_weights(TABLE, plain(uniform=1.0), "step")[DRAWN] == 1.0).all()
 
 
 def test_clipping_and_floor():
-    table = table_of([[0.0, 0.1, 0.1, 0.8, 1.0]])  # the last step leads nowhere
-    np.testing.assert_allclose(weights_of(table, plain(), "step")[0], np.array([0, 0.1, 0.1, 0.8, 0]) / 0.25)
+    table = make_table([[0.0, 0.1, 0.1, 0.8, 1.0]])  # the last step leads nowhere
+    np.testing.assert_allclose(
+        sampling_weights(table, plain(), "step")[0], np.array([0, 0.1, 0.1, 0.8, 0]) / 0.25
+    )
     # 0.8 becomes c = 2 (0 + 0.1 + 0.1 + c) / 4 = 0.2
     clipped = np.array([0.0, 0.1, 0.1, 0.2]) / 0.1
-    np.testing.assert_allclose(weights_of(table, plain(most=2.0), "step")[0, :4], clipped)
+    np.testing.assert_allclose(sampling_weights(table, plain(most=2.0), "step")[0, :4], clipped)
     floored = np.array([0.2, 0.3, 0.3, 1.0]) / 0.45
-    np.testing.assert_allclose(weights_of(table, plain(floor=0.2), "step")[0, :4], floored)
+    np.testing.assert_allclose(sampling_weights(table, plain(floor=0.2), "step")[0, :4], floored)
 
 
 @pytest.mark.parametrize("most", [1.1, 2.0, 10.0])
-def test_no_weight_is_more_than_the_clip(most):
+def test_clip_bounds_all_weights(most):
     """However heavy the tail; the others keep their proportions, and no more is clipped than has to be."""
     rng = np.random.default_rng(0)
     for power in (0.5, 1.0, 4.0):
         score = rng.uniform(0.001, 1.0, (20, 11)) ** power
-        table = table_of(score)
-        weight = weights_of(table, plain(most=most, temperature=0.2), "step")[table.drawn]
-        raw = score[table.drawn] ** 5.0
+        table = make_table(score)
+        weight = sampling_weights(table, plain(most=most, temperature=0.2), "step")[table.drawable]
+        raw = score[table.drawable] ** 5.0
         assert weight.max() == pytest.approx(min(most, raw.max() / raw.mean()))
         below = weight < weight.max() * (1.0 - 1e-9)
         ratio = weight[below] / raw[below]
@@ -77,9 +80,9 @@ def test_no_weight_is_more_than_the_clip(most):
         assert (weight[~below] <= raw[~below] * ratio[0] * (1.0 + 1e-9)).all()
 
 
-def test_a_clip_that_too_few_steps_can_keep():
-    table = table_of([[0.0, 0.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(weights_of(table, plain(most=2.0), "step")[0, :4], [0, 0, 0, 8])
+def test_clip_with_too_few_positive_scores():
+    table = make_table([[0.0, 0.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(sampling_weights(table, plain(most=2.0), "step")[0, :4], [0, 0, 0, 8])
 
 
 @pytest.mark.parametrize(
@@ -87,53 +90,53 @@ def test_a_clip_that_too_few_steps_can_keep():
     [(0.2835, 0.1712, 0.746), (0.0104, 0.0062, 0.915)],
     ids=["heuristic", "rarity"],
 )
-def test_published_weights_tilt_as_the_study_says(mean, deviation, share):
+def test_published_weights_have_the_published_tilt(mean, deviation, share):
     """Scores of a mean and deviation, drawn with 0.01 on top (the study's own statistics of its scores)."""
-    table = table_of(np.resize((mean - deviation, mean + deviation), (40, 51)))
-    weights = weights_of(table, PUBLISHED, "step")
-    assert effective_size(weights[table.drawn]) / table.drawn.sum() == pytest.approx(share, abs=1e-3)
+    table = make_table(np.resize((mean - deviation, mean + deviation), (40, 51)))
+    weights = sampling_weights(table, PUBLISHED, "step")
+    assert effective_size(weights[table.drawable]) / table.drawable.sum() == pytest.approx(share, abs=1e-3)
 
 
 def test_equal_scores_are_uniform_at_either_scale():
-    table = table_of(np.full((3, 9), 0.3))
+    table = make_table(np.full((3, 9), 0.3))
     for scale in ("step", "scenario"):
-        weights = weights_of(table, WeightConfig(), scale)
+        weights = sampling_weights(table, WeightConfig(), scale)
         np.testing.assert_allclose(weights[:, :-1], 1.0)
         assert (weights[:, -1] == 0).all()
-        found = draws_of(weights, table.drawn)
+        found = draw_statistics(weights, table.drawable)
         assert (found.effective, found.effective_scenarios) == (pytest.approx(1.0), pytest.approx(1.0))
 
 
 def test_steps_of_a_scenario_share_its_weight():
     valid = np.ones((3, 6), bool)
     valid[1, 4:] = False
-    table = table_of(RNG.random((3, 6)), valid, scenarios=[0.1, 0.2, 0.6])
-    weights = weights_of(table, plain(), "scenario")
-    drawn = table.drawn
+    table = make_table(RNG.random((3, 6)), valid, scenarios=[0.1, 0.2, 0.6])
+    weights = sampling_weights(table, plain(), "scenario")
+    drawn = table.drawable
     assert drawn.sum(axis=1).tolist() == [5, 3, 5]
     mean = (5 * 0.1 + 3 * 0.2 + 5 * 0.6) / 13
     np.testing.assert_allclose(weights, np.where(drawn, np.array([[0.1], [0.2], [0.6]]) / mean, 0.0))
 
 
 @pytest.mark.parametrize("scale", ["step", "scenario"])
-def test_weights_are_global_and_of_mean_one_and_zero_where_ego_is_not(scale):
+def test_weights_have_mean_one_and_are_zero_without_ego(scale):
     valid = RNG.random((30, 20)) < 0.8
-    table = table_of(RNG.random((30, 20)) ** 4, valid)
-    weights, drawn = weights_of(table, WeightConfig(), scale), table.drawn
+    table = make_table(RNG.random((30, 20)) ** 4, valid)
+    weights, drawn = sampling_weights(table, WeightConfig(), scale), table.drawable
     assert weights.shape == valid.shape and weights[drawn].mean() == pytest.approx(1.0)
     assert (weights[~drawn] == 0).all() and (weights[drawn] > 0).all() and not drawn[~valid].any()
 
 
-def test_a_low_temperature_neither_overflows_nor_vanishes():
-    weights = weights_of(table_of([[0.1, 0.2, 0.4, 0.4]]), plain(temperature=1e-3), "step")
+def test_low_temperature_is_stable():
+    weights = sampling_weights(make_table([[0.1, 0.2, 0.4, 0.4]]), plain(temperature=1e-3), "step")
     np.testing.assert_allclose(weights, [[0.0, 0.0, 3.0, 0.0]], atol=1e-12)
 
 
 def test_one_step_with_all_the_weight():
     one = np.zeros((4, 26))
     one[2, 3] = 1.0
-    found = draws_of(
-        weights_of(table_of(one), plain(), "step"), np.pad(np.ones((4, 25), bool), ((0, 0), (0, 1)))
+    found = draw_statistics(
+        sampling_weights(make_table(one), plain(), "step"), np.pad(np.ones((4, 25), bool), ((0, 0), (0, 1)))
     )
     assert (found.effective, found.effective_scenarios) == (pytest.approx(0.01), pytest.approx(0.25))
     assert (found.largest, found.concentration) == (pytest.approx(100.0), pytest.approx(1.0))
@@ -143,63 +146,65 @@ def test_one_step_with_all_the_weight():
     "config", [WeightConfig(), PUBLISHED, plain(temperature=0.3)], ids=["ours", "published", "sharp"]
 )
 @pytest.mark.parametrize("scale", ["step", "scenario"])
-def test_matched_random_weights_prefer_nothing_and_are_spread_alike(config, scale):
-    """Over all steps, and over scenarios too: critical steps lie together, and so do those of the lot."""
-    table = table_of(np.clip(RNG.random((500, 1)) ** 3 + 0.1 * RNG.random((500, 41)), 0, 1))
-    lot = matched(table, seed=7)
-    drawn = table.drawn
-    own, other = (weights_of(one, config, scale) for one in (table, lot))
+def test_permuted_scores_keep_the_distribution_of_weights(config, scale):
+    """Over all steps, and over scenarios too: critical steps lie together, and so do those of the control."""
+    table = make_table(np.clip(RNG.random((500, 1)) ** 3 + 0.1 * RNG.random((500, 41)), 0, 1))
+    control = permute_scores(table, seed=7)
+    drawn = table.drawable
+    own, other = (sampling_weights(one, config, scale) for one in (table, control))
     np.testing.assert_allclose(np.sort(own[drawn]), np.sort(other[drawn]))
-    one, two = draws_of(own, drawn), draws_of(other, drawn)
+    one, two = draw_statistics(own, drawn), draw_statistics(other, drawn)
     assert one.effective == pytest.approx(two.effective, rel=1e-9)
     assert one.effective_scenarios == pytest.approx(two.effective_scenarios, rel=1e-9) and one.effective < 0.8
     # Of 500 scenarios: a standard error of 0.045.
     assert abs(np.corrcoef(own[drawn], other[drawn])[0, 1]) < 0.14
-    np.testing.assert_array_equal(matched(table, seed=7).steps, lot.steps)
-    assert not np.array_equal(matched(table, seed=8).steps, lot.steps)
-    assert lot.config["like"] == "made" and not lot.components
+    np.testing.assert_array_equal(permute_scores(table, seed=7).steps, control.steps)
+    assert not np.array_equal(permute_scores(table, seed=8).steps, control.steps)
+    assert control.config["like"] == "made" and not control.components
 
 
-def test_a_lot_prefers_no_time_of_a_scenario_either():
-    late = table_of(np.tile(np.linspace(0.0, 1.0, 41), (2000, 1)))
-    lot = matched(late, seed=0)
-    by_step = lot.steps[:, :-1].mean(axis=0)
+def test_permuted_scores_are_uniform_over_time():
+    late = make_table(np.tile(np.linspace(0.0, 1.0, 41), (2000, 1)))
+    control = permute_scores(late, seed=0)
+    by_step = control.steps[:, :-1].mean(axis=0)
     # Of 2,000 values that are uniform to 0.975: a standard error of 0.0063.
     np.testing.assert_allclose(by_step, late.steps[0, :-1].mean(), atol=0.03)
 
 
-def test_a_lot_among_scenarios_of_unequal_length():
+def test_permuted_scores_of_scenarios_of_unequal_length():
     valid = np.ones((40, 21), bool)
     valid[::2, 11:] = False
     valid[5] = False
-    table = table_of(np.arange(40.0)[:, None] / 40 + np.zeros(21), valid)
-    lot = matched(table, seed=1)
-    drawn = table.drawn
+    table = make_table(np.arange(40.0)[:, None] / 40 + np.zeros(21), valid)
+    control = permute_scores(table, seed=1)
+    drawn = table.drawable
     for row in np.flatnonzero(drawn.any(axis=1)):
-        assert len({*lot.steps[row, drawn[row]], lot.scenarios[row]}) == 1  # all of one other scenario
-    assert sorted(lot.scenarios) == sorted(table.scenarios) and not lot.steps[5].any()
+        assert (
+            len({*control.steps[row, drawn[row]], control.scenarios[row]}) == 1
+        )  # all of one other scenario
+    assert sorted(control.scenarios) == sorted(table.scenarios) and not control.steps[5].any()
 
 
-def test_weights_of_the_steps_that_a_training_can_use():
+def test_weights_are_zero_on_unusable_steps():
     """Ranks, mean and effective size are over these alone."""
     usable = DRAWN & (RNG.random(DRAWN.shape) < 0.5)
-    weights = weights_of(TABLE, plain(normalise="quantile"), "step", usable)
+    weights = sampling_weights(TABLE, plain(normalise="quantile"), "step", usable)
     assert (weights[~usable] == 0).all() and weights[usable].mean() == pytest.approx(1.0)
     order = np.argsort(TABLE.steps[usable])
     count = usable.sum()
     np.testing.assert_allclose(weights[usable][order], (np.arange(count) + 0.5) / count * 2)
-    assert draws_of(weights, usable).effective == pytest.approx(0.75, rel=1e-3)
+    assert draw_statistics(weights, usable).effective == pytest.approx(0.75, rel=1e-3)
 
 
 @pytest.mark.parametrize("config", [WeightConfig(), plain(most=1.5), PUBLISHED])
-def test_a_scenario_counts_as_often_as_its_steps_are_drawn(config):
+def test_scenario_ranks_count_drawable_steps(config):
     """The same as weighing every step by its scenario's score, one by one."""
-    table = table_of(RNG.random((60, 41)), scenarios=RNG.random(60) ** 4)
-    usable = table.drawn & (np.arange(41) < RNG.integers(0, 41, 60)[:, None])
+    table = make_table(RNG.random((60, 41)), scenarios=RNG.random(60) ** 4)
+    usable = table.drawable & (np.arange(41) < RNG.integers(0, 41, 60)[:, None])
     usable[np.argsort(table.scenarios)[-20:]] &= np.arange(41) == 0  # the most critical have one step each
-    weights = weights_of(table, config, "scenario", usable)
-    every = table_of(np.broadcast_to(table.scenarios[:, None], (60, 41)))
-    np.testing.assert_allclose(weights, weights_of(every, config, "step", usable), rtol=1e-9)
+    weights = sampling_weights(table, config, "scenario", usable)
+    every = make_table(np.broadcast_to(table.scenarios[:, None], (60, 41)))
+    np.testing.assert_allclose(weights, sampling_weights(every, config, "step", usable), rtol=1e-9)
     assert weights.max() < config.most * (1 + 1e-9)
 
 
@@ -212,13 +217,13 @@ def test_a_scenario_counts_as_often_as_its_steps_are_drawn(config):
         ({"uniform": 1.1}, "uniform is 1.1"),
     ],
 )
-def test_what_cannot_be_meant(given, words):
+def test_invalid_arguments_are_refused(given, words):
     with pytest.raises(UsageError, match=words):
         WeightConfig(**given)
 
 
-def test_no_weight_is_an_error():
+def test_zero_weights_are_refused():
     with pytest.raises(UsageError, match="every score is 0"):
-        weights_of(table_of(np.zeros((2, 5))), plain(), "step")
+        sampling_weights(make_table(np.zeros((2, 5))), plain(), "step")
     with pytest.raises(UsageError, match="no step that can be drawn"):
-        weights_of(table_of(np.ones((2, 5)), np.arange(5) % 2 * np.ones((2, 1)) > 0), plain(), "step")
+        sampling_weights(make_table(np.ones((2, 5)), np.arange(5) % 2 * np.ones((2, 1)) > 0), plain(), "step")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.evaluation.results import ADDED, KEYS
+from drivax.evaluation.episode_table import ADDED, KEYS
 from drivax.metrics.catalogue import METRICS
 from drivax.scenario.store import ScenarioSet
 from drivax.studies import bench
@@ -233,7 +233,7 @@ def test_report(evaluation, data):
         (["--planner", "idm", "--data", "SET", "--out", "OLD"], ["--overwrite"], 2),
         (["--planner", "idm", "--data", "SET", "--out", "NEW", "--start-step", "90"], ["90"], 2),
         (["--planner", "idm", "--data", "SET", "--out", "NEW", "--limit", "0"], ["--limit 0"], 2),
-        (["--planner", "SET", "--data", "SET", "--out", "NEW"], ["no run folder"], 1),
+        (["--planner", "SET", "--data", "SET", "--out", "NEW"], ["not a run folder"], 1),
         (
             ["--planner", "idm", "--data", "SET", "--out", "NEW", "--filter", "type=juncton"],
             ["'junction'"],

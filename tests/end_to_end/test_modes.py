@@ -60,8 +60,8 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
     assert (away > 0.01).all(), "a second of wrong driving leads elsewhere than the log"
     options = {"start": NoisyStart(), "start_step": START, "seed": 7, "metrics": ("own_terms:nearest_other",)}
     found = drivax.evaluate(planner, data, sample=True, **options)
-    np.testing.assert_array_equal(found.motion.astype(np.float32), sampled["ego"])
-    assert list(found.own) == ["nearest_other"]
+    np.testing.assert_array_equal(found.trajectories.ego, sampled["ego"])
+    assert list(found.own_metrics) == ["nearest_other"]
     with pytest.raises(UsageError, match="only a policy by name can sample"):
         drivax.evaluate(find_planner(planner, load(data).bank)[0], data, sample=True)
     (out / "crashes.json").write_text("[]")
@@ -77,7 +77,9 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("planner", ["idm", "pdm", "search", "random", "zoo:aggressive"])
+@pytest.mark.parametrize(
+    "planner", ["idm", "pdm", "search_planner:SearchPlanner", "random", "zoo:aggressive"]
+)
 def test_thread_count_does_not_change_results(data, planner, tmp_path):
     """XLA's pool has a thread per core unless NPROC says otherwise, which it reads once per process."""
     found = []
@@ -86,7 +88,7 @@ def test_thread_count_does_not_change_results(data, planner, tmp_path):
         call = ["evaluate", "--planner", planner, "--data", str(data), "--out", str(out), "--traffic", "idm"]
         subprocess.run(
             [sys.executable, "-m", "drivax", *call],
-            env=os.environ | {"NPROC": threads},
+            env=os.environ | {"NPROC": threads, "PYTHONPATH": os.pathsep.join(sys.path)},
             check=True,
             timeout=900,
         )

@@ -13,8 +13,8 @@ import scipy.stats
 from drivax import settings
 from drivax.errors import UsageError
 from drivax.evaluation.comparison import compare
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.stored import EpisodeTable, read_evaluation, read_seeds
 from drivax.stats.effects import power, scenarios_needed
 from drivax.stats.intervals import paired_bootstrap, rate
 from drivax.stats.significance import holm, mcnemar, paired_permutation
@@ -132,9 +132,9 @@ def test_recordings_of_several_scenarios_take_more_of_them():
     assert 3 < seen.design_effect <= 4.5 and seen.needed > 3 * 787
 
 
-def test_planners_that_are_alike():
+def test_equal_planners_give_no_difference():
     found = compare(PLAN, [table("one")], [table("two")])
-    assert (found.decision.recommendation, found.decision.because) == ("no difference", "alike")
+    assert (found.decision.recommendation, found.decision.because) == ("no difference", "equal")
     assert found.primary.evidence.p == 1.0 and found.sensitivity is None
 
 
@@ -212,7 +212,7 @@ def test_seeds_that_differ_decide_nothing_however_many_scenarios():
     assert found.primary.a.low < found.primary.a.mean < found.primary.a.high
 
 
-def test_seeds_that_agree_are_told_apart_or_said_to_be_alike():
+def test_seeds_that_agree_give_a_winner_or_no_difference():
     others = seeds_of(0.0, 0.0, 0.0, folder="runs/other", first=9)
     assert compare(PLAN, seeds_of(0.3, 0.3, 0.3), others).decision.recommendation == "A"
     plan = dataclasses.replace(PLAN, smallest_difference=0.5)
@@ -221,7 +221,7 @@ def test_seeds_that_agree_are_told_apart_or_said_to_be_alike():
     assert found.sensitivity.needed == N
 
 
-def test_seeds_that_differ_alike_everywhere_ask_for_seeds():
+def test_seeds_that_differ_equally_everywhere_need_more_seeds():
     rows = [np.ones(N), np.zeros(N)]
     seeds = [table(f"seed-{n}", vmax_score=row) for n, row in enumerate(rows)]
     found = compare(PLAN, seeds, [table("two", vmax_score=np.zeros(N))])
@@ -230,7 +230,7 @@ def test_seeds_that_differ_alike_everywhere_ask_for_seeds():
     same = compare(
         PLAN, [table(f"seed-{n}", vmax_score=rows[0]) for n in range(2)], [table("two", vmax_score=rows[0])]
     )
-    assert (same.decision.recommendation, same.decision.because) == ("no difference", "alike")
+    assert (same.decision.recommendation, same.decision.because) == ("no difference", "equal")
 
 
 def test_seeds_on_one_recording_tell_nothing():
@@ -256,8 +256,8 @@ def test_everything_is_plain_json():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"about": {"data": {"hash": "other"}}}, "different scenario sets"),
-        ({"about": {"traffic": "idm"}}, "different traffic (log and idm)"),
+        ({"about": {"data": {"hash": "other"}}}, "differ in scenario set"),
+        ({"about": {"traffic": "idm"}}, "differ in traffic (log and idm)"),
         ({"rows": range(N, 2 * N)}, "no scenario in common"),
         ({"vmax_score": np.full(N, np.nan)}, "in no common scenario"),
         ({"vmax_score": np.full(N, np.nan), "vmax_score_partial": np.ones(N)}, "every vmax_score is partial"),
@@ -274,8 +274,8 @@ def test_what_cannot_be_compared_is_refused(change, words):
     ("change", "words"),
     [
         ({"primary": "vmaxscore"}, "has no metric 'vmaxscore'; did you mean 'vmax_score'?"),
-        ({"secondary": ("steps",)}, "no mean of steps"),
-        ({"primary": "vmax_score_partial"}, "made up differently"),
+        ({"secondary": ("steps",)}, "steps is a code or count without a mean"),
+        ({"primary": "vmax_score_partial"}, "combines different inputs"),
         ({"primary": "ade"}, "neither better high nor low"),
         ({"split": "stratified"}, "--data"),
         ({"split": "random", "ratio": 0.999}, "leave an arm empty"),
@@ -329,21 +329,21 @@ def written(folder, lines, about='{"kind": "evaluation", "planner": "p"}'):
 
 def test_runs_are_read_back_and_damage_is_named(tmp_path):
     run = written(tmp_path / "run", ["p,d,s1,,0,log,1", "p,d,s1,,1,log,0", "p,d,s2,r,0,log,"])
-    found = read_evaluation(run)
+    found = EpisodeTable.read(run)
     assert found.by_scenario("success")["d", "s1"] == 0.5 and np.isnan(
         found.by_scenario("success")["d", "s2"]
     )
     assert found.clusters == ["d/s1", "d/s1", "d/r"]
     bad = written(tmp_path / "nan", ["p,d,s1,,0,log,nan"])
     with pytest.raises(Exception, match="record 1: success is NaN"):
-        read_evaluation(bad)
+        EpisodeTable.read(bad)
     with pytest.raises(Exception, match="of kind 'training', not evaluation"):
-        read_evaluation(written(tmp_path / "train", [], '{"kind": "training"}'))
+        EpisodeTable.read(written(tmp_path / "train", [], '{"kind": "training"}'))
     for seed in range(2):
         written(tmp_path / "seeds" / f"seed-{seed}", [f"seed-{seed},d,s1,,0,log,1"])
-    assert len(read_seeds(tmp_path / "seeds")) == 2 and len(read_seeds(run)) == 1
-    with pytest.raises(Exception, match="there is no such run folder"):
-        read_seeds(tmp_path / "nowhere")
+    assert len(EpisodeTable.read_seeds(tmp_path / "seeds")) == 2 and len(EpisodeTable.read_seeds(run)) == 1
+    with pytest.raises(Exception, match="run folder not found"):
+        EpisodeTable.read_seeds(tmp_path / "nowhere")
 
 
 def test_other_starts_are_refused(tmp_path):
@@ -351,4 +351,4 @@ def test_other_starts_are_refused(tmp_path):
     (a / "config.yaml").write_text("noisy_start: true\nstart_step: 10\n")
     (b / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
     with pytest.raises(UsageError, match=r"differ in noisy_start \(True and False\)"):
-        compare(PLAN, [read_evaluation(a)], [read_evaluation(b)])
+        compare(PLAN, [EpisodeTable.read(a)], [EpisodeTable.read(b)])

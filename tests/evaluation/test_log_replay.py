@@ -1,4 +1,4 @@
-"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays beside it.
+"""Log replay: the exact expert never diverges, collides or leaves the road; the driven expert stays next to it.
 
 Six generated logs do so in every quick run (``tests/simulator/test_simulator.py``).
 """

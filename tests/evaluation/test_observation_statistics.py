@@ -58,7 +58,7 @@ TASK = Task(
 
 @pytest.fixture(scope="module")
 def bank():
-    """One scenario in which ego at 9 m/s meets a standing car, two in which nobody is on its lane."""
+    """One scenario in which ego at 9 m/s meets a standing car, two in which no agent is on its lane."""
     standing = car(STARE_M, 0, 0, 0)
     scenes = [[car(0, 0, 0, 9), standing], *([car(0, 0, 0, 9), car(-20 - k, 3.7, 0, 5)] for k in range(2))]
     return bank_of(*(replace(straight_road(cars), scenario_id=f"s{k}") for k, cars in enumerate(scenes)))
@@ -142,7 +142,7 @@ def test_a_planner_of_another_action_space_is_refused(bank):
 
 
 def test_columns_of_observations_made_by_hand():
-    """Two episodes of three looks at one row that is there or not; the second one hits somebody at its last look."""
+    """Two episodes of three looks at one row that is there or not; the second one hits an agent at its last look."""
     rows = np.arange(12.0).reshape(2, 3, 1, 2)
     mask = np.array([[[True], [True], [False]], [[True], [True], [True]]])
     rows[0, 1, 0, 1], rows[0, 2, 0, 1], rows[1, 0, 0, 1] = np.nan, np.inf, -np.inf
@@ -169,7 +169,7 @@ def test_correlation_is_scipys_point_biserial():
     collides = rng.random(40) < 0.4
     values = rng.normal(size=(40, 6, 3)) + 0.8 * collides[:, None, None]
     valid = rng.random(values.shape) < 0.6
-    valid[3] = False  # nobody is there in the whole episode
+    valid[3] = False  # no agent is there in the whole episode
     values[7, 2, 1] = np.nan
     means = [values[k][valid[k] & np.isfinite(values[k])].mean() for k in range(40) if k != 3]
     wanted = stats.pointbiserialr(np.delete(collides, 3), means).statistic

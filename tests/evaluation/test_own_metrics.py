@@ -21,7 +21,7 @@ from scenes import SMALL, bank_of, car, straight_road
 
 @pytest.mark.slow
 def test_an_own_metric_is_a_column_with_unit_and_direction(tmp_path):
-    """Row 0: a car stands 30 m ahead of a standing ego. Row 1: nobody else, so it is undefined."""
+    """Row 0: a car stands 30 m ahead of a standing ego. Row 1: no other agent, so it is undefined."""
     worlds = straight_road([car(), car(x=30.0)]), replace(straight_road([car()]), scenario_id="alone")
     with ScenarioWriter(tmp_path / "set", SMALL) as writer:
         for world in worlds:

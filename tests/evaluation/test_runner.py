@@ -11,10 +11,9 @@ import drivax
 from drivax.api import load
 from drivax.errors import DataError, UsageError
 from drivax.evaluation.audit import audit, scenario_names
-from drivax.evaluation.results import ADDED, FAILED, KEYS, with_crashes
+from drivax.evaluation.episode_table import ADDED, FAILED, KEYS, Crash, EpisodeTable, fail_crashed
 from drivax.evaluation.run_evaluation import format_crashes
-from drivax.evaluation.runner import evaluate, evaluate_in, evaluate_scenarios
-from drivax.evaluation.stored import EpisodeTable, read_episodes, read_evaluation
+from drivax.evaluation.runner import evaluate
 from drivax.evaluation.tables import paired_difference, paired_differences, summarise
 from drivax.metrics.catalogue import METRICS
 from drivax.planners.simple import Expert
@@ -22,7 +21,6 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioWriter
-from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.actions import PUBLISHED
@@ -31,8 +29,6 @@ from own_drivers import fragile, plain
 from scenes import SMALL, bank_of, car, straight_road
 
 COUNT = 9
-#: Every chance there is: the starts, and what the planner draws.
-NOISY = Simulator(Task(), start=NoisyStart())
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +46,9 @@ def driven(data):
     """Drives some of the scenarios, all of them in one program."""
 
     def drive(some, planner=None, batch=4, seed=0):
-        return evaluate_scenarios(NOISY, planner or fragile(), some, batch=batch, seed=seed, sizes=data.sizes)
+        return evaluate(
+            planner or fragile(), some, start=NoisyStart(), batch=batch, seed=seed, sizes=data.sizes
+        )
 
     return drive
 
@@ -65,7 +63,8 @@ def by_scenario(results):
     names = [row["scenario_id"] for row in rows]
     assert len(set(names)) == len(rows)
     return {
-        name: (row, motion.tobytes()) for name, row, motion in zip(names, rows, results.motion, strict=True)
+        name: (row, motion.tobytes())
+        for name, row, motion in zip(names, rows, results.trajectories.ego, strict=True)
     }
 
 
@@ -81,12 +80,17 @@ def test_neither_batches_nor_order_nor_company_change_an_episode(scenarios, whol
     assert some == {name: expected[name] for name in some} and len(some) == 3
     assert by_scenario(driven(scenarios, seed=1)) != expected
     copies = driven([scenarios[0], scenarios[0]], batch=1)
-    assert copies.motion[0].tobytes() == expected[scenarios[0].id][1] != copies.motion[1].tobytes()
+    assert (
+        copies.trajectories.ego[0].tobytes()
+        == expected[scenarios[0].id][1]
+        != copies.trajectories.ego[1].tobytes()
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "planner", ["expert", "constant_velocity", "idm", "random", "pdm", "search", "zoo:aggressive"]
+    "planner",
+    ["expert", "constant_velocity", "idm", "random", "pdm", "search_planner:SearchPlanner", "zoo:aggressive"],
 )
 def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
     with ScenarioWriter(tmp_path / "set", scenarios[0].capacity) as writer:
@@ -101,20 +105,22 @@ def test_nor_do_they_with_our_planners_in_a_set(scenarios, planner, tmp_path):
 
 def test_actions_are_what_moved_the_car(whole):
     """The first number is a share of 6 m/s2, for a tenth of a second."""
-    assert whole.actions.shape == (COUNT, 80, 2) and np.abs(whole.actions).max() <= 1
-    before, after = whole.motion[:, :-1, 3], whole.motion[:, 1:, 3]
+    assert whole.trajectories.action.shape == (COUNT, 80, 2) and np.abs(whole.trajectories.action).max() <= 1
+    before, after = whole.trajectories.ego[:, :-1, 3], whole.trajectories.ego[:, 1:, 3]
     drives = after > 0.01
     assert drives.mean() > 0.5
-    np.testing.assert_allclose((after - before)[drives], 0.6 * whole.actions[..., 0][drives], atol=1e-4)
+    np.testing.assert_allclose(
+        (after - before)[drives], 0.6 * whole.trajectories.action[..., 0][drives], atol=1e-4
+    )
     assert whole.rows()[0]["action_jerk"] == f"{whole.metrics['action_jerk'][0]:.6g}" != "0"
 
 
 def test_every_planner_has_the_same_noisy_starts(scenarios, whole, driven):
     other = driven(scenarios[2:6], fragile(share=0.0))
-    np.testing.assert_array_equal(other.motion[:, 0], whole.motion[2:6, 0])
-    assert (other.motion[:, -1] != whole.motion[2:6, -1]).any(axis=1).all()
+    np.testing.assert_array_equal(other.trajectories.ego[:, 0], whole.trajectories.ego[2:6, 0])
+    assert (other.trajectories.ego[:, -1] != whole.trajectories.ego[2:6, -1]).any(axis=1).all()
     again = driven(scenarios[2:6], fragile(share=0.0), seed=1)
-    assert (other.motion[:, 0] != again.motion[:, 0]).any()
+    assert (other.trajectories.ego[:, 0] != again.trajectories.ego[:, 0]).any()
 
 
 @pytest.fixture(scope="module")
@@ -123,21 +129,24 @@ def crashed(scenarios, data, driven):
 
 
 def test_a_crash_is_a_failed_episode_and_no_other_changes(scenarios, whole, crashed):
-    assert [(crash.row, crash.step, crash.error) for crash in crashed.crashes] == [
-        (3, 40, "action is not finite")
-    ]
+    assert crashed.crashes == (Crash("drivax", scenarios[3].id, 40, "action is not finite"),)
     before, after = by_scenario(whole), by_scenario(crashed)
     assert {name for name in before if before[name] != after[name]} == {scenarios[3].id}
-    np.testing.assert_array_equal(crashed.motion[3, :31], whole.motion[3, :31])
-    assert (crashed.motion[3, 31:] == crashed.motion[3, 30]).all(), "nobody drives it any more"
-    np.testing.assert_array_equal(crashed.actions[3, :30], whole.actions[3, :30])
-    assert np.isnan(crashed.actions[3, 30:]).all() and np.isfinite(crashed.actions[4:]).all()
+    np.testing.assert_array_equal(crashed.trajectories.ego[3, :31], whole.trajectories.ego[3, :31])
+    assert (crashed.trajectories.ego[3, 31:] == crashed.trajectories.ego[3, 30]).all(), (
+        "nobody drives it any more"
+    )
+    np.testing.assert_array_equal(crashed.trajectories.action[3, :30], whole.trajectories.action[3, :30])
+    assert (
+        np.isnan(crashed.trajectories.action[3, 30:]).all()
+        and np.isfinite(crashed.trajectories.action[4:]).all()
+    )
     row, sound = after[scenarios[3].id][0], before[scenarios[3].id][0]
     assert row["crashed"] == "1" and sound["crashed"] == "0"
     for name in FAILED:
         assert row[name] == ("0" if sound[name] != "" else ""), name
     # The rest is what was measured in the 30 steps until then.
-    moved = np.hypot(*np.diff(whole.motion[3, :31, :2], axis=0).T).sum()
+    moved = np.hypot(*np.diff(whole.trajectories.ego[3, :31, :2], axis=0).T).sum()
     assert float(row["distance"]) == pytest.approx(moved, abs=0.05) and row["steps"] == "30"
     assert 0 < float(row["progress_ratio"]) < float(sound["progress_ratio"])
     assert row["vmax_score"] == "0" and row["success"] == "0"
@@ -157,9 +166,10 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
     with (tmp_path / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [*KEYS, *METRICS, *ADDED]
-    keys, metrics = read_episodes(tmp_path)
-    assert keys["scenario_id"][3] == scenarios[3].id
-    assert metrics["crashed"].tolist() == [float(row == 3) for row in range(COUNT)]
+    (tmp_path / "run.json").write_text('{"kind": "evaluation", "planner": "fragile"}')
+    stored = EpisodeTable.read(tmp_path)
+    assert stored.crashes == crashed.crashes and stored.keys == crashed.keys
+    assert stored.metrics["crashed"].tolist() == [float(row == 3) for row in range(COUNT)]
     said = format_crashes(crashed).splitlines()
     assert said == [
         "fragile crashed in 1 of 9 episodes, which count as failed:",
@@ -168,21 +178,24 @@ def test_a_crash_is_named(scenarios, crashed, whole, tmp_path):
     assert format_crashes(whole) == ""
     same = paired_differences(crashed, whole, "success")
     assert same.n == COUNT and same.mean <= 0
-    assert same == paired_difference(EpisodeTable.of(crashed), EpisodeTable.of(whole), "success")
-    elsewhere = [row | {"dataset": "other"} for row in whole.scenarios]
-    with pytest.raises(UsageError, match="different scenarios"):
-        paired_differences(crashed, replace(whole, scenarios=elsewhere), "success")
+    assert same == paired_difference(crashed, whole, "success")
+    elsewhere = dict(whole.keys) | {"dataset": ("other",) * COUNT}
+    with pytest.raises(UsageError, match="scenarios of the evaluations differ"):
+        paired_differences(crashed, replace(whole, keys=elsewhere), "success")
 
 
 def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
     """Segments of two data sets may share a name, and where none is known scenarios are their own clusters."""
-    names = [{"dataset": f"set-{row % 2}", "segment": "a" if row < 4 else ""} for row in range(COUNT)]
-    mixed = replace(whole, scenarios=[row | new for row, new in zip(whole.scenarios, names, strict=True)])
-    assert len(set(EpisodeTable.of(mixed).clusters)) == 2 + COUNT - 4
+    names = {
+        "dataset": tuple(f"set-{row % 2}" for row in range(COUNT)),
+        "segment": tuple("a" if row < 4 else "" for row in range(COUNT)),
+    }
+    mixed = replace(whole, keys=dict(whole.keys) | names)
+    assert len(set(mixed.clusters)) == 2 + COUNT - 4
     mixed.write(tmp_path)
     (tmp_path / "run.json").write_text('{"kind": "evaluation", "planner": "fragile"}')
     stored, summary = (
-        read_evaluation(tmp_path),
+        EpisodeTable.read(tmp_path),
         json.loads((tmp_path / "summary.json").read_text())["metrics"],
     )
     for name in ("success", "offroad", "progress_ratio"):
@@ -192,7 +205,7 @@ def test_a_summary_has_the_intervals_of_the_tables(whole, tmp_path):
 
 def test_crashes_by_hand():
     nan = np.nan
-    found = with_crashes(
+    found = fail_crashed(
         {
             "success": np.array([1.0, 1.0, nan]), "vmax_score": np.array([0.5, nan, 0.7]),
             "vmax_score_partial": np.array([nan, 0.9, nan]), "collision": np.array([0.0, 0.0, 1.0]),
@@ -214,7 +227,7 @@ def test_a_planner_of_another_action_space_is_refused(data):
         evaluate(Expert(), data.bank, data.names, task=Task(actions=PUBLISHED))
 
 
-def test_a_function_that_nobody_made_a_planner_of_is_refused(data):
+def test_plain_function_is_refused_as_planner(data):
     with pytest.raises(UsageError, match=r"'plain' takes \(situation, observation\).*@drivax.python_planner"):
         drivax.evaluate(plain, data)
 
@@ -245,13 +258,13 @@ def named(recording, name):
     return assemble(replace(recording, scenario_id=name), SMALL)
 
 
-def test_logs_in_which_nobody_could_be_judged_are_named_with_the_filter_that_leaves_them_out():
+def test_scenarios_without_ego_or_future_are_refused_with_a_filter():
     late = straight_road([car(steps=range(5, 91)), car(30)])
     gap = straight_road([car(steps=[*range(40), *range(50, 91)])])
     logs = [named(straight_road([car()]), "good"), named(late, "late"), named(gap, "gap")]
     for step, told in ((45, "1 of 3 .*'scenario_id!=gap'"), (2, "1 of 3 .*'scenario_id!=late'")):
         with pytest.raises(UsageError, match=rf"not in the log at step {step} in {told}"):
-            evaluate_scenarios(NOISY, fragile(), logs, start_step=step)
+            evaluate(fragile(), logs, start=NoisyStart(), start_step=step)
     long = straight_road([car()])
     tracks = {
         field.name: value[:, :11] if value.ndim > 1 else value
@@ -261,10 +274,10 @@ def test_logs_in_which_nobody_could_be_judged_are_named_with_the_filter_that_lea
     cut = replace(long, tracks=replace(long.tracks, **tracks), timestamps_s=long.timestamps_s[:11])
     short = named(cut, "short")
     assert Flag.NO_FUTURE in short.has
-    with pytest.raises(DataError, match=r"record short: has no logged future.*1 of 4.*flag!=NO_FUTURE"):
-        evaluate_scenarios(NOISY, fragile(), [*logs, short])
+    with pytest.raises(DataError, match=r"record short: no logged future.*1 of 4.*flag!=NO_FUTURE"):
+        evaluate(fragile(), [*logs, short], start=NoisyStart())
     bank = ScenarioBank.from_scenarios([logs[0], short], allow_no_future=True)
-    with pytest.raises(DataError, match=r"record short: has no logged future.*1 of 2"):
-        evaluate_in(NOISY, fragile(), bank, scenario_names([logs[0], short]))
-    with pytest.raises(UsageError, match="a batch of 0"):
-        evaluate_scenarios(NOISY, fragile(), logs, batch=0)
+    with pytest.raises(DataError, match=r"record short: no logged future.*1 of 2"):
+        evaluate(fragile(), bank, scenario_names([logs[0], short]), start=NoisyStart())
+    with pytest.raises(UsageError, match="batch of 0"):
+        evaluate(fragile(), logs, start=NoisyStart(), batch=0)

@@ -13,7 +13,7 @@ CLUSTERS = [f"r{number // 2}" for number in range(120)]
 HARD = ["hard" if (n // 2) % 3 == 0 or n % 8 == 3 else "easy" for n in range(120)]
 
 
-def test_whole_recordings_in_the_wanted_ratio():
+def test_split_assigns_whole_recordings_in_the_ratio():
     found = assign(CLUSTERS, None, 0.25, seed=1)
     arms = {cluster: set() for cluster in CLUSTERS}
     for cluster, mine in zip(CLUSTERS, found.first, strict=True):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivax.evaluation.stored import EpisodeTable
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.tables import (
     COLLISION_KINDS,
     collisions_table,
@@ -137,7 +137,7 @@ def test_transfer_is_training_by_evaluation():
     assert [label for label, *_ in labels(transfer_table(twice, "success"))] == ["p", "p (noisy)"]
 
 
-def test_policies_of_one_name_are_told_apart(tmp_path):
+def test_policies_of_one_name_are_distinguished(tmp_path):
     """Every algorithm has a seed-0; what they are called on the command line differs."""
     runs = []
     for place, (planner, data) in enumerate(
@@ -155,7 +155,7 @@ def test_policies_of_one_name_are_told_apart(tmp_path):
     assert [cell.link["run"] for cell in numbers(table, table.rows[0])] == ["seed-0 (0)", "seed-0 (2)"]
 
 
-def test_sets_of_one_name_are_told_apart():
+def test_sets_of_one_name_are_distinguished():
     runs = [
         run("a", {}, data="0123456789", path="old/test"),
         run("b", {}, data="abcdefghij", path="new/test"),

@@ -196,7 +196,7 @@ def test_monotone_projection_stays_on_its_branch_and_at_the_end():
     assert project_monotone(line, np.array([[3.0, 5]]), np.zeros(1), first_window_m=1.0).tolist() == [1.0]
 
 
-def test_resampling_needs_no_more_memory_than_the_samples_that_are_wanted():
+def test_resampling_needs_memory_for_its_samples_only():
     points, index = resample(np.array([[0.0, 0.0, 0.0], [1e13, 0.0, 0.0]]), 1.0, 400)
     assert points[:, 0] == pytest.approx(np.arange(400.0))
     assert index.tolist() == [0] * 400

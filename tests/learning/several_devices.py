@@ -15,11 +15,12 @@ from drivax.learning.algorithms.iql import IqlConfig
 from drivax.learning.config import TrainConfig
 from drivax.learning.driving import Driving
 from drivax.learning.loop import train
-from drivax.learning.program import Agents, Program
+from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.synthetic.generate import Generation, generate
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.observations import ObservationConfig
@@ -45,7 +46,7 @@ def problem(name):
 
 def run(learner, data, seeds, devices):
     """Parameters and logs after three iterations; shapes of what each device holds; bytes by part."""
-    program = Program(Agents(learner, seeds), data, devices)
+    program = Program(Seeds(learner, seeds), data, devices)
     assert len(program.devices) == (devices or 4), program.devices
     state = program.first_state()
     for _ in range(3):
@@ -59,7 +60,7 @@ def run(learner, data, seeds, devices):
     shards = {name: leaf.sharding.shard_shape(leaf.shape) for name, leaf in held.items() if leaf is not None}
     spread = {len(leaf.sharding.device_set) for leaf in jax.tree.leaves((environments, state.parameters))}
     assert spread == {len(program.devices)}, spread
-    return jax.device_get((state.parameters, logs)), shards, program.account().parts
+    return jax.device_get((state.parameters, logs)), shards, program.account().sizes
 
 
 def same(one, other):
@@ -83,7 +84,7 @@ def divides(learner, data, counts):
 def divides_agents(learner, data, one):
     """Two agents on two devices, one each: the first learns what it learns alone, the second something else."""
     pair, shards, _ = run(learner, data, (3, 4), 2)
-    first, second = (Agents(learner, (3, 4)).one(pair, number) for number in (0, 1))
+    first, second = (Seeds(learner, (3, 4)).member(pair, number) for number in (0, 1))
     same(one, first)
     apart = jax.tree.map(lambda a, b: np.abs(a - b).max(), first[0], second[0])
     assert max(jax.tree.leaves(apart)) > 0.1, apart
@@ -92,7 +93,7 @@ def divides_agents(learner, data, one):
 
 def refuses(learner, data, devices, words):
     try:
-        Program(Agents(learner, (3,)), data, devices)
+        Program(Seeds(learner, (3,)), data, devices)
     except UsageError as error:
         assert words in str(error), error
     else:
@@ -107,7 +108,7 @@ def divides_batches(learner, data):
         several, _, _ = run(learner, data, (3,), devices)
         same(one, several)
     for devices in (1, 4):
-        program = Program(Agents(learner, (3,)), data, devices)
+        program = Program(Seeds(learner, (3,)), data, devices)
         work.append(program.compiled.cost_analysis()["flops"])
     assert work[1] < 0.6 * work[0], work
     refuses(learner, data, 3, "8 moments cannot be divided among 3 devices")
@@ -134,7 +135,7 @@ def whole_runs(folder):
         shapes = jax.eval_shape(algorithm.build(environment, bank, count).init, bank, jax.random.key(0))
         return jax.device_get(Checkpoints(run.checkpoints).restore(shapes).parameters)
 
-    environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
+    environment, bank = config.environment(LogTraffic()), ScenarioBank.from_scenarios(data)
     (one, shown), (two, others) = driven("one", devices=1), driven("two")
     same(parameters(one), parameters(two))
     for row, other in zip(shown, others, strict=True):

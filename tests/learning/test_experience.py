@@ -53,6 +53,7 @@ def drive(bank, index):
         seen = simulator.observe(bank, state.context)
         situation = simulator.situation(bank, state)
         action, _ = planner.act((), bank, state, situation, seen, jax.random.key(0))
+        action = DRIVING.task.actuated(state.context.history[-1], action, state.context.action)
         after, made = simulator.replay(bank, state, logged_motion(bank, state.context, 1), action)
         following = simulator.observe(bank, after.context)
         return after, (dict(seen), action, made.reward, made.terminated, dict(following), made.truncated)
@@ -60,7 +61,7 @@ def drive(bank, index):
     return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]
 
 
-def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, experience):
+def test_transitions_equal_a_simulated_expert(bank, experience):
     online = jax.device_get(jax.jit(jax.vmap(drive, (None, 0)))(bank, jnp.arange(3)))
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.usable)
@@ -76,7 +77,9 @@ def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, 
         np.testing.assert_allclose(
             found.observation[name][~first], value[~first], atol=1e-3, rtol=1e-4, err_msg=name
         )
-        np.testing.assert_allclose(found.following[name], following[name], atol=1e-3, rtol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            found.next_observation[name], following[name], atol=1e-3, rtol=1e-4, err_msg=name
+        )
     np.testing.assert_allclose(found.action, action, atol=1e-4)
     np.testing.assert_allclose(found.reward, reward, atol=1e-4, rtol=1e-4)
     np.testing.assert_array_equal(found.terminated, terminated)
@@ -84,7 +87,7 @@ def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, 
     assert np.abs(reward).max() > 0
 
 
-def test_nothing_is_learned_behind_an_end_nor_without_the_expert(experience):
+def test_steps_after_an_end_or_without_expert_are_unusable(experience):
     expert = jax.device_get(experience.expert)
     assert isinstance(DRIVING, Recorded)
     end = int(np.argmax(expert.terminated[0]))
@@ -96,7 +99,7 @@ def test_nothing_is_learned_behind_an_end_nor_without_the_expert(experience):
     assert lost[10:68].all() and not lost[68:].any()
 
 
-def test_clipped_steps_are_left_out_unless_they_are_asked_for(bank, experience):
+def test_clipped_steps_are_left_out_by_default(bank, experience):
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.clipped & expert.usable)
     assert {JUMP - 1} <= {s for i, s in zip(index, step, strict=True) if i == 1}
@@ -107,7 +110,7 @@ def test_clipped_steps_are_left_out_unless_they_are_asked_for(bank, experience):
         assert ((chances.reshape(expert.usable.shape)[index, step] > 0) == drawn).all()
 
 
-def test_what_follows_the_weights(bank, experience):
+def test_weights_apply_to_policy_or_all(bank, experience):
     usable = np.asarray(experience.expert.usable & ~experience.expert.clipped)
     weights = np.zeros(usable.shape)
     weights[1, 20], weights[1, 30], weights[0, 3] = 3.0, 1.0, 100.0
@@ -121,16 +124,16 @@ def test_what_follows_the_weights(bank, experience):
     for made in (both, apart):
         np.testing.assert_array_equal(made.usable, usable)
         # What features are normalised by.
-        np.testing.assert_array_equal(made.alike.cumulative, experience.critic.cumulative)
+        np.testing.assert_array_equal(made.uniform.cumulative, experience.critic.cumulative)
 
 
-def test_steps_that_weights_are_made_for_are_those_that_are_drawn(data):
+def test_usable_steps_are_the_drawn_steps(data):
     config = TrainConfig(task=DRIVING.task, algorithm=CqlConfig())
     own = ExperienceConfig().of(DRIVING, ScenarioBank.from_scenarios(data))
     usable = usable_steps(config, data)
     np.testing.assert_array_equal(usable, own.expert.usable & ~own.expert.clipped)
     assert usable.any() and not usable[:, :10].any()
-    with pytest.raises(UsageError, match="PpoConfig learns from no recorded steps"):
+    with pytest.raises(UsageError, match="PpoConfig does not learn from logged steps"):
         usable_steps(replace(config, algorithm=PpoConfig()), data)
 
 
@@ -145,5 +148,5 @@ def test_what_cannot_be_learned_from_is_refused(bank):
             ExperienceConfig().of(DRIVING, bank, weights)
     with pytest.raises(DataError, match="no step has any weight"):
         ExperienceConfig().of(DRIVING, bank, np.zeros(shape))
-    with pytest.raises(UsageError, match="Pendulum holds no recorded episodes"):
+    with pytest.raises(UsageError, match="Pendulum has no logged episodes"):
         ExperienceConfig().of(Pendulum(), ())

@@ -15,8 +15,7 @@ from drivax.learning.config import TrainConfig
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train
 from drivax.learning.policies import load_policy
-from drivax.learning.training_log import patience_is_up
-from drivax.learning.validation import rank
+from drivax.learning.training_log import patience_exceeded, rank
 from drivax.report.runs import read_runs
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
@@ -53,7 +52,7 @@ def numbers(state: ToyState):
 
 def test_seeds_are_runs_of_their_own(data, config, tmp_path):
     lines = []
-    folder = train(config, data, tmp_path / "three", seeds=3, say=lines.append)
+    folder = train(config, data, tmp_path / "three", seeds=3, log=lines.append)
     inside = seed_folders(folder.path)
     assert [path.name for path in inside] == ["seed-4", "seed-5", "seed-6"]
     assert len(lines) == 1 and lines[0].startswith("memory: ") and "scenarios" in lines[0]
@@ -70,13 +69,13 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
             np.testing.assert_allclose(one, other, rtol=1e-6)
     bank = ScenarioBank.from_scenarios(data)
     assert load_policy(inside[0], bank)[1] == config.task
-    with pytest.raises(UsageError, match=r"holds 3 agents; name one of them, as .*seed-4"):
+    with pytest.raises(UsageError, match=r"holds 3 seeds; name one, as .*seed-4"):
         load_policy(folder.path, bank)
     _, trainings = read_runs([folder.path])
     assert [training.name for training in trainings] == ["seed-4", "seed-5", "seed-6"]
 
 
-def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_path):
+def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path):
     whole = train(config, data, tmp_path / "whole", seeds=2)
     cut = train(config, data, tmp_path / "cut", seeds=2)
     # As if the machine had gone while checkpoints were written: one agent is a checkpoint behind.
@@ -86,18 +85,18 @@ def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_
         assert [row["step"] for row in read_rows(other / "metrics.jsonl")] == [10, 20, 30, 40, 50, 60]
         for one, again in zip(numbers(last_state(path)), numbers(last_state(other)), strict=True):
             np.testing.assert_array_equal(one, again)
-    with pytest.raises(UsageError, match="holds 2 agents, not 3; resume without --seeds"):
+    with pytest.raises(UsageError, match="holds 2 seeds, not 3; resume without --seeds"):
         train(config, data, tmp_path / "cut", resume=True, seeds=3)
 
 
 @pytest.mark.slow
-def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
+def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     """The toy adds random numbers of its key to its parameters, so what it began with is what a fresh one lacks."""
     former = train(config, data, tmp_path / "former").path
     plain = train(replace(config, total_steps=10), data, tmp_path / "plain", seeds=2).path
     lines = []
     onward = replace(config, total_steps=10, begin_from=f"{former}@40")
-    run = train(onward, data, tmp_path / "run", seeds=2, say=lines.append)
+    run = train(onward, data, tmp_path / "run", seeds=2, log=lines.append)
     assert lines[1:] == [f"begins with parameters of {former}@40"]
     began = Checkpoints(former / "checkpoints").restore(jax.eval_shape(Toy(ToyConfig()).init, None, KEY), 40)
     pairs = list(zip(seed_folders(run.path), seed_folders(plain), strict=True))
@@ -122,10 +121,10 @@ def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
             wide,
             r"parameters is float32\[3\] in the checkpoint, not float32\[4\]; begin from a run with the same net",
         ),
-        (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 agents; name one of them"),
+        (replace(onward, begin_from=str(tmp_path / "run")), "holds 2 seeds; name one"),
         (replace(onward, begin_from=str(tmp_path)), "is no run folder"),
         (replace(onward, begin_from=f"{former}@7"), "there is no checkpoint of step 7"),
-        (replace(onward, begin_from="zoo:aggressive"), "is packed, and has no networks to learn on from"),
+        (replace(onward, begin_from="zoo:aggressive"), "is an exported policy, which cannot be fine-tuned"),
     ):
         with pytest.raises(DrivaxError, match=words):
             train(wrong, data, tmp_path / "never")
@@ -136,11 +135,11 @@ def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
 
 
 @pytest.mark.slow
-def test_learning_stops_when_patience_is_up(data, config, tmp_path):
-    """The toy always drives alike: the first validation is the best, two more are waited for."""
+def test_training_stops_when_patience_is_exceeded(data, config, tmp_path):
+    """The toy always drives the same: the first validation is the best, two more are waited for."""
     patient = replace(config, evaluate_every=1, patience=2, checkpoint_rule="lexicographic")
     lines = []
-    run = train(patient, data, tmp_path / "run", validation=data, seeds=2, say=lines.append)
+    run = train(patient, data, tmp_path / "run", validation=data, seeds=2, log=lines.append)
     assert lines[1:] == [f"seed {seed}: no better for 2 validations, stopped at 30 steps" for seed in (4, 5)]
     for path in seed_folders(run.path):
         rows = list(read_rows(path / "metrics.jsonl"))
@@ -158,11 +157,11 @@ def test_learning_stops_when_patience_is_up(data, config, tmp_path):
 
 def test_patience():
     ranks = [(0.1,), (0.5,), (0.5,), (0.4,), (0.6,)]
-    assert [patience_is_up(ranks[:n], 2) for n in range(6)] == [False, False, False, False, True, False]
-    assert not patience_is_up(ranks, 0) and not patience_is_up([], 3)
+    assert [patience_exceeded(ranks[:n], 2) for n in range(6)] == [False, False, False, False, True, False]
+    assert not patience_exceeded(ranks, 0) and not patience_exceeded([], 3)
     # Equal failures, better progress: that is better.
-    assert not patience_is_up([(0.9, 0.5, 1.0), (0.9, 0.6, 0.0)], 1)
-    assert patience_is_up([(0.9, 0.5, 0.2), (0.8, 1.0, 1.0)], 1)
+    assert not patience_exceeded([(0.9, 0.5, 1.0), (0.9, 0.6, 0.0)], 1)
+    assert patience_exceeded([(0.9, 0.5, 0.2), (0.8, 1.0, 1.0)], 1)
 
 
 def test_ranks():
@@ -210,9 +209,9 @@ def test_the_command_trains_several(data, tmp_path, capsys):
     assert "0 seeds; use 1 or more" in capsys.readouterr().err
 
 
-def test_weights_are_for_algorithms_that_learn_from_records(data, config, tmp_path):
+def test_weights_need_an_offline_algorithm(data, config, tmp_path):
     weighted = WeightedSet(data, np.ones((3, 91)))
-    with pytest.raises(UsageError, match="ToyConfig learns from no recorded steps"):
+    with pytest.raises(UsageError, match="ToyConfig does not learn from logged steps"):
         train(config, weighted, tmp_path / "run")
     assert not (tmp_path / "run").exists()
     train(config, data, tmp_path / "run")

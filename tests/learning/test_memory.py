@@ -9,7 +9,7 @@ import pytest
 from drivax.errors import UsageError
 from drivax.evaluation.memory import memory_of
 from drivax.learning.environment import Environments
-from drivax.learning.memory import MemoryAccount, account
+from drivax.learning.program import MemoryAccount, account
 from drivax.scenario.record import record
 
 
@@ -26,7 +26,7 @@ class Inner:
     replay: jax.Array
 
 
-def test_every_byte_is_on_one_line():
+def test_account_covers_all_bytes():
     data = {"scenarios": jnp.zeros((5, 7)), "codes": jnp.zeros(9, jnp.int8)}
     state = State(
         parameters=jnp.zeros((10, 3)),
@@ -42,13 +42,13 @@ def test_every_byte_is_on_one_line():
 
     compiled = jax.jit(iterate, donate_argnums=1).lower(data, state).compile()
     found = account(data, jnp.zeros(6), state, compiled, jax.devices()[:1])
-    assert {name: size for name, size in found.parts.items() if name != "program"} == {
+    assert {name: size for name, size in found.sizes.items() if name != "program"} == {
         "scenarios": 5 * 7 * 4 + 9, "validation": 24, "replay": 1600, "environments": 16 + 4 + 16,
         "networks and optimiser": 120 + 8,
     }  # fmt: skip
     # Results that take the place of no argument, and the table.
-    assert 200 + 35 * 35 * 4 <= found.parts["program"] < 10 * 35 * 35 * 4
-    assert found.total == sum(found.parts.values())
+    assert 200 + 35 * 35 * 4 <= found.sizes["program"] < 10 * 35 * 35 * 4
+    assert found.total == sum(found.sizes.values())
     assert found.limit == memory_of(jax.devices()[0]) and found.limit > 10**8
     assert found.text().startswith("memory: ") and "replay 1.6 kB" in found.text()
     assert memory_of(jax.devices()[0], 4) == found.limit // 4
@@ -57,10 +57,10 @@ def test_every_byte_is_on_one_line():
 def test_what_does_not_fit_is_refused_with_the_cure():
     parts = {"scenarios": 3_000_000_000, "replay": 5_000_000_000, "program": 2}
     fits = MemoryAccount(parts, 9_000_000_000, "cuda:0")
-    fits.refuse_too_much()
-    replace(fits, limit=None).refuse_too_much()
+    fits.check()
+    replace(fits, limit=None).check()
     with pytest.raises(UsageError) as refused:
-        replace(fits, limit=7_999_999_999).refuse_too_much()
+        replace(fits, limit=7_999_999_999).check()
     assert str(refused.value) == (
         "training does not fit; memory: 8.0 GB of 8.0 GB on cuda:0: scenarios 3.0 GB, replay 5.0 GB, program 2 B; "
         "lower algorithm.replay.capacity, or set algorithm.replay.store to state"

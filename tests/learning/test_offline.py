@@ -24,10 +24,11 @@ from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from drivax.planners.planner import Planner
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.traffic.log import LogTraffic
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.sinks import read_rows
-from recorded import Table, Told, arms
+from recorded import Logged, Table, arms
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 COUNT, ACTIONS = 16, 3
@@ -45,7 +46,7 @@ def part():
         action=jax.random.uniform(keys[1], (COUNT, 1), minval=-0.9, maxval=0.9),
         reward=jax.random.normal(keys[2], (COUNT,)),
         terminated=jax.random.bernoulli(keys[3], 0.3, (COUNT,)),
-        following={"pendulum": jax.random.normal(keys[4], (COUNT, 3))},
+        next_observation={"pendulum": jax.random.normal(keys[4], (COUNT, 3))},
     )
 
 
@@ -57,7 +58,7 @@ def improved(part):
 
 def begun(config):
     """A learner with what it trains, and targets that differ from what they follow."""
-    learner = config.build(Told(), arms([0.0], [0.0]), 1)
+    learner = config.build(Logged(), arms([0.0], [0.0]), 1)
     state = jax.jit(learner.init)((), jax.random.key(0))
     target = jax.tree.map(lambda leaf: leaf + 0.1, state.target)
     return learner, {"policy": state.parameters, **state.rest}, target
@@ -85,7 +86,7 @@ def test_cql_against_numpy(part, improved):
         critic_key, policy_key = jax.random.split(key)
         next_key, sample_key = jax.random.split(critic_key)
         uniform_key, now_key, then_key = jax.random.split(sample_key, 3)
-        following = learner.distribution(trained["policy"], part.following)
+        following = learner.distribution(trained["policy"], part.next_observation)
         now = learner.distribution(trained["policy"], part.observation)
         there = learner.distribution(trained["policy"], improved[0])
         then = jnp.stack([jnp.tanh(following.sample(own)) for own in jax.random.split(next_key, 2)])
@@ -94,16 +95,18 @@ def test_cql_against_numpy(part, improved):
         for number in range(ACTIONS):
             for name, policy, own in (("now", now, now_key), ("then", following, then_key)):
                 choice = policy.sample(jax.random.split(own, ACTIONS)[number])
-                q = learner.q(trained["critic"], part.observation, jnp.tanh(choice))
+                q = learner.q_values(trained["critic"], part.observation, jnp.tanh(choice))
                 rows[name].append((q, policy.log_prob(choice)))
-            rows["uniform"].append((learner.q(trained["critic"], part.observation, uniform[number]), None))
+            rows["uniform"].append(
+                (learner.q_values(trained["critic"], part.observation, uniform[number]), None)
+            )
         choice = there.sample(policy_key)
         return {
-            "target": learner.q(target["critic"], part.following, then),
-            "q": learner.q(trained["critic"], part.observation, part.action),
+            "target": learner.q_values(target["critic"], part.next_observation, then),
+            "q": learner.q_values(trained["critic"], part.observation, part.action),
             **{f"q_{name}": jnp.stack([q for q, _ in found]) for name, found in rows.items()},
             **{f"p_{name}": jnp.stack([p for _, p in rows[name]]) for name in ("now", "then")},
-            "judged": learner.q(trained["critic"], improved[0], jnp.tanh(choice)),
+            "judged": learner.q_values(trained["critic"], improved[0], jnp.tanh(choice)),
             "log_prob": there.log_prob(choice),
             "mode": there.mode(),
         }
@@ -143,20 +146,20 @@ def test_cql_against_numpy(part, improved):
 
 
 @pytest.mark.slow
-def test_the_published_penalty_puts_the_action_of_the_data_among_the_others(part, improved):
+def test_published_penalty_includes_the_logged_action(part, improved):
     config = replace(CQL, importance=False, next_actions=False, imitation=0.0)
     learner, trained, target = begun(config)
     key = jax.random.key(7)
     _, logs = losses(learner, trained, target, part, improved, key)
     sample_key = jax.random.split(jax.random.split(key)[0])[1]
     now, following = (
-        learner.distribution(trained["policy"], seen) for seen in (part.observation, part.following)
+        learner.distribution(trained["policy"], seen) for seen in (part.observation, part.next_observation)
     )
     action, density = learner._sampled(now, following, part.action, sample_key)
     assert action.shape == (2 * ACTIONS + 1, COUNT, 1) and not np.asarray(density).any()
     np.testing.assert_array_equal(action[-1], part.action)
-    q = np.asarray(learner.q(trained["critic"], part.observation, action), np.float64)
-    data = np.asarray(learner.q(trained["critic"], part.observation, part.action), np.float64)
+    q = np.asarray(learner.q_values(trained["critic"], part.observation, action), np.float64)
+    data = np.asarray(learner.q_values(trained["critic"], part.observation, part.action), np.float64)
     # The study's, but for a constant: the logarithm of how many there are.
     expected = (special.logsumexp(q, axis=1) - data).mean() - np.log(2 * ACTIONS + 1)
     assert logs["penalty"] == pytest.approx(expected, rel=1e-4)
@@ -170,11 +173,11 @@ def test_iql_against_numpy(part, improved):
     def outputs(trained):
         policy = learner.distribution(trained["policy"], improved[0])
         return {
-            "target": learner.q(target["critic"], part.observation, part.action),
-            "q": learner.q(trained["critic"], part.observation, part.action),
+            "target": learner.q_values(target["critic"], part.observation, part.action),
+            "q": learner.q_values(trained["critic"], part.observation, part.action),
             "value": learner._value(trained["value"], part.observation),
-            "then": learner._value(trained["value"], part.following),
-            "there": learner.q(target["critic"], *improved),
+            "then": learner._value(trained["value"], part.next_observation),
+            "there": learner.q_values(target["critic"], *improved),
             "value_there": learner._value(trained["value"], improved[0]),
             "log_prob": policy.log_prob(jnp.arctanh(improved[1])),
         }
@@ -205,14 +208,14 @@ def test_td3_bc_against_numpy(part, improved):
 
     @jax.jit
     def outputs(trained):
-        mode = learner.distribution(target["policy"], part.following).mode()
+        mode = learner.distribution(target["policy"], part.next_observation).mode()
         noise = 0.5 * jax.random.normal(key, mode.shape)
         then = jnp.clip(mode + jnp.clip(noise, -0.3, 0.3), -1.0, 1.0)
         action = learner.distribution(trained["policy"], improved[0]).mode()
         return {
-            "target": learner.q(target["critic"], part.following, then),
-            "q": learner.q(trained["critic"], part.observation, part.action),
-            "judged": learner.q(trained["critic"], improved[0], action)[0],
+            "target": learner.q_values(target["critic"], part.next_observation, then),
+            "q": learner.q_values(trained["critic"], part.observation, part.action),
+            "judged": learner.q_values(trained["critic"], improved[0], action)[0],
             "off": action - improved[1],
             "noise": noise,
         }
@@ -260,9 +263,9 @@ def test_every_loss_reaches_its_own_parameters_only(config, part, improved):
 
 
 def learned(config, data, iterations=20, weights=None):
-    """A learner and its state after so many iterations, and what the last one logged."""
-    learner = config.build(Told(), data, iterations)
-    made = training_data(config, Told(), data, weights)
+    """A learner and its state after n iterations, and what the last one logged."""
+    learner = config.build(Logged(), data, iterations)
+    made = training_data(config, Logged(), data, weights)
 
     @jax.jit
     def run(made):
@@ -278,7 +281,7 @@ FAST = {"batch": 64, "updates": 50, "policy_rate": 3e-3, "critic_rate": 3e-3}
 
 @pytest.fixture(scope="module")
 def bandit():
-    """Arms from -0.5 to 0.5, of which the higher ones pay more; beyond, where nobody has been, all pay -1."""
+    """Arms from -0.5 to 0.5, of which the higher ones pay more; beyond, where no agent has been, all pay -1."""
     action = np.random.default_rng(0).uniform(-0.5, 0.5, 500)
     return arms(action, action)
 
@@ -297,12 +300,12 @@ def bandit():
         pytest.param(Td3BcConfig(network=NETWORK, q_weight=0.2, **FAST), True, id="td3_bc"),
     ],
 )
-def test_arms_that_nobody_pulled(bandit, config, stays):
+def test_unlogged_arms_are_not_overestimated(bandit, config, stays):
     """Without a term that keeps them there, actions go where the critic makes up values."""
     learner, state, _ = learned(config, bandit)
     seen = {"pendulum": jnp.ones(3)}
     action = learner.distribution(state.parameters, seen).mode()
-    believed = float(learner.q(state.rest["critic"], seen, action).min())
+    believed = float(learner.q_values(state.rest["critic"], seen, action).min())
     true = float(action[0]) if abs(float(action[0])) <= 0.5 else -1.0
     assert (abs(float(action[0])) <= 0.55) == stays, float(action[0])
     assert (believed - true > 0.5) == (not stays), (believed, true)
@@ -311,7 +314,7 @@ def test_arms_that_nobody_pulled(bandit, config, stays):
 
 
 @pytest.mark.slow
-def test_a_multiplier_finds_the_weight_that_a_gap_takes():
+def test_multiplier_reaches_the_gap():
     """Arms from 0.2 to 0.4: the lower the penalty is to be, the larger its weight; above what there is, nothing."""
     action = np.random.default_rng(0).uniform(0.2, 0.4, 500)
     settings = {"network": NETWORK, "penalty": 1.0, "penalty_rate": 0.01, **FAST}
@@ -323,7 +326,7 @@ def test_a_multiplier_finds_the_weight_that_a_gap_takes():
     assert found[1.0][1] > found[-0.5][1] > found[-1.0][1]
 
 
-def test_a_timeout_is_worth_what_follows():
+def test_timeouts_bootstrap():
     """One state for ever, paid 1 a step: 1 / (1 - gamma) where episodes are cut off, 1 where they end."""
     ones, number = jnp.ones((20, 10)), jnp.broadcast_to(jnp.arange(10), (20, 10))
     never = jnp.zeros((20, 10), bool)
@@ -335,7 +338,7 @@ def test_a_timeout_is_worth_what_follows():
 
 
 @pytest.mark.slow
-def test_weights_choose_what_is_learned_from(bandit):
+def test_weights_select_training_steps(bandit):
     """Only the arms around 0.3 have weight: for all that is learned, or for the policy alone."""
     weights = np.zeros((500, 2))
     weights[:, 0] = np.abs(np.asarray(bandit.action[:, 0, 0]) - 0.3) < 0.05
@@ -359,10 +362,10 @@ def test_what_cannot_be_learned_is_refused():
     assert IqlConfig(network=grid).loss == "likelihood"
     for config, words in (
         (partial(IqlConfig, expectile=1.0), "an expectile of 1"),
-        (partial(IqlConfig, inverse_temperature=-1.0), "weights of IQL"),
+        (partial(IqlConfig, inverse_temperature=-1.0), "inverse_temperature or largest_weight"),
         (partial(CqlConfig, actions=0), "too small"),
         (partial(CqlConfig, backup_actions=0), "too small"),
-        (partial(CqlConfig, penalty=0.0, gap=1.0), "nothing for a multiplier"),
+        (partial(CqlConfig, penalty=0.0, gap=1.0), "penalty is 0 with a gap"),
         (partial(Td3BcConfig, delay=0), "a delay of 1"),
     ):
         with pytest.raises(UsageError, match=words):
@@ -381,8 +384,8 @@ RESUMED = {
 def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     """Stopped in the middle, with an odd number of updates behind it, and restored from disk."""
     config, weights = RESUMED[name], np.random.default_rng(0).uniform(size=(500, 2))
-    learner = config.build(Told(), bandit, 4)
-    data = training_data(config, Told(), bandit, weights)
+    learner = config.build(Logged(), bandit, 4)
+    data = training_data(config, Logged(), bandit, weights)
     iterate, states = jax.jit(learner.iterate), [jax.jit(learner.init)(data, jax.random.key(5))]
     for _ in range(4):
         states.append(iterate(data, states[-1])[0])
@@ -390,7 +393,7 @@ def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     checkpoints.save(1, states[1])
     # Restored into shapes alone, and for the environment's bare data, as a fresh process does.
     state = checkpoints.restore(jax.eval_shape(learner.init, bandit, jax.random.key(0)))
-    again = training_data(config, Told(), bandit, weights)
+    again = training_data(config, Logged(), bandit, weights)
     for _ in range(3):
         state = iterate(again, state)[0]
     one, other = ([_plain(leaf) for leaf in jax.tree.leaves(part)] for part in (state, states[-1]))
@@ -413,13 +416,13 @@ def _plain(leaf):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RESUMED)
-def test_algorithms_keep_to_the_rules(name):
+def test_algorithms_pass_their_checks(name):
     check_algorithm(RESUMED[name])
 
 
 @pytest.mark.slow
-def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
-    """Of one run: validation in closed loop beside the mean Q, and a policy that drives."""
+def test_held_out_values_are_logged_without_ranking(data, tmp_path):
+    """Of one run: validation in closed loop next to the mean Q, and a policy that drives."""
     network = {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]}
     values = {
         "task": {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 3}},
@@ -434,10 +437,12 @@ def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
     assert rows[0]["sampler/policy_effective"] > 100
     bank = ScenarioBank.from_scenarios(data)
     planner, _ = load_policy(run.path, bank)
-    learner = config.algorithm.build(config.environment(), bank, config.iterations)
-    held_out = training_data(config.algorithm, config.environment(), bank)
+    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
+    held_out = training_data(config.algorithm, config.environment(LogTraffic()), bank)
     state = Checkpoints(run.checkpoints).restore(jax.eval_shape(learner.init, bank, jax.random.key(0)))
-    assert rows[-1]["validation/mean_q"] == pytest.approx(learner.judge(held_out, state)["mean_q"], rel=1e-5)
+    assert rows[-1]["validation/mean_q"] == pytest.approx(
+        learner.held_out_metrics(held_out, state)["mean_q"], rel=1e-5
+    )
     assert isinstance(planner, Planner)
 
 
@@ -446,7 +451,7 @@ def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
 def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
     """Adam's step under a constant gradient is its rate, whatever moves how often."""
     config = replace(kind, updates=10, last_rate=0.25, falling=falling, policy_rate=1e-3, gradient_norm=1e6)
-    learner = config.build(Told(), arms([0.0], [0.0]), 4)
+    learner = config.build(Logged(), arms([0.0], [0.0]), 4)
     adam = learner.adam(config.policy_rate, every)
     weights = jnp.zeros(1)
 

@@ -11,9 +11,10 @@ from drivax import settings
 from drivax.errors import DataError
 from drivax.learning.config import TrainConfig
 from drivax.learning.loop import train
-from drivax.learning.policy_traffic import policy_traffic
+from drivax.learning.policies import policy_traffic
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.agent_paths import AgentPaths
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.synthetic.generate import Generation, generate
 
@@ -37,7 +38,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_planner_is_judged_among_vehicles_that_a_policy_drives(tmp_path):
+def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     data = ScenarioSet.open(tmp_path / "set")
     run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold")
@@ -45,9 +46,9 @@ def test_a_planner_is_judged_among_vehicles_that_a_policy_drives(tmp_path):
     assert (with_logged.name, with_idm.name) == ("driven_by_bold", "driven_by_bold+idm")
     assert hash(with_logged) == hash(policy_traffic(run.path, count=2))
     loaded = drivax.load(tmp_path / "set")
-    bank = prepared(with_idm, loaded.bank)
-    assert bank.paths is not None and bank.driver.name == "bold"
-    assert jax.tree.leaves(bank.driver.parameters)
+    bank = prepare_bank(with_idm, loaded.bank)
+    assert data_of(bank, AgentPaths).kinds and data_of(bank, TrafficPolicy).planner.name == "bold"
+    assert jax.tree.leaves(data_of(bank, TrafficPolicy).planner.parameters)
     results = drivax.evaluate("idm", loaded, traffic=with_logged)
     logged = drivax.evaluate("idm", loaded)
     assert results.summary()["traffic"] == "driven_by_bold"

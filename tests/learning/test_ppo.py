@@ -7,9 +7,9 @@ import optax
 import pytest
 
 from drivax.learning.algorithms.behaviour_cloning import Cloning
-from drivax.learning.algorithms.optimisers import clip_apart, clipped_adam
+from drivax.learning.algorithms.optimisers import clip_per_network, clipped_adam
 from drivax.learning.algorithms.ppo import PpoConfig
-from drivax.learning.collector import Rollout
+from drivax.learning.environment import Rollout
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import Pendulum
@@ -27,7 +27,7 @@ def test_a_truncated_step_bootstraps_its_own_final_state():
     for truncated in (True, False):
         cut, failed = (ended, ~ended & ended) if truncated else (~ended & ended, ended)
         rows = Rollout(
-            observation={"pendulum": jnp.zeros((4, 1, 3))}, state=None, choice=jnp.zeros((4, 1, 1)),
+            observation={"pendulum": jnp.zeros((4, 1, 3))}, state=None, raw_action=jnp.zeros((4, 1, 1)),
             extra={"value": value, "log_prob": jnp.zeros((4, 1))}, reward=reward, terminated=failed,
             truncated=cut, alive=jnp.array([[True], [True], [False], [True]]),
         )  # fmt: skip
@@ -51,13 +51,13 @@ def test_the_loss_against_numpy():
     alive = jnp.array([1.0, 1.0, 0.0, 1.0] * 8)
     part = {
         "observation": {"pendulum": jax.random.normal(keys[0], (32, 3))},
-        "choice": jax.random.normal(keys[1], (32, 1)),
+        "raw_action": jax.random.normal(keys[1], (32, 1)),
         "advantage": 3.0 + 2.0 * jax.random.normal(keys[2], (32,)),
         "target": jax.random.normal(keys[3], (32,)),
         "alive": alive,
     }
     policy, value = learner.network(parameters).both(part["observation"])
-    now = policy.log_prob(part["choice"])
+    now = policy.log_prob(part["raw_action"])
     part["log_prob"] = now + 0.3 * jax.random.normal(keys[4], (32,))
     total, logs = learner._loss(
         parameters, part, keys[5], lambda *_: (jnp.float32(0.5), {"also": jnp.ones(())})
@@ -106,15 +106,15 @@ def test_heads(network):
     assert network.distribution != "grid" or float(action[0]) in (-1.0, 0.0, 1.0)
 
 
-def test_parts_are_clipped_by_their_own_norms():
+def test_networks_are_clipped_by_their_own_norms():
     gradient = {
         "policy": {"w": jnp.array([0.3, 0.4])},
         "value": {"w": jnp.array([30.0]), "b": jnp.array([40.0])},
     }
-    clipped, _ = clip_apart(1.0).update(gradient, optax.EmptyState())
+    clipped, _ = clip_per_network(1.0).update(gradient, optax.EmptyState())
     np.testing.assert_allclose(clipped["policy"]["w"], [0.3, 0.4], rtol=1e-6)
     np.testing.assert_allclose([clipped["value"]["w"][0], clipped["value"]["b"][0]], [0.6, 0.8], rtol=1e-6)
-    nothing, _ = clip_apart(1.0).update({"policy": jnp.zeros(2)}, optax.EmptyState())
+    nothing, _ = clip_per_network(1.0).update({"policy": jnp.zeros(2)}, optax.EmptyState())
     np.testing.assert_array_equal(nothing["policy"], [0.0, 0.0])
 
 

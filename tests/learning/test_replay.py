@@ -9,11 +9,9 @@ import pytest
 from scipy import stats
 
 from drivax.errors import UsageError
-from drivax.learning import replay
-from drivax.learning.collector import collect
 from drivax.learning.driving import Driving
-from drivax.learning.environment import Environments, Outcome
-from drivax.learning.replay import ReplayConfig
+from drivax.learning.environment import Environments, Outcome, collect
+from drivax.learning.replay import ReplayBuffer, ReplayConfig
 from drivax.simulator.simulator import Simulator
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -44,10 +42,10 @@ class Counting:
 
     observe = observe_all
 
-    def look(self, data, state):
+    def cache(self, data, state):
         return ()
 
-    def step(self, data, now, looked, action, key):
+    def step(self, data, now, cache, action, key):
         who, episode, step = jnp.moveaxis(now.state, -1, 0)
         moved = jnp.stack([who, episode, step + 1], axis=-1)
         begun = jnp.stack([who, episode + 1, jnp.zeros_like(step)], axis=-1)
@@ -64,14 +62,15 @@ def act(observation, key):
 
 
 def fill(config, steps, unroll):
-    """A replay after so many steps, and the steps that it should hold, told by plain loops."""
+    """Return a buffer, its contents after ``steps``, and the steps that it should hold, found by plain loops."""
     environment = Counting()
     environments = environment.start((), jax.random.key(0), COUNT)
-    kept = replay.init(config, environment, environments)
+    buffer = ReplayBuffer(config, environment)
+    kept = buffer.init(environments)
     run = jax.jit(lambda e, key: collect(environment, (), e, act, key, unroll, config.store)[:2])
     for _ in range(steps // unroll):
         environments, rollout = run(environments, jax.random.key(0))
-        kept = jax.jit(replay.add)(kept, rollout)
+        kept = jax.jit(buffer.add)(kept, rollout)
     held = set()
     for who in range(COUNT):
         row, episode, step = 0, 0, 0
@@ -83,21 +82,22 @@ def fill(config, steps, unroll):
                 held.add((who, episode, step))
             episode, step = (episode + 1, 0) if step == length else (episode, step + 1)
             row += 1
-    return environment, kept, held
+    return buffer, kept, held
 
 
-def sampled(environment, kept, count, seed=1):
-    places = replay.draw(kept, jax.random.key(seed), (count,))
-    return replay.sample(environment, (), kept, places)
+def sampled(buffer, kept, count, seed=1):
+    return buffer.sample((), kept, buffer.draw(kept, jax.random.key(seed), (count,)))
 
 
 @pytest.mark.parametrize("store", ["state", "observation"])
 @pytest.mark.parametrize(("capacity", "steps"), [(60, 12), (60, 20), (60, 24), (37, 48), (60, 84)])
-def test_samples_are_the_steps_that_happened(store, capacity, steps):
+def test_samples_are_collected_steps(store, capacity, steps):
     """Before the ring is full, exactly full, and after it was written over once and four times."""
-    environment, kept, held = fill(ReplayConfig(capacity, store), steps, 4)
-    batch = sampled(environment, kept, 4000)
-    before, after = (np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.following))
+    buffer, kept, held = fill(ReplayConfig(capacity, store), steps, 4)
+    batch = sampled(buffer, kept, 4000)
+    before, after = (
+        np.asarray(part["place"]).astype(int) for part in (batch.observation, batch.next_observation)
+    )
     assert {tuple(row) for row in before.tolist()} == held
     # What a step led to is the next state of the same episode, final states included.
     np.testing.assert_array_equal(after, before + np.array([0, 0, 1]))
@@ -109,9 +109,9 @@ def test_samples_are_the_steps_that_happened(store, capacity, steps):
     assert batch.observation["place_mask"].dtype == bool
 
 
-def test_every_step_is_as_likely_as_any_other():
-    environment, kept, held = fill(ReplayConfig(60), 84, 4)
-    batch = np.asarray(sampled(environment, kept, 20_000).observation["place"]).astype(int)
+def test_steps_are_sampled_uniformly():
+    buffer, kept, held = fill(ReplayConfig(60), 84, 4)
+    batch = np.asarray(sampled(buffer, kept, 20_000).observation["place"]).astype(int)
     counts = np.unique(batch, axis=0, return_counts=True)[1]
     assert len(counts) == len(held)
     assert stats.chisquare(counts).pvalue > 0.01
@@ -120,13 +120,14 @@ def test_every_step_is_as_likely_as_any_other():
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(UsageError, match="capacity of at least 6"):
+    with pytest.raises(UsageError, match=r"capacity to 6 or more"):
         ReplayConfig(capacity=5).rows(3)
-    environment, kept, _ = fill(ReplayConfig(12), 4, 4)
+    buffer, kept, _ = fill(ReplayConfig(12), 4, 4)
+    environment = buffer.environment
     environments = environment.start((), jax.random.key(0), COUNT)
     _, rollout, _ = collect(environment, (), environments, act, jax.random.key(0), 5, "state")
-    with pytest.raises(UsageError, match="5 steps for a replay of 4 rows"):
-        replay.add(kept, rollout)
+    with pytest.raises(UsageError, match="5 steps do not fit a replay buffer of 4 rows"):
+        buffer.add(kept, rollout)
 
 
 @pytest.mark.slow
@@ -144,18 +145,21 @@ def test_states_and_observations_give_the_same_batch():
         _, rollout, _ = collect(environment, bank, environments, drive, jax.random.key(1), 16, "state")
         for part in (rollout, replace(rollout, state=None, observation=rollout.extra)):
             store = "state" if part.observation is None else "observation"
-            kept = replay.add(replay.init(ReplayConfig(64, store), environment, environments), part)
-            places = replay.draw(kept, jax.random.key(2), (64,))
-            yield replay.sample(environment, bank, kept, places)
+            buffer = ReplayBuffer(ReplayConfig(64, store), environment)
+            kept = buffer.add(buffer.init(environments), part)
+            yield buffer.sample(bank, kept, buffer.draw(kept, jax.random.key(2), (64,)))
 
     exact, stored = jax.jit(lambda bank: tuple(batches(bank)))(worlds.worlds())
     assert bool(exact.terminated.any()) or float(jnp.abs(exact.reward).max()) > 0
     for name in ("action", "reward", "terminated"):
         np.testing.assert_array_equal(getattr(exact, name), getattr(stored, name))
-    for one, other in ((exact.observation, stored.observation), (exact.following, stored.following)):
+    for one, other in (
+        (exact.observation, stored.observation),
+        (exact.next_observation, stored.next_observation),
+    ):
         assert set(one) == set(other)
         for name in one:
             # bfloat16 keeps 8 bits.
             np.testing.assert_allclose(one[name], other[name], rtol=2**-8, atol=1e-6, err_msg=name)
-    moved = np.abs(np.asarray(exact.observation["route"]) - np.asarray(exact.following["route"]))
+    moved = np.abs(np.asarray(exact.observation["route"]) - np.asarray(exact.next_observation["route"]))
     assert moved.max() > 1e-3

@@ -13,8 +13,8 @@ from drivax.learning.algorithms.behaviour_cloning import BcConfig, Cloning
 from drivax.learning.algorithms.ppo import PpoConfig
 from drivax.learning.algorithms.sac import SacConfig
 from drivax.learning.algorithms.warm_start import BcPpoConfig, BcSacConfig, WarmStart
-from drivax.learning.first_state import Origin, with_networks
-from drivax.learning.loop import logged
+from drivax.learning.loop import mean_logs
+from drivax.learning.pretrained import Pretrained, with_networks
 from drivax.learning.replay import ReplayConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
@@ -84,11 +84,11 @@ def test_resuming_is_bit_for_bit(run, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, *(jax.tree.map(_plain, part) for part in (state, states[-1])))
 
 
-def test_a_warm_start_clones_and_then_learns(run):
+def test_warm_start_pretrains_and_then_reinforces(run):
     name, _, _, states, raw = run
     if not name.startswith("bc_"):
         pytest.skip("has one phase")
-    rows = [logged(row) for row in raw]
+    rows = [mean_logs(row) for row in raw]
     same = partial(np.array_equal, equal_nan=True)  # an episode that began in the middle has no return
     begun, cloned, learned = (jax.device_get(states[number]) for number in (0, 2, 6))
     # Cloning moves the policy alone, and logs nothing of what it did not do.
@@ -119,14 +119,14 @@ def test_a_warm_start_clones_and_then_learns(run):
 
 
 @pytest.mark.slow
-def test_networks_go_over_to_another_run(tmp_path):
+def test_networks_transfer_to_another_run(tmp_path):
     """SAC, hotter, from each of them: it gets all the networks that there are, and nothing else."""
     hot = replace(SAC, temperature=0.5).build(Pendulum(), SHOWN, 6)
     fresh = jax.jit(hot.init)(SHOWN, jax.random.key(5))
     for number, (name, wanted) in enumerate(TAKEN.items()):
         former = jax.jit(ALGORITHMS[name].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(6))
         Checkpoints(tmp_path / "checkpoints").save(number, former)
-        origin = Origin(tmp_path, number, [])
+        origin = Pretrained(tmp_path, number, [])
         if name == "ppo":
             with pytest.raises(DataError, match=r"no \.parameters.*; begin from a run with the same network"):
                 origin.networks(fresh)
@@ -145,7 +145,7 @@ def test_networks_go_over_to_another_run(tmp_path):
         assert float(state.log_temperature) == pytest.approx(np.log(0.5))
     # And back into a warm start, where they lie one level deeper.
     both = jax.jit(ALGORITHMS["bc_sac"].build(Pendulum(), SHOWN, 6).init)(SHOWN, jax.random.key(7))
-    found = Origin(tmp_path, list(TAKEN).index("sac"), []).networks(both)
+    found = Pretrained(tmp_path, list(TAKEN).index("sac"), []).networks(both)
     assert list(found) == [".parameters", ".learner.critic", ".learner.target"]
     jax.tree.map(
         np.testing.assert_array_equal, with_networks(both, found).learner.critic, found[".learner.critic"]
@@ -159,7 +159,7 @@ def _plain(leaf):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bc", "sac", "bc_sac", "bc_ppo"])
-def test_algorithms_keep_to_the_rules(name):
+def test_algorithms_pass_their_checks(name):
     config = ALGORITHMS[name]
     if name.startswith("bc_"):
         config = replace(config, warm_start=replace(START, iterations=1))

@@ -17,9 +17,16 @@ from drivax.api import find_planner
 from drivax.cli import main
 from drivax.errors import DataError, UsageError
 from drivax.learning.config import TrainConfig
-from drivax.learning.policies import PACKED, load_policy, pack_policy
-from drivax.learning.policy_traffic import PolicyTraffic, find_traffic, policy_traffic
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.learning.policies import (
+    POLICY_FILE,
+    PolicyTraffic,
+    export_policy,
+    find_traffic,
+    load_policy,
+    policy_traffic,
+)
+from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tracking.run_folder import RunFolder
@@ -43,8 +50,8 @@ def weights(planner):
 
 
 @pytest.mark.slow
-def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
-    packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
+def test_exported_policy_is_the_best_of_its_run(run, bank, tmp_path):
+    packed = export_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
     (one, task), (best, _) = load_policy(packed.path, bank), load_policy(run.path, bank, step=4)
     assert task == settings.load(TrainConfig, TINY).task and one.name == "packed"
     assert jax.tree.structure(replace(one, name="bold@4")) == jax.tree.structure(best)
@@ -55,38 +62,38 @@ def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
     assert load_policy(packed.path, bank, samples=True)[0].samples
 
 
-def test_a_packed_policy_says_where_it_comes_from_and_not_where_it_lay(run, bank, tmp_path):
-    packed = pack_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
-    assert sorted(path.name for path in packed.path.iterdir()) == ["config.yaml", PACKED, "run.json"]
+def test_exported_policy_has_provenance_without_paths(run, bank, tmp_path):
+    packed = export_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
+    assert sorted(path.name for path in packed.path.iterdir()) == ["config.yaml", POLICY_FILE, "run.json"]
     assert packed.config(TrainConfig) == settings.load(TrainConfig, TINY)
     info = json.loads((packed.path / "run.json").read_text())
     assert info["data"] == [{"hash": "f00d", "scenarios": 3}] and info["machine"] is None
     assert (info["kind"], info["step"], info["command"]) == ("policy", 4, "drivax train tiny")
     assert info["validation"] == "c0de" and info["measured"] == {"speed": 0.5} and "jax" in info["versions"]
     # The value network stays behind.
-    stored = np.load(packed.path / PACKED)
+    stored = np.load(packed.path / POLICY_FILE)
     assert sum(stored[name].size for name in stored.files) == sum(
         leaf.size for leaf in weights(load_policy(run.path, bank)[0])
     )
 
 
 @pytest.mark.slow
-def test_what_a_packed_policy_is_not(run, bank, tmp_path):
-    packed = pack_policy(run.path, tmp_path / "packed", bank)
-    with pytest.raises(UsageError, match="packed and has no steps; leave out @4"):
+def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
+    packed = export_policy(run.path, tmp_path / "packed", bank)
+    with pytest.raises(UsageError, match="packed and without steps; leave out @4"):
         find_planner(f"{packed.path}@4", bank)
     with pytest.raises(UsageError, match="exists already"):
-        pack_policy(run.path, packed.path, bank)
+        export_policy(run.path, packed.path, bank)
     wider = {**TINY, "algorithm": {**TINY["algorithm"], "network": {"encoder": {"rows": [4], "hidden": [9]}}}}
     (packed.path / "config.yaml").write_text(settings.dump(settings.load(TrainConfig, wider)))
     with pytest.raises(DataError, match=r"parameters.* in the checkpoint, not"):
         load_policy(packed.path, bank)
-    (packed.path / PACKED).write_bytes(b"PK")
+    (packed.path / POLICY_FILE).write_bytes(b"PK")
     with pytest.raises(DataError, match=r"policy.npz: is damaged"):
         load_policy(packed.path, bank)
 
 
-def test_policies_load_when_what_drove_beside_them_is_gone(run, bank, tmp_path):
+def test_policies_load_without_their_training_traffic(run, bank, tmp_path):
     text = (run.path / "config.yaml").read_text()
     moved = RunFolder.create(tmp_path / "moved", settings.load(TrainConfig, TINY), kind="training")
     (moved.path / "config.yaml").write_text(text.replace("traffic: idm", "traffic: runs/gone"))
@@ -113,7 +120,7 @@ def test_traffic_is_found_by_name(run, tmp_path):
     ):
         with pytest.raises(UsageError, match=words):
             find_traffic(name)
-    with pytest.raises(DataError, match="is no run folder"):
+    with pytest.raises(DataError, match="not a run folder"):
         find_traffic(str(tmp_path))
 
 
@@ -125,7 +132,7 @@ def test_names_of_the_zoo():
             policy_folder(name)
 
 
-def test_a_misspelt_policy_is_one_line_that_lists_the_names(bank, capsys, tmp_path):
+def test_misspelt_policy_lists_the_names(bank, capsys, tmp_path):
     command = [
         "evaluate",
         "--planner",
@@ -145,7 +152,7 @@ def test_a_misspelt_policy_is_one_line_that_lists_the_names(bank, capsys, tmp_pa
 
 
 @pytest.mark.parametrize("name", zoo())
-def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
+def test_shipped_policies_drive_and_have_provenance(name, bank):
     folder = policy_folder(name)
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5e6
     info = json.loads((folder / "run.json").read_text())
@@ -157,10 +164,12 @@ def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
     assert planner.name == name.removeprefix("zoo:") and all(
         np.isfinite(leaf).all() for leaf in weights(planner)
     )
-    with pytest.raises(UsageError, match="has no steps"):
+    with pytest.raises(UsageError, match="without steps"):
         find_planner(f"{name}@5", bank)
     among = find_traffic(name)
-    assert among.task == task and prepared(among, bank).driver.name == planner.name
+    assert (
+        among.task == task and data_of(prepare_bank(among, bank), TrafficPolicy).planner.name == planner.name
+    )
 
 
 @pytest.mark.slow

@@ -10,10 +10,11 @@ from flax import nnx
 
 from drivax.errors import UsageError
 from drivax.planners.network_planner import NetworkPlanner
-from drivax.planners.planner_traffic import PlannerTraffic, with_driver
+from drivax.planners.planner_traffic import PlannerTraffic, TrafficPolicy, with_driver
 from drivax.planners.simple import Expert
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.simulator import Simulator
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -67,16 +68,16 @@ def nearest(bank):
 
 def test_the_nearest_moving_vehicles_are_driven(bank):
     state = jax.jit(lambda b: TRAFFIC.start(b, 0, 10))(bank)
-    assert state.scenes.slot.tolist() == nearest(bank)
+    assert state.contexts.slot.tolist() == nearest(bank)
     more = PlannerTraffic(TASK, count=6)
-    slots = jax.jit(lambda b: more.start(b, 0, 10))(bank).scenes.slot.tolist()
+    slots = jax.jit(lambda b: more.start(b, 0, 10))(bank).contexts.slot.tolist()
     assert slots[:3] == nearest(bank) and slots[4:] == [bank.agents.shape[2]] * 2
 
 
 def test_what_cannot_drive_is_refused(bank):
     with pytest.raises(UsageError, match="cannot drive others"):
         with_driver(bank, Expert())
-    with pytest.raises(UsageError, match="the bank has no driver; use planners"):
+    with pytest.raises(UsageError, match="the bank has no TrafficPolicy; use planners"):
         TRAFFIC.start(bank_of(straight_road([car()])), 0, 10)
 
 
@@ -99,7 +100,9 @@ def test_they_drive_as_agents_that_are_stepped_together(bank):
     def together(bank, slots):
         def one(states, _):
             seen = stacked.observe_together(bank, states)
-            network = nnx.merge(bank.driver.graph, bank.driver.parameters)
+            network = nnx.merge(
+                data_of(bank, TrafficPolicy).planner.graph, data_of(bank, TrafficPolicy).planner.parameters
+            )
             act = jax.vmap(lambda groups: network(groups).mode())
             actions = act(seen).at[0].set(ego)
             after, _ = stacked.step_together(bank, states, actions)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from drivax.cli import main
-from drivax.evaluation.stored import read_evaluation
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.tracking.sinks import read_rows
 
 TINY = [
@@ -38,4 +38,4 @@ def test_policy_learns_from_recordings_weighted_by_scores(recorded, kind, tmp_pa
     assert rows[-1]["validation/progress_ratio"] is not None
     assert len(json.loads((run / "run.json").read_text())["weights"]) == 64
     assert main(["evaluate", "--planner", str(run), "--data", data, "--out", str(drive)]) == 0
-    assert len(read_evaluation(drive).metrics["collision"]) > 0
+    assert len(EpisodeTable.read(drive).metrics["collision"]) > 0

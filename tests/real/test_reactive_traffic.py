@@ -11,6 +11,8 @@ from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.reader import BadRecord
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.traffic.agent_paths import AgentPaths
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import DRIVES, REPLAYS
 from traffic_oracle import TRAFFIC, compare, meetings, runs_of
 from traffic_oracle import Path as Line
@@ -49,9 +51,12 @@ def test_paths_follow_logs_and_vehicles_follow_paths(bank, runs):
     away, left, moves = [], [], []
     for index, (frames, traffic) in enumerate(runs):
         for row in np.flatnonzero((traffic.phase == DRIVES).any(0)):
-            slot, path = int(bank.paths.slot[index, row]), Line(bank.paths, index, row)
+            slot, path = (
+                int(data_of(bank, AgentPaths).slot[index, row]),
+                Line(data_of(bank, AgentPaths), index, row),
+            )
             seen = agents[index, :, slot, AgentColumn.VALID] > 0
-            x, y, _, _ = path.at(np.asarray(bank.paths.log_arc[index, seen, row]))
+            x, y, _, _ = path.at(np.asarray(data_of(bank, AgentPaths).log_arc[index, seen, row]))
             away += np.hypot(x - agents[index, seen, slot, 0], y - agents[index, seen, slot, 1]).tolist()
             moves += (np.hypot(*agents[index, seen, slot, 5:7].T) > 1.0).tolist()
             there = np.flatnonzero(frames.valid[1:, slot])[::10] + 1
@@ -77,7 +82,10 @@ def test_reactive_speeds_match_the_log(bank, runs):
     shares = []
     for index, (_, traffic) in enumerate(runs):
         for row in np.flatnonzero((traffic.phase != REPLAYS).any(0)):
-            logged = float(bank.paths.log_arc[index, -1, row] - bank.paths.log_arc[index, 10, row])
+            logged = float(
+                data_of(bank, AgentPaths).log_arc[index, -1, row]
+                - data_of(bank, AgentPaths).log_arc[index, 10, row]
+            )
             if logged > 20.0:
                 shares.append((traffic.arc[-1, -1, row] - traffic.arc[0, -1, row]) / logged)
     assert 0.8 < np.median(shares) < 1.3

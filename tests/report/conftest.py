@@ -1,4 +1,4 @@
-"""A hand-made scene (curved road, light, everyone on it) and run folders as an evaluation and a training write them."""
+"""A hand-made scenario (curved road, light, agents of every kind) and run folders of evaluations and a training."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def make_scenario(number: int) -> Scenario:
 
 
 def offset_path(scenario: Scenario, sideways_m: float) -> np.ndarray:
-    """The log's drive, leaving it to the left by ``sideways_m`` at the end: [91, 4]."""
+    """The log's path ``[91, 4]``, offset to the left by up to ``sideways_m`` at the end."""
     xy, heading = scenario.agent_xy[:, 0], scenario.agent_heading[:, 0]
     speed = np.linalg.norm(scenario.agent_velocity[:, 0], axis=-1)
     away = sideways_m * np.clip((np.arange(91) - 10) / 80, 0, None)
@@ -152,7 +152,7 @@ def episode(planner: str, scenario: Scenario, number: int) -> dict[str, object]:
 
 
 def commands(planner: str) -> np.ndarray:
-    """Eighty actions: a wave of the policy's, others ask for nothing."""
+    """Eighty actions: a wave for the policy, zero for others."""
     wave = np.sin(np.arange(80) / 7.0) * (planner == "policy")
     return np.stack((wave, -wave / 2), -1).astype(np.float16)
 

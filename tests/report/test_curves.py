@@ -21,12 +21,12 @@ from drivax.report.runs import read_runs
         (3, 3, [1, 2, 3, 4, 5]),
     ],
 )
-def test_ticks_by_hand(low, high, expected):
+def test_ticks_are_round_numbers(low, high, expected):
     np.testing.assert_allclose(ticks(low, high, 5), expected, atol=1e-9)
 
 
 @given(st.floats(-1e9, 1e9), st.floats(-1e9, 1e9))
-def test_ticks_enclose_evenly(a, b):
+def test_ticks_are_even_and_enclose_the_range(a, b):
     low, high = min(a, b), max(a, b)
     found = np.array(ticks(low, high, 5))
     slack = 1e-6 * max(1.0, abs(low), abs(high))
@@ -34,11 +34,11 @@ def test_ticks_enclose_evenly(a, b):
     np.testing.assert_allclose(np.diff(found), found[1] - found[0], rtol=1e-6)
 
 
-def test_compact():
+def test_compact_numbers_use_k_m_and_g():
     assert [compact(v) for v in (0, 1500, 2.5e6, -0.25, 1e-3)] == ["0", "1.5k", "2.5M", "−0.25", "0.001"]
 
 
-def test_a_straight_line_is_drawn_straight_and_to_scale():
+def test_straight_line_is_drawn_straight_and_to_scale():
     points = np.array([[0.0, 0.0], [50.0, 0.5], [100.0, 1.0]])
     html = chart("rollout/success", {"a <run>": (Stroke("#123456"), points)}, share=True)
     drawn = np.array(
@@ -52,13 +52,13 @@ def test_a_straight_line_is_drawn_straight_and_to_scale():
     assert "a &lt;run&gt;" in html and "<run>" not in html
 
 
-def test_many_points_are_averaged():
+def test_long_curves_are_averaged_into_bins():
     points = np.stack((np.arange(10_000.0), np.full(10_000, 2.0)), axis=-1)
     html = chart("loss", {"a": (Stroke("#123456"), points)})
     assert len(re.search(r'points="([^"]+)"', html)[1].split()) == 150
 
 
-def test_sections(runs):
+def test_rollout_curves_come_first_and_losses_are_folded(runs):
     html = curve_sections(read_runs(runs)[1])
     first, rest = html.split("<details>")
     assert "rollout/success" in first and "loss/policy" in rest and "1 more curves" in rest

@@ -11,7 +11,7 @@ from drivax.report.charts.distributions import distribution, distribution_charts
 from drivax.report.runs import read_runs
 
 
-def test_a_staircase_by_hand():
+def test_distribution_is_a_staircase():
     found = distribution([3.0, np.nan, 1.0, 3.0, 2.0])
     np.testing.assert_allclose(
         found, [(1, 0), (1, 0.25), (2, 0.25), (2, 0.5), (3, 0.5), (3, 0.75), (3, 0.75), (3, 1.0)]
@@ -20,7 +20,7 @@ def test_a_staircase_by_hand():
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=400))
-def test_a_staircase_is_the_share_of_values_up_to_a_value(values):
+def test_distribution_is_the_share_of_values_up_to_a_value(values):
     found = distribution(values)
     assert (
         found[0, 1] == 0 and found[-1, 1] == 1 and (np.diff(found, axis=0) >= 0).all() and len(found) <= 150
@@ -32,7 +32,7 @@ def test_a_staircase_is_the_share_of_values_up_to_a_value(values):
         assert below - 1e-9 <= share <= exact + 1e-9
 
 
-def test_charts_are_drawn_of_what_varies(runs):
+def test_only_varying_metrics_have_a_chart(runs):
     evaluations, _ = read_runs(runs)
     html = distribution_charts(evaluations)
     titles = re.findall(r"<figcaption>([^<]+)</figcaption>", html)
@@ -43,7 +43,7 @@ def test_charts_are_drawn_of_what_varies(runs):
     assert distribution_charts(evaluations[:0]) == ""
 
 
-def test_nine_planners_are_told_apart(runs):
+def test_nine_planners_have_distinct_strokes(runs):
     policy = read_runs(runs)[0][-1]
     html = distribution_charts([replace(policy, name=f"planner {place}") for place in range(9)])
     legend, *charts = html.split("<figure")

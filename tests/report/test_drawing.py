@@ -11,7 +11,7 @@ from drivax.scenario.schema import AgentKind, LightState, RoadKind
 from .conftest import RADIUS_M, offset_path, on_arc
 
 
-def test_shuffled_segments_become_whole_lines_again(scenarios):
+def test_shuffled_segments_are_joined_to_whole_lines(scenarios):
     lines = road_lines(scenarios[0])
     assert [len(lines[name]) for name in LAYERS] == [1, 1, 1, 1, 2]
     assert len(lines["lane"][0]) == 61
@@ -20,7 +20,7 @@ def test_shuffled_segments_become_whole_lines_again(scenarios):
     np.testing.assert_array_equal(lines["crosswalk"][0][0], lines["crosswalk"][0][-1])
 
 
-def test_a_box_cuts_lines_where_they_leave_it(scenarios):
+def test_lines_end_at_the_box(scenarios):
     # A low band across the left curve: the edge on the right leaves it and does not come back.
     lines = road_lines(scenarios[0], (-1000.0, -1000.0, 1000.0, 20.0))
     middles = [(line[1:] + line[:-1]) / 2 for group in lines.values() for line in group]

@@ -1,4 +1,4 @@
-"""Histograms: bins hold every value once, drawings show the shares, the page needs nothing else."""
+"""Histograms and the self-contained page about scenario sets."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def test_bins_hold_every_value_once(numbers):
         ([0.0, 0.0], [-1.5, -0.5, 0.5, 1.5]),
     ],
 )
-def test_whole_numbers_have_bins_of_their_own(values, edges):
+def test_whole_numbers_are_bin_centres(values, edges):
     np.testing.assert_allclose(bins(np.array(values, np.float64)), edges)
 
 
-def test_heights_are_shares():
+def test_bar_heights_are_shares():
     # 1, 1, 1, 2: bars of 75 % and 25 %, so that one is three times as high.
     text = histogram("cars", {"a": np.array([1.0, 1.0, 1.0, 2.0])})
     heights = [float(height) for height in re.findall(r'<rect [^>]*height="([\d.]+)"', text)]
@@ -54,7 +54,7 @@ def test_heights_are_shares():
     assert "median 1, most 2, n 4" in text
 
 
-def test_several_series_share_their_bins():
+def test_series_share_their_bins():
     text = histogram("cars", {"a": np.array([1.0, 2.0]), "b": np.array([9.0]), "none": np.zeros(0)})
     lines = re.findall(r'<polyline[^>]*points="([^"]*)"', text)
     ends = {tuple(line.split()[i] for i in (0, -1)) for line in lines}
@@ -62,7 +62,7 @@ def test_several_series_share_their_bins():
     assert "none: n 0" in text and "<rect" not in text
 
 
-def test_names_cannot_break_the_page():
+def test_names_are_escaped():
     text = histogram("a<b", {"<script>": np.array([1.0]), "&": np.array([2.0])})
     assert "<script>" not in text and "a&lt;b" in text
 
@@ -86,7 +86,7 @@ class _Tags(HTMLParser):
             assert self.open and self.open.pop() == tag
 
 
-def test_the_page_is_whole_and_loads_nothing(hand_set, tmp_path):
+def test_page_nests_and_loads_nothing(hand_set, tmp_path):
     one = Inspection.open(hand_set, Selection())
     page = write_histograms([one, one], tmp_path / "page.html")
     parser = _Tags()
@@ -95,7 +95,7 @@ def test_the_page_is_whole_and_loads_nothing(hand_set, tmp_path):
     assert len(page.read_bytes()) < 200_000
 
 
-def test_an_existing_page_is_kept(hand_set, tmp_path):
+def test_existing_page_is_kept(hand_set, tmp_path):
     one = Inspection.open(hand_set, Selection())
     page = tmp_path / "page.html"
     page.write_text("mine")

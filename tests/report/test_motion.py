@@ -21,7 +21,7 @@ def wavy(steps=91):
     return np.column_stack((xy, (heading + np.pi) % (2 * np.pi) - np.pi, speed))
 
 
-def test_signals_are_scipys_filter_of_the_motion():
+def test_signals_equal_scipy_savgol_filter():
     path = wavy()
     found = signals(path)
     along = np.diff(path[:, 3]) / 0.1
@@ -39,13 +39,13 @@ def test_signals_are_scipys_filter_of_the_motion():
     np.testing.assert_allclose(found["curvature"][1:], rate / middle, atol=1e-9)
 
 
-def test_lateral_acceleration_is_that_of_the_comfort_metric():
+def test_lateral_acceleration_equals_the_comfort_metric():
     path = wavy().astype(np.float32)
     judged = np.asarray(check_trip_comfort(jnp.asarray(path)).lateral_mps2)
     np.testing.assert_allclose(np.abs(signals(path)["lateral"][9:]), judged[1:], atol=2e-3)
 
 
-def test_a_circle_has_its_curvature():
+def test_circle_has_constant_curvature():
     angle = np.arange(91) * 0.1 * 6.0 / 40.0  # 6 m/s on a radius of 40 m
     path = np.column_stack((40 * np.sin(angle), 40 - 40 * np.cos(angle), angle, np.full(91, 6.0)))
     found = signals(path)
@@ -54,7 +54,7 @@ def test_a_circle_has_its_curvature():
     np.testing.assert_allclose(found["jerk"][1:], 0, atol=1e-9)
 
 
-def test_gaps_and_short_paths_say_nothing_that_is_not_there():
+def test_signals_are_nan_in_gaps_and_short_paths():
     path = wavy()
     path[:20] = np.nan
     path[80:] = np.nan
@@ -70,7 +70,7 @@ def test_gaps_and_short_paths_say_nothing_that_is_not_there():
     assert all(np.isnan(values).all() for values in signals(np.full((91, 4), np.nan)).values())
 
 
-def test_the_page_gets_them_in_their_own_steps():
+def test_packed_signals_are_within_half_a_step():
     scenario = make_scenario(0)
     ego = offset_path(scenario, 3.0)
     ego[85:] = np.nan

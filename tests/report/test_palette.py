@@ -1,4 +1,4 @@
-"""Colours that have to be told apart are far from each other, with every kind of colour vision."""
+"""Neighbouring colours differ with every kind of colour vision."""
 
 import itertools
 
@@ -24,7 +24,7 @@ LIGHTS = ("red", "amber", "green", "unknown")
 
 
 def lab(colour, vision):
-    """CIE L*a*b* of a hex colour as it is seen."""
+    """CIE L*a*b* of a hex colour under a kind of vision."""
     values = np.array([int(colour[at : at + 2], 16) for at in (1, 3, 5)]) / 255
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
     ratio = XYZ @ np.clip(np.asarray(VISION[vision]) @ linear, 0, 1) / WHITE
@@ -36,7 +36,7 @@ def distance(one, other, vision):
     return float(np.linalg.norm(lab(one, vision) - lab(other, vision)))
 
 
-def test_the_oracle_knows_black_white_and_red():
+def test_reference_lab_values_of_black_white_and_red():
     np.testing.assert_allclose(lab("#ffffff", "normal"), (100, 0, 0), atol=1e-3)
     np.testing.assert_allclose(lab("#000000", "deuteranopia"), 0, atol=1e-9)
     np.testing.assert_allclose(lab("#ff0000", "normal"), (53.24, 80.09, 67.20), atol=0.02)  # CIE76, D65
@@ -46,8 +46,8 @@ def test_the_oracle_knows_black_white_and_red():
 @pytest.mark.parametrize("vision", VISION)
 @pytest.mark.parametrize("theme", THEMES)
 @pytest.mark.parametrize("group", [CLASSES, LIGHTS])
-def test_what_stands_side_by_side_differs(vision, theme, group):
-    """At 2.3 two colours are just told apart (Mahy et al. 1994); here it is six times as much."""
+def test_neighbouring_colours_differ(vision, theme, group):
+    """The threshold is six times the just noticeable difference of 2.3 (Mahy et al. 1994)."""
     colours = THEMES[theme]
     for one, other in itertools.combinations(group, 2):
         assert distance(colours[one], colours[other], vision) > 14, (one, other)
@@ -55,25 +55,25 @@ def test_what_stands_side_by_side_differs(vision, theme, group):
 
 @pytest.mark.parametrize("vision", VISION)
 @pytest.mark.parametrize("theme", THEMES)
-def test_everything_stands_out_from_the_ground(vision, theme):
+def test_all_colours_differ_from_the_ground(vision, theme):
     colours = THEMES[theme]
     for name in (*CLASSES, *LIGHTS, "edge", "lane", "line", "route", "log", "stop", "mark", "ink"):
         assert distance(colours[name], colours["ground"], vision) > 14, name
 
 
 @pytest.mark.parametrize("vision", VISION)
-def test_lines_of_charts_differ(vision):
+def test_colours_of_chart_lines_differ(vision):
     assert min(distance(a, b, vision) for a, b in itertools.combinations(SERIES, 2)) > 14
 
 
-def test_lines_beyond_the_colours_are_dashed():
+def test_lines_beyond_six_are_dashed():
     strokes = [stroke(place) for place in range(18)]
     assert len({(one.colour, one.dash) for one in strokes}) == 18 and len({one.key for one in strokes}) == 18
     assert [one.colour for one in strokes[:6]] == list(SERIES) and not any(one.dash for one in strokes[:6])
     assert strokes[6].svg == f'stroke="{SERIES[0]}" stroke-dasharray="6 3"' and stroke(18) == strokes[0]
 
 
-def test_the_legend_names_every_class_and_light():
+def test_legend_names_every_class_and_light():
     named = {name for name, _ in LEGEND}
     assert {*CLASSES, *LIGHTS, "route", "log", "stop", "goal", "mark"} == named
     assert set(THEMES["light"]) == set(THEMES["dark"])

@@ -33,7 +33,7 @@ def packed(scenario, drive):
     return json.loads(json.dumps(pack_episode(scenario, [drive], "title"), allow_nan=False))
 
 
-def test_drives_come_back_within_half_a_unit(packed, drive):
+def test_rollouts_are_packed_within_half_a_unit(packed, drive):
     stored = packed["rollouts"][0]
     pose = shorts(stored["pose"], 91, 3)
     xy = pose[:80, :2] * packed["unit"] + packed["centre"]
@@ -44,7 +44,7 @@ def test_drives_come_back_within_half_a_unit(packed, drive):
     assert stored["events"] == {"collision": 40, "red_light": 3} and stored["start"] == 10
 
 
-def test_agents_come_back_and_far_ones_are_left_out(packed, scenario):
+def test_near_agents_are_packed_and_far_ones_left_out(packed, scenario):
     agents = packed["agents"]
     assert agents["kind"] == ["vehicle", "pedestrian", "cyclist"]
     pose = shorts(agents["pose"], 3, 91, 3)
@@ -58,7 +58,7 @@ def test_agents_come_back_and_far_ones_are_left_out(packed, scenario):
     assert shorts(packed["parked"]["seen"], 1, 2).tolist() == [[5, 79]]
 
 
-def test_map_route_and_lights_come_back(packed, scenario):
+def test_map_route_and_lights_are_packed(packed, scenario):
     lane = packed["map"]["lane"]
     counts = shorts(lane["counts"], -1)
     points = shorts(lane["points"], -1, 2) * packed["unit"] + packed["centre"]
@@ -73,11 +73,11 @@ def test_map_route_and_lights_come_back(packed, scenario):
     np.testing.assert_allclose(route, scenario.route_xy[0, :100], atol=packed["unit"])
 
 
-def test_an_episode_is_small(packed):
+def test_packed_episode_is_below_40_kb(packed):
     assert len(json.dumps(packed)) < 40_000
 
 
-def test_long_drives_coarsen_the_unit_and_still_fit():
+def test_long_episodes_use_a_coarser_unit():
     scale = Scale.of((-900.0, 0.0, 900.0, 10.0))
     assert 0.01 < scale.unit_m < 0.03
     points = np.array([[-905.0, 0.0], [905.0, 10.0]])

@@ -81,7 +81,7 @@ def page(runs, tmp_path):
     return html, Page(html)
 
 
-def test_the_page_is_self_contained(page):
+def test_page_is_self_contained(page):
     html, parsed = page
     assert not parsed.links and "url(" not in html and "@import" not in html
     assert not re.search(
@@ -91,7 +91,7 @@ def test_the_page_is_self_contained(page):
     assert "fetch(" not in html and "XMLHttpRequest" not in html and "import(" not in html
 
 
-def test_tables_are_what_the_csv_files_say(page, runs):
+def test_tables_equal_the_csv_files(page, runs):
     """Means, intervals and n of every rate, recomputed with nothing but the csv module and Wilson's formula."""
     _, parsed = page
     header, *rows = parsed.tables[0]
@@ -116,14 +116,14 @@ def test_tables_are_what_the_csv_files_say(page, runs):
                 assert mean == f"{sum(values) / len(values):.3f}"
 
 
-def test_undefined_everywhere_is_an_empty_cell_with_its_n(page):
+def test_undefined_metric_is_an_empty_cell_with_n_0(page):
     _, parsed = page
     header, *rows = parsed.tables[1]
     place = [re.sub(r" [↑↓]$", "", cell.strip()) for cell in header].index("minimum TTC [s]")
     assert all(row[place] == "–|n 0" for row in rows)
 
 
-def test_differences_are_what_the_csv_files_say(page, runs):
+def test_differences_equal_the_csv_files(page, runs):
     _, parsed = page
     header, *rows = parsed.tables[2]
     assert header[1:] == ["expert", "constant"]
@@ -148,7 +148,7 @@ def test_differences_are_what_the_csv_files_say(page, runs):
             assert cell.endswith(f"n {len(pairs)}")
 
 
-def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
+def test_player_data_parse_and_cannot_end_their_element(page):
     html, parsed = page
     data = [json.loads(text) for attrs, text in parsed.scripts if attrs.get("type") == "application/json"]
     style, *episodes, listed = data
@@ -163,8 +163,8 @@ def test_data_of_the_player_parse_and_cannot_leave_their_element(page):
     assert len(html.encode()) < 600_000
 
 
-def test_steps_before_the_planner_took_over_are_the_logs(page, scenarios):
-    """The stored path begins where the planner took over; the page shows the logged drive before."""
+def test_steps_before_the_takeover_are_the_log(page, scenarios):
+    """The stored path starts at the takeover; the page shows the log before."""
     _, parsed = page
     episode = next(json.loads(t) for a, t in parsed.scripts if a.get("class") == "episode")
     from .test_player_data import shorts
@@ -175,7 +175,7 @@ def test_steps_before_the_planner_took_over_are_the_logs(page, scenarios):
     np.testing.assert_allclose(pose[10:], offset_path(scenarios[1], 3.0)[10:, :2], atol=episode["unit"])
 
 
-def test_a_moved_set_is_named_and_can_be_given(runs, tmp_path, hand_set):
+def test_moved_set_is_an_error_unless_given(runs, tmp_path, hand_set):
     for folder in runs[:3]:
         about = json.loads((folder / "run.json").read_text())
         about["data"]["path"] = str(tmp_path / "gone")
@@ -187,10 +187,10 @@ def test_a_moved_set_is_named_and_can_be_given(runs, tmp_path, hand_set):
     assert write_report(runs, tmp_path / "tables.html", episodes=0).stat().st_size < 100_000
 
 
-def test_another_set_is_refused(runs, tmp_path):
+def test_other_set_is_refused(runs, tmp_path):
     with ScenarioWriter(tmp_path / "other", SMALL) as writer:
         writer.add(make_scenario(0))
-    with pytest.raises(DataError, match="is not the set that 'policy' was evaluated on"):
+    with pytest.raises(DataError, match="not the set that 'policy' was evaluated on"):
         write_report(runs, tmp_path / "report.html", data=tmp_path / "other")
     about = json.loads((runs[2] / "run.json").read_text())
     (runs[2] / "run.json").write_text(json.dumps(about | {"data": {"path": str(tmp_path / "other")}}))
@@ -201,7 +201,7 @@ def test_another_set_is_refused(runs, tmp_path):
         write_report(runs, tmp_path / "report.html")
 
 
-def test_nothing_is_overwritten_or_left_half_written(runs, tmp_path, monkeypatch):
+def test_failed_write_leaves_the_old_page(runs, tmp_path, monkeypatch):
     out = tmp_path / "out" / "report.html"
     write_report(runs, out)
     before = out.read_bytes()
@@ -226,7 +226,7 @@ def test_equal_runs_give_equal_pages(runs, tmp_path):
     assert pages[0] == pages[1]
 
 
-def test_trainings_alone_and_one_planner_alone(runs, tmp_path):
+def test_report_of_trainings_or_one_planner_alone(runs, tmp_path):
     alone = Page(write_report([runs[-1]], tmp_path / "training.html").read_text())
     assert "Learning curves" in alone.text and "Results" not in alone.text
     single = Page(write_report([runs[2]], tmp_path / "single.html").read_text())
@@ -234,7 +234,7 @@ def test_trainings_alone_and_one_planner_alone(runs, tmp_path):
 
 
 def crash(folder, number, step, error):
-    """What a run says whose planner crashed in a scenario."""
+    """Write a crash of the planner into a run folder."""
     header, *rows = (folder / "episodes.csv").read_text().splitlines()
     rows = [f"{row},{int(place == number)}" for place, row in enumerate(rows)]
     (folder / "episodes.csv").write_text("\n".join([f"{header},crashed", *rows]) + "\n")
@@ -242,7 +242,7 @@ def crash(folder, number, step, error):
     (folder / "crashes.json").write_text(json.dumps([row]))
 
 
-def test_crashes_are_told_with_step_and_error(runs, tmp_path):
+def test_crashes_are_shown_with_step_and_error(runs, tmp_path):
     before = Page(write_report(runs, tmp_path / "before.html").read_text())
     assert not any("crashed" in cell for cell in before.tables[0][0]), "nobody crashed"
     crash(runs[2], 2, 55, "ValueError: too <fast>")
@@ -258,7 +258,7 @@ def test_crashes_are_told_with_step_and_error(runs, tmp_path):
 
 
 @needs_browser
-def test_the_error_of_a_crash_is_the_title_of_its_cell(runs, tmp_path):
+def test_crash_error_is_the_title_of_its_cell(runs, tmp_path):
     crash(runs[2], 2, 55, "ValueError: too <fast>")
     act = """
       const cell = document.querySelector("#rows tr td");
@@ -272,7 +272,7 @@ def test_the_error_of_a_crash_is_the_title_of_its_cell(runs, tmp_path):
 
 
 def react(run):
-    """Stores where reactive traffic went: slot 1 stands still left of where ego began, nobody else is there."""
+    """Store reactive traffic: slot 1 stands still left of ego's start, no other agent is present."""
     with np.load(run / "trajectories.npz") as stored:
         arrays = dict(stored)
     others = np.full((*arrays["ego"].shape[:2], 2, 3), -32768, np.int16)
@@ -280,7 +280,7 @@ def react(run):
     np.savez(run / "trajectories.npz", **arrays, others=others)
 
 
-def test_others_are_shown_as_they_reacted_to_the_last_run(runs, tmp_path):
+def test_reactive_agents_are_those_of_the_last_run(runs, tmp_path):
     for run in runs[:3]:
         about = json.loads((run / "run.json").read_text())
         (run / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
@@ -296,19 +296,19 @@ def test_others_are_shown_as_they_reacted_to_the_last_run(runs, tmp_path):
     assert "Other agents are drawn" not in alone.text
 
 
-def test_other_traffic_is_said_and_not_compared(runs, tmp_path):
+def test_runs_in_other_traffic_are_not_compared(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     (runs[0] / "run.json").write_text(json.dumps(about | {"traffic": "idm"}))
     with pytest.raises(DataError, match="lacks an array: others"):
         read_runs(runs)
     react(runs[0])
     parsed = Page(write_report(runs, tmp_path / "report.html").read_text())
-    said = "expert and policy drove in different traffic (idm and log)."
+    said = "expert and policy differ in traffic (idm and log)."
     assert said in parsed.text and "constant and policy" not in parsed.text
-    assert all(row[1] == "no pairs: drove in different traffic (log and idm)" for row in parsed.tables[2][1:])
+    assert all(row[1] == "no pairs: differ in traffic (log and idm)" for row in parsed.tables[2][1:])
 
 
-def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
+def test_page_names_runs_with_other_starts_or_fewer_scenarios(runs, tmp_path):
     """A noisy run from another step makes no pairs; one of two of the eight scenarios makes two."""
     (runs[0] / "config.yaml").write_text("noisy_start: true\nstart_step: 40\n")
     (runs[2] / "config.yaml").write_text("noisy_start: false\nstart_step: 10\n")
@@ -324,7 +324,7 @@ def test_other_starts_and_fewer_scenarios_are_said(runs, tmp_path):
     assert {one["planner"] for episode in drives for one in episode} == {"constant", "policy"}
 
 
-def test_the_command(runs, tmp_path, capsys):
+def test_report_command(runs, tmp_path, capsys):
     assert main(["report", *map(str, runs), "--out", str(tmp_path / "r.html"), "--episodes", "2"]) == 0
     assert "r.html" in capsys.readouterr().out
     assert main(["report", *map(str, runs[:3])]) == 0 and (runs[2] / "report.html").is_file()
@@ -336,8 +336,8 @@ def test_the_command(runs, tmp_path, capsys):
 
 
 @needs_browser
-def test_the_player_plays_in_a_browser(runs, tmp_path, scenarios):
-    """No errors, one canvas per planner, and what the page reads out at a step is what was stored."""
+def test_player_works_in_a_browser(runs, tmp_path, scenarios):
+    """No errors, one canvas per planner, and the displayed numbers of a step are the stored ones."""
     html = write_report(runs, tmp_path / "report.html")
     act = """
       const key = (name) => document.body.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));

@@ -10,15 +10,15 @@ from drivax.report.episodes import EpisodeGroup, rollouts_of
 from drivax.report.runs import read_runs
 
 
-def test_what_was_written_is_read(runs, scenarios):
+def test_evaluations_and_trainings_are_read(runs, scenarios):
     evaluations, trainings = read_runs(runs)
     assert [run.name for run in evaluations] == ["expert", "constant", "policy"]
     policy = evaluations[-1]
-    assert policy.episodes == 8 and policy.traffic == "log" and policy.data["hash"] == scenarios.hash
+    assert len(policy) == 8 and policy.traffic == "log" and policy.data["hash"] == scenarios.hash
     np.testing.assert_array_equal(policy.metrics["collision"], [0, 1, 0, 0, 0, 1, 0, 0])
     assert np.isnan(policy.metrics["red_light"][::3]).all() and policy.metrics["red_light"][4] == 1
     assert "seed" not in policy.metrics
-    row = policy.trajectories.rows["hand-03", 0]
+    row = policy.keys["scenario_id"].index("hand-03")
     assert policy.trajectories.events["offroad"][row] == 40
     assert policy.trajectories.ego.shape == (8, 81, 4)
     curves = trainings[0].curves
@@ -27,7 +27,7 @@ def test_what_was_written_is_read(runs, scenarios):
     assert len(curves["loss/policy"]) == 20, "half a last row is left out"
 
 
-def test_repeated_names_stay_apart(runs):
+def test_repeated_names_get_the_folder_as_suffix(runs):
     folder = runs[1]
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"planner": "expert"}))
@@ -35,7 +35,7 @@ def test_repeated_names_stay_apart(runs):
     assert [run.name for run in evaluations] == ["expert", "expert (constant)", "policy"]
 
 
-def test_repeated_scenarios_keep_their_own_trajectory(runs):
+def test_repeated_scenarios_keep_their_trajectories(runs):
     folder = runs[0]
     lines = (folder / "episodes.csv").read_text().splitlines()
     (folder / "episodes.csv").write_text("\n".join([*lines, lines[1].replace(",0,log", ",1,log", 1)]) + "\n")
@@ -44,11 +44,11 @@ def test_repeated_scenarios_keep_their_own_trajectory(runs):
                   else np.append(array, array[0]) for name, array in stored.items()}  # fmt: skip
     np.savez(folder / "trajectories.npz", **arrays)
     run = read_runs([folder])[0][0]
-    assert run.occurrences[0] == ("hand-00", 0) and run.occurrences[8] == ("hand-00", 1)
-    assert run.trajectories.rows["hand-00", 1] == 8
+    assert run.keys["scenario_id"][0] == run.keys["scenario_id"][8] == "hand-00"
+    np.testing.assert_array_equal(run.trajectories.ego[8], run.trajectories.ego[0] + 1)
 
 
-def test_actions_are_read_where_a_run_tells_them(runs, scenarios):
+def test_actions_are_nan_in_runs_without_them(runs, scenarios):
     run = read_runs([runs[2]])[0][0]
     assert run.trajectories.action.shape == (8, 80, 2)
     choice = EpisodeGroup("hand", "hand-03", (3,), "offroad")
@@ -94,11 +94,11 @@ def _lacks(folder):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (_remove("run.json"), "run.json: is missing"),
-        (_remove("episodes.csv"), "episodes.csv: is missing"),
-        (_remove("trajectories.npz"), "trajectories.npz: is missing"),
-        (_write("run.json", "{"), "not JSON"),
-        (_write("run.json", "[1]"), "no table of facts"),
+        (_remove("run.json"), "not a run folder: no run.json"),
+        (_remove("episodes.csv"), "episodes.csv: file not found"),
+        (_remove("trajectories.npz"), "trajectories.npz: file not found"),
+        (_write("run.json", "{"), "not valid JSON"),
+        (_write("run.json", "[1]"), "not a JSON object"),
         (_write("run.json", '{"kind": "study"}'), "of kind 'study'"),
         (_write("episodes.csv", ""), "lacks the column 'planner'"),
         (_edit("episodes.csv", "segment", "recording"), "lacks the column 'segment'"),
@@ -112,7 +112,7 @@ def _lacks(folder):
         (_lacks, "lacks an array"),
     ],
 )
-def test_damage_is_named_with_its_cure(runs, damage, words):
+def test_damaged_files_are_errors_with_a_cure(runs, damage, words):
     damage(runs[0])
     with pytest.raises(DataError) as caught:
         read_runs(runs)
@@ -120,27 +120,27 @@ def test_damage_is_named_with_its_cure(runs, damage, words):
     assert "\n" not in str(caught.value)
 
 
-def test_an_evaluation_without_episodes_is_refused(runs):
+def test_evaluation_without_episodes_is_refused(runs):
     path = runs[0] / "episodes.csv"
     path.write_text(path.read_text().splitlines()[0] + "\n")
     with pytest.raises(DataError, match="no episodes"):
         read_runs(runs)
 
 
-def test_training_damage(runs):
+def test_damaged_training_log_is_an_error(runs):
     log = runs[-1] / "metrics.jsonl"
     log.write_text(log.read_text().replace('"step": 300', '"stop": 300'))
-    with pytest.raises(DataError, match="record 4: is no row of metrics"):
+    with pytest.raises(DataError, match="record 4: not a metrics row"):
         read_runs(runs)
     log.unlink()
-    with pytest.raises(DataError, match=r"metrics\.jsonl: is missing"):
+    with pytest.raises(DataError, match=r"metrics\.jsonl: file not found"):
         read_runs(runs)
 
 
-def test_runs_must_exist_once(runs, tmp_path):
+def test_runs_must_exist_and_be_given_once(runs, tmp_path):
     with pytest.raises(UsageError, match="once"):
         read_runs([runs[0], tmp_path / "x" / ".." / runs[0].name])
     with pytest.raises(UsageError):
         read_runs([])
-    with pytest.raises(DataError, match="no such run folder"):
+    with pytest.raises(DataError, match="run folder not found"):
         read_runs([tmp_path / "nowhere"])

@@ -28,7 +28,7 @@ def share(image, name, near=2, theme=LIGHT):
     return int((np.abs(image - wanted).max(axis=-1) <= near).sum())
 
 
-def test_what_is_there_is_drawn_and_only_that():
+def test_only_present_things_are_drawn():
     from drivax.report.pictures.still import draw_scenario
 
     scenario = make_scenario(0)
@@ -42,7 +42,7 @@ def test_what_is_there_is_drawn_and_only_that():
     )
 
 
-def test_the_legend_and_the_dark():
+def test_legend_has_every_colour_of_the_dark_theme():
     from drivax.report.pictures.still import draw_scenario
 
     scenario = make_scenario(0)
@@ -56,7 +56,7 @@ def test_the_legend_and_the_dark():
     assert not edges[:, :4].any() and not edges[:, -4:].any(), "the legend fits"
 
 
-def test_a_driven_path_moves_the_ego_and_leaves_the_log_dashed():
+def test_path_moves_ego_and_leaves_the_log_dashed():
     from drivax.report.pictures.still import draw_scenario
 
     scenario = make_scenario(0)
@@ -69,7 +69,7 @@ def test_a_driven_path_moves_the_ego_and_leaves_the_log_dashed():
     assert pixels(draw_scenario(scenario, 60, gone)).shape == image.shape
 
 
-def test_impossible_steps_and_a_missing_matplotlib_are_named(monkeypatch):
+def test_impossible_step_and_missing_matplotlib_are_errors(monkeypatch):
     from drivax.report.pictures.still import draw_scenario
 
     with pytest.raises(UsageError, match="0 to 90"):

@@ -34,12 +34,12 @@ def written(runs, tmp_path):
     return {file.name: file for file in write_tables(runs, tmp_path / "tables")}
 
 
-def test_which_tables(written):
+def test_each_table_has_three_files(written):
     names = {name.rsplit(".", 1)[0] for name in written}
     assert names == {"results", "differences", "collisions", "by-difficulty"} and len(written) == 12
 
 
-def test_csv_holds_what_the_run_says(written, runs):
+def test_csv_equals_the_episodes_of_the_run(written, runs):
     with written["results.csv"].open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["planner"] for row in rows} == {NASTY, HARD, "policy"}
@@ -73,14 +73,14 @@ def test_markdown_has_a_cell_for_every_column(written):
     assert "points" in written["differences.md"].read_text()
 
 
-def test_markdown_renders_as_the_words_that_it_holds(written):
+def test_markdown_renders_special_characters_as_text(written):
     for name in ("results.md", "by-difficulty.md"):
         html = MarkdownIt("gfm-like", {"linkify": False}).render(written[name].read_text())
         cells = [unescape(cell) for cell in re.findall(r"<t[hd].*?>(.*?)</t[hd]>", html)]
         assert NASTY in cells and HARD in cells, name
 
 
-def test_progress_and_own_metrics_are_exported_and_others_on_request(runs, tmp_path):
+def test_progress_own_and_requested_metrics_are_exported(runs, tmp_path):
     for folder in runs[:3]:
         header, *rows = (folder / "episodes.csv").read_text().splitlines()
         more = [f"{row},{7 * place},0.5,{place}" for place, row in enumerate(rows)]
@@ -107,7 +107,7 @@ def plain(text):
     return re.sub(r"\\[\\{}&%$#_]", "", re.sub(r"\\\\(?= |$)", "", text, flags=re.M))
 
 
-def test_latex_is_sound(written):
+def test_latex_has_balanced_braces_and_columns(written):
     for name, file in written.items():
         if not name.endswith(".tex"):
             continue
@@ -143,7 +143,7 @@ def test_latex_compiles(written, tmp_path):
     assert paper.with_suffix(".pdf").stat().st_size > 5000
 
 
-def test_what_is_refused(runs, tmp_path, hand_set, capsys):
+def test_existing_files_and_wrong_arguments_are_refused(runs, tmp_path, hand_set, capsys):
     out = tmp_path / "tables"
     assert main(["report", *map(str, runs), "--tables", "--out", str(out)]) == 0
     assert "results.csv" in capsys.readouterr().out
@@ -163,7 +163,7 @@ def test_what_is_refused(runs, tmp_path, hand_set, capsys):
     assert write_tables(runs, tmp_path / "moved", data=hand_set)
 
 
-def test_transfer_needs_two_sets(runs, tmp_path):
+def test_transfer_table_needs_two_sets(runs, tmp_path):
     about = json.loads((runs[0] / "run.json").read_text())
     data = {"path": "elsewhere/b", "hash": "f00"}
     trained = [{"path": "elsewhere/b", "hash": "f00"}]

@@ -1,4 +1,4 @@
-"""Videos: what is in the frames, what the files are called, and how fast they are made."""
+"""Videos: contents of frames, names of files, and speed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def scene(theme="light"):
 
 
 @pytest.mark.parametrize("theme", THEMES)
-def test_a_frame_shows_what_is_there_and_only_that(theme):
+def test_frame_shows_only_present_things(theme):
     from drivax.report.pictures.frames import draw_frame
 
     scenario, scenery = scene(theme)
@@ -51,7 +51,7 @@ def test_a_frame_shows_what_is_there_and_only_that(theme):
     assert close(late, "pedestrian", theme).sum() > 20 > close(early, "pedestrian", theme).sum()
 
 
-def test_ego_is_where_it_drove_and_the_camera_follows():
+def test_camera_follows_ego():
     """Metres and pixels: the picture is 690 / 70 pixels per metre, ego is in the middle below the bar."""
     from drivax.report.pictures.frames import draw_frame
 
@@ -79,7 +79,7 @@ def test_failures_are_marked_from_their_step_on():
     assert draw_frame(scenery, never, 20, 0.1).shape == (720, 720, 4)
 
 
-def test_the_legend_is_complete():
+def test_legend_has_every_colour():
     from drivax.report.pictures.frames import legend_strip
 
     for theme in THEMES:
@@ -95,7 +95,7 @@ def decoded(path):
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], stream.average_rate
 
 
-def test_the_files(runs, tmp_path, capsys):
+def test_video_starts_at_the_takeover(runs, tmp_path, capsys):
     out = tmp_path / "videos"
     assert main(["report", *map(str, runs), "--video", "worst:1", "--out", str(out)]) == 0
     assert "1 videos" in capsys.readouterr().out
@@ -106,7 +106,7 @@ def test_the_files(runs, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_side_by_side(runs, tmp_path):
+def test_side_by_side_video_has_a_pane_per_planner(runs, tmp_path):
     out = tmp_path / "videos"
     assert (
         main(["report", *map(str, runs), "--side-by-side", "hand-03", "--theme", "dark", "--out", str(out)])
@@ -119,7 +119,7 @@ def test_side_by_side(runs, tmp_path):
     assert not np.array_equal(panes[0][:30], panes[2][:30]), "each has a name of its own"
 
 
-def test_panes_in_rows():
+def test_at_most_three_panes_in_a_row():
     from drivax.report.pictures.video import frames
 
     scenario = make_scenario(0)
@@ -129,7 +129,7 @@ def test_panes_in_rows():
     assert 480 < sizes[1][0] < 600 and 960 < sizes[2][0] < 1100 and all(size[0] % 2 == 0 for size in sizes)
 
 
-def test_names_of_files(tmp_path):
+def test_file_names_have_rank_and_scenario(tmp_path):
     from drivax.report.episodes import EpisodeGroup
     from drivax.report.pictures.video import _files
 
@@ -141,7 +141,7 @@ def test_names_of_files(tmp_path):
     assert [file.name for file in _files(tmp_path, chosen[:1], ranked=False)] == ["a_b_0.mp4"]
 
 
-def test_what_is_refused(runs, tmp_path, capsys):
+def test_wrong_selections_and_existing_files_are_refused(runs, tmp_path, capsys):
     from drivax.report.pictures.video import encode, write_videos
 
     out = tmp_path / "videos"
@@ -172,7 +172,7 @@ def test_what_is_refused(runs, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_an_episode_is_drawn_faster_than_it_lasts(tmp_path):
+def test_episode_is_drawn_faster_than_real_time(tmp_path):
     from drivax.report.pictures.video import encode, frames
 
     scenario = make_scenario(0)

@@ -1,4 +1,4 @@
-"""The page: what it holds, what is refused, and that it works in a browser."""
+"""The viewer: its data, its errors, and its behaviour in a browser."""
 
 import base64
 import json
@@ -44,7 +44,7 @@ def page(data, tmp_path):
     return write_player(list(data), tmp_path / "page.html", title="roads & more")
 
 
-def test_the_logs_are_in_the_page(page, data):
+def test_page_holds_the_logs(page, data):
     text = page.read_text()
     stored = [json.loads(one) for one in re.findall(r'class="episode">(.*?)</script>', text)]
     assert [one["id"] for one in stored] == ["calm", "bad", "new"] == [one["title"] for one in stored]
@@ -59,7 +59,7 @@ def test_the_logs_are_in_the_page(page, data):
     assert [one["rollouts"][0]["outcome"] for one in stored] == ["", "collides, runs red, off-road", ""]
 
 
-def test_what_is_known_stands_beside_it(page):
+def test_details_list_tags_flags_audit_and_overflow(page):
     text = page.read_text()
     assert "<h1>roads &amp; more</h1>" in text
     assert "<b>3</b> recorded scenarios; the audit finds violations in 1 of 2." in text
@@ -74,11 +74,11 @@ def test_what_is_known_stands_beside_it(page):
     assert not re.search(r"(?:src|href)=|@import|url\(", text), "nothing is loaded from elsewhere"
 
 
-def test_findings(data):
+def test_findings_are_words(data):
     assert [findings(scenario) for scenario in data] == ["", "collides, runs red, off-road", ""]
 
 
-def test_select(data):
+def test_select_by_id_and_limit(data):
     assert [scenario.id for scenario in select(data)] == ["calm", "bad", "new"]
     assert [scenario.id for scenario in select(data, limit=2)] == ["calm", "bad"]
     assert [scenario.id for scenario in select(data, ids=("new", "calm"))] == ["new", "calm"]
@@ -89,7 +89,7 @@ def test_select(data):
         select(data, limit=0)
 
 
-def test_what_is_refused(page, data, tmp_path):
+def test_existing_page_and_empty_selection_are_refused(page, data, tmp_path):
     before = page.read_bytes()
     with pytest.raises(UsageError, match="output file already exists; choose another or pass --overwrite"):
         write_player(list(data)[:1], page)
@@ -103,7 +103,7 @@ def test_what_is_refused(page, data, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
-def test_the_command(data, tmp_path, capsys):
+def test_view_command(data, tmp_path, capsys):
     assert main(["view", str(data.path), "--limit", "2"]) == 0
     page = data.path.with_name("roads.html")
     assert "roads.html (2 of 3 scenarios, 0." in capsys.readouterr().out
@@ -114,7 +114,7 @@ def test_the_command(data, tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 1
 
 
-def test_the_most_critical_come_first_with_what_their_scores_are_made_of(data, tmp_path, capsys):
+def test_critical_scenarios_come_first_with_their_components(data, tmp_path, capsys):
     valid = np.array([scenario.agent_valid[:, 0] for scenario in data])
     urgency = np.zeros(valid.shape)
     urgency[:, 20:30] = np.array([[0.2], [0.9], [0.5]])
@@ -141,8 +141,8 @@ def test_the_most_critical_come_first_with_what_their_scores_are_made_of(data, t
 
 
 @needs_browser
-def test_browsing_in_a_browser(page, tmp_path):
-    """Opened at the second scenario, then the next one by key, then a filter that only the first one passes."""
+def test_page_works_in_a_browser(page, tmp_path):
+    """Open the second scenario, then the next by key, then filter for the first."""
     act = """
       const opened = document.querySelector("[data-control=title]").textContent;
       document.body.dispatchEvent(new KeyboardEvent("keydown", {key: "n", bubbles: true}));

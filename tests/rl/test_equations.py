@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivax.rl.advantages import generalised_advantages
-from drivax.rl.policy_gradients import clipped_surrogate_loss
+from drivax.rl.online import clipped_surrogate_loss, generalised_advantages
 
 
 def by_loop(reward, value, after, terminated, truncated, gamma, lambda_):

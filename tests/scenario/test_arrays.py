@@ -34,7 +34,7 @@ def agents() -> dict[str, Any]:
 
 @pytest.fixture
 def roads() -> dict[str, Any]:
-    """Two lanes one after the other, one beside the first, inside a closed edge."""
+    """Two lanes one after the other, another next to the first, inside a closed edge."""
     return {
         "lanes": [
             {"points": [(-50, 0), (50, 0)], "successors": [1], "left": [2], "limit_mps": 13.9},
@@ -214,7 +214,7 @@ def test_16_faster_data_keep_every_other_step():
 
 
 def test_velocities_are_differences_within_what_was_seen():
-    """By hand: one-sided at the ends, central inside, zero beside no neighbour and over gaps."""
+    """By hand: one-sided at the ends, central inside, zero without a neighbour and over gaps."""
     xy = np.zeros((1, 7, 2))
     xy[0, :, 0] = [0, 1, 4, 9, 50, 60, 80]
     valid = np.array([[True, True, True, False, True, False, False]])

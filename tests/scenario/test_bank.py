@@ -80,7 +80,7 @@ def test_trimming_changes_no_result(both):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4, err_msg=name)
 
 
-def test_a_long_ego_is_told_apart():
+def test_a_long_ego_is_marked():
     assert not bank_of(straight_road([car(0, 0, 0, 5)])).long_ego
     assert bank_of(straight_road([car(0, 0, 0, 5, length=11.0, width=2.5)])).long_ego
 

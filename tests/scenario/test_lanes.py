@@ -61,7 +61,7 @@ def test_oncoming_neighbours_are_no_neighbours_and_spacing_gives_the_width():
     assert graph.neighbours(0) == [(2, pytest.approx(-60.0)), (3, pytest.approx(0.0))]
 
 
-def test_of_several_neighbours_the_one_beside_most_of_the_lane_is_taken():
+def test_the_neighbour_along_most_of_the_lane_is_taken():
     graph = graph_of(
         lane(1, line((0, 0), (100, 0)), left_neighbours=(2, 3)),
         lane(2, line((0, 3), (25, 3))),

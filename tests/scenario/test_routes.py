@@ -392,7 +392,7 @@ def hand_score(search: LaneSearch, lane_path) -> float:
 
 
 def network(seed: int, layers: int, width: int):
-    """Layers of lanes, linked at random; some turn; straight neighbours run beside each other."""
+    """Layers of lanes, linked at random; some turn; straight neighbours run parallel."""
     rng = np.random.default_rng(seed)
     features, x = [], -30.0
     for layer in range(layers):
@@ -456,7 +456,7 @@ def test_the_published_score_by_hand_best_first():
     assert [round(score(changed, lane_path), 6) for lane_path in published_paths(changed)] == [40.0, 39.7]
 
 
-def test_published_routes_begin_beside_the_first_pose_and_lead_to_the_goal():
+def test_published_routes_begin_at_the_first_pose_and_lead_to_the_goal():
     found, _, _ = routes_of(two_pairs(), driving(speed=10.0, y=0.4), style="published")
     assert found.on_lanes
     assert found.routes[0].xyz[0] == pytest.approx([-10.0, 0.0, 0.0])

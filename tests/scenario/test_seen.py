@@ -1,4 +1,4 @@
-"""What ego's sensors would see: stored beside the truth, cut and restored with it."""
+"""What ego's sensors would see: stored next to the truth, cut and restored with it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scenario.recordings import driving, make_recording, make_tracks, straight_r
 
 @pytest.fixture
 def recording():
-    """Ego, a car beside it, and a parked one that appears at step 5."""
+    """Ego, a car next to it, and a parked one that appears at step 5."""
     valid = np.ones((3, 91), bool)
     valid[2, :5] = False
     parked = np.tile([30.0, 3.5], (91, 1))

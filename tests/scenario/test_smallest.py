@@ -34,7 +34,7 @@ def test_gaps_of_things_that_overlap(values):
 
 
 @pytest.mark.parametrize("size", [2, 37, 300])
-def test_it_is_what_argmin_finds_where_none_are_all_but_alike(size):
+def test_first_smallest_equals_argmin_of_distinct_values(size):
     rng = np.random.default_rng(size)
     values = jnp.asarray(np.stack([rng.permutation(size) + 1.0 for _ in range(64)]), jnp.float32)
     np.testing.assert_array_equal(smallest(values), np.argmin(values, axis=-1))

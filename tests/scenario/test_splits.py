@@ -69,7 +69,7 @@ def test_windows_of_a_recording_never_straddle(tmp_path):
     assert abs(len(logs["train"]) / 400 - 0.6) < 0.08 and abs(len(logs["test"]) / 400 - 0.2) < 0.07
 
 
-def test_more_data_moves_nobody(tmp_path):
+def test_more_data_changes_no_split(tmp_path):
     (tmp_path / "few").mkdir()
     (tmp_path / "many").mkdir()
     write_splits(tmp_path / "few", entries(50), (80, 10, 10))

@@ -224,6 +224,6 @@ def test_lights_limits_and_lane_graph_are_those_of_the_map():
     assert tags_of(unlinked)["lane_graph"] == "chained"
 
 
-def test_the_kind_of_routes_is_told():
+def test_the_kind_of_routes_is_tagged():
     assert tags_of(straight_road())["routes"] == "graph"
     assert assemble(make_recording(), routes="published").tags["routes"] == "published"

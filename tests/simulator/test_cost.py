@@ -12,8 +12,9 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
 from drivax.simulator import situation
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import make_traffic, prepared
-from drivax.simulator.traffic.override import OverrideTraffic, with_given
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.catalogue import make_traffic
+from drivax.simulator.traffic.override import OverrideTraffic, with_override
 from drivax.studies.bench import BenchConfig, _parts, _rounds
 from drivax.synthetic.world import generate_recording
 from drivax.tasks.rewards import RewardConfig
@@ -110,14 +111,14 @@ every_traffic = pytest.mark.parametrize(
 
 def told(bank):
     """The bank, with four agents that are told to stand at the origin."""
-    return with_given(bank, jnp.arange(1, 5)[None], jnp.zeros((1, bank.steps, 4, 4)))
+    return with_override(bank, jnp.arange(1, 5)[None], jnp.zeros((1, bank.steps, 4, 4)))
 
 
 @every_traffic
 def test_states_are_small(bank, traffic, most):
     simulator = Simulator(Task(observation=GLIMPSE), traffic)
     state = jax.eval_shape(
-        lambda bank: simulator.reset(told(bank), jnp.zeros((), jnp.int32)), prepared(traffic, bank)
+        lambda bank: simulator.reset(told(bank), jnp.zeros((), jnp.int32)), prepare_bank(traffic, bank)
     )
     assert sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state)) <= most
 
@@ -127,7 +128,7 @@ def test_a_state_has_the_same_types_after_a_reset_and_after_a_step(bank, traffic
     """Else whoever steps compiles twice, and every loop over steps is traced twice."""
     simulator, bank = (
         Simulator(Task(observation=GLIMPSE), traffic),
-        jax.eval_shape(told, prepared(traffic, bank)),
+        jax.eval_shape(told, prepare_bank(traffic, bank)),
     )
 
     def types(state):
@@ -144,7 +145,7 @@ def test_one_configuration_is_compiled_once(traffic):
     model = make_traffic(traffic)
 
     def driven(scenarios, rows, trim=True):
-        bank = prepared(model, ScenarioBank.from_scenarios(scenarios, trim=trim))
+        bank = prepare_bank(model, ScenarioBank.from_scenarios(scenarios, trim=trim))
         keys = jax.random.split(jax.random.key(0), 2)
         drive(Simulator(judging(Task()), model), ConstantVelocity(), bank, jnp.asarray(rows), keys)
         return drive._cache_size()

@@ -9,7 +9,7 @@ import pytest
 
 from drivax.evaluation.rollout import judging
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.actions import DELTA_LOCAL, DIRECT_STATE, PHYSICAL, PUBLISHED, Physical
@@ -131,7 +131,7 @@ def test_reactive_traffic_differentiates_with_respect_to_ego():
     """A car follows ego by IDM: where it is depends on what ego did before, by the finite difference."""
     simulator = Simulator(Task(metrics="none", ends=()), IdmTraffic())
     road = straight_road([car(0, 0, 0, 8), car(-14, 0, 0, 9), car(0, 3.7, 0, 0)])
-    bank = prepared(simulator.traffic, bank_of(road))
+    bank = prepare_bank(simulator.traffic, bank_of(road))
 
     def followers(bank, actions):
         def one(state, action):

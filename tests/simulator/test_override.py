@@ -12,9 +12,10 @@ from drivax.metrics.episode import episode_metrics
 from drivax.scenario.schema import AgentKind
 from drivax.simulator.contact import CollisionType
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import make_traffic, prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.traffic.log import LogTraffic, alone
-from drivax.simulator.traffic.override import OverrideTraffic, motions_of_actions, with_given
+from drivax.simulator.traffic.override import OverrideTraffic, motions_of_actions, with_override
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.task import Task
 from scenes import GLIMPSE, bank_of, car, straight_road
@@ -36,7 +37,7 @@ def bank():
 
 def _frames(bank, motion, valid):
     """Everyone at every step from 10 on, when slot 1 does what it is told; ego stands."""
-    told = with_given(bank, jnp.asarray([[1, -1]]), motion, valid)
+    told = with_override(bank, jnp.asarray([[1, -1]]), motion, valid)
 
     def one(context, _):
         frame = SIMULATOR.frame(told, context, alone(context), 0)
@@ -98,7 +99,7 @@ def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
     @jax.jit
     def driven_past(y):
         pose = jnp.stack([bank.agents[0, 10, 1, 0], y, 0.0, 0.0])
-        told = with_given(bank, jnp.asarray([[1]]), jnp.broadcast_to(pose, (1, 91, 1, 4)))
+        told = with_override(bank, jnp.asarray([[1]]), jnp.broadcast_to(pose, (1, 91, 1, 4)))
 
         def step(state, _):
             after, done = simulator.step(told, state, jnp.zeros(2))
@@ -113,7 +114,7 @@ def test_ego_hits_a_car_that_was_told_to_stand_in_its_way():
     }  # fmt: skip
     np.testing.assert_array_equal(over, np.arange(8) >= 5)
     np.testing.assert_array_equal(reward, np.where(np.arange(8) >= 5, -1.0, 0.0))
-    # Told to stand in the lane beside, it is passed.
+    # Logged to stand in the lane beside, it is passed.
     metrics, reward, over = driven_past(3.7)
     assert float(metrics["collision"].value) == 0.0 and not over.any() and not reward.any()
 
@@ -132,7 +133,7 @@ def test_gradients_reach_the_actions_of_others(bank):
 
 
 def test_a_bank_that_tells_nobody_what_to_do_is_refused(bank):
-    with pytest.raises(UsageError, match="overridden"):
+    with pytest.raises(UsageError, match="no OverrideMotions"):
         SIMULATOR.context(bank, 0, 10)
     assert (OverrideTraffic().name, OverrideTraffic(IdmTraffic()).name) == ("override", "override+idm")
 
@@ -140,7 +141,7 @@ def test_a_bank_that_tells_nobody_what_to_do_is_refused(bank):
 def test_traffic_is_found_by_name(bank):
     assert isinstance(make_traffic("log"), LogTraffic) and isinstance(make_traffic("idm"), IdmTraffic)
     assert isinstance(make_traffic("drivax.simulator.traffic.reactive:IdmTraffic"), IdmTraffic)
-    assert prepared(LogTraffic(), bank) is bank
+    assert prepare_bank(LogTraffic(), bank) is bank
     for name, words in (("idn", "there is no traffic"), ("drivax.tasks.task:Task", "makes no traffic")):
         with pytest.raises(UsageError, match=words):
             make_traffic(name)

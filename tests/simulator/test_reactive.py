@@ -20,7 +20,9 @@ from drivax.simulator.traffic.agent_paths import (
     PATH_X,
     PATH_Y,
     PROFILE_SPEED,
+    AgentPaths,
 )
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.traffic.reactive import DRIVES, LEFT, REPLAYS, WAITS, IdmTraffic
 from drivax.tasks.task import Task
@@ -69,7 +71,7 @@ class Run:
         self.box[..., :2] += origin
         self.x, self.y = self.box[..., 0], self.box[..., 1]
         self.speed = np.hypot(*np.moveaxis(np.asarray(frames.velocity)[:, slots], -1, 0))
-        paths = list(np.asarray(bank.paths.slot[0]))
+        paths = list(np.asarray(data_of(bank, AgentPaths).slot[0]))
         self.row = [paths.index(slot) if slot in paths else -1 for slot in slots]
         self.slots = slots
 
@@ -303,7 +305,7 @@ def test_the_past_of_a_vehicle_is_what_it_drove():
 
 def test_paths_go_through_the_log_and_on_along_the_lane():
     bank = TRAFFIC.prepare(bank_of(straight_road([EGO, car(0, 0.8, 0, 10)])))
-    paths, row = bank.paths, list(np.asarray(bank.paths.slot[0])).index(1)
+    paths, row = data_of(bank, AgentPaths), list(np.asarray(data_of(bank, AgentPaths).slot[0])).index(1)
     points, spacing = np.array(paths.points[0, row]), float(paths.spacing[0, row])
     points[:, :2] += [-100.0, 3.7]
     assert spacing * (PATH_POINTS - 1) == pytest.approx(90.0 + 60.0, abs=0.1)
@@ -334,7 +336,7 @@ def test_in_random_traffic_everyone_does_what_the_law_says(seed):
 
 def test_a_bank_without_paths_is_refused_and_one_with_paths_is_kept():
     bank = bank_of(straight_road([EGO, car(0, 0, 0, 8)]))
-    with pytest.raises(UsageError, match="no paths"):
+    with pytest.raises(UsageError, match="no AgentPaths"):
         SIMULATOR.context(bank, 0, 10)
     ready = TRAFFIC.prepare(bank)
     assert TRAFFIC.prepare(ready) is ready
@@ -345,12 +347,12 @@ def test_paths_that_were_made_for_other_classes_are_made_anew():
     both = IdmTraffic(drivers=((1, IdmParameters()), (int(AgentKind.CYCLIST), IdmParameters())))
     few = TRAFFIC.prepare(bank)
     more = both.prepare(few)
-    assert [int((b.paths.slot[0] >= 0).sum()) for b in (few, more)] == [1, 2]
+    assert [int((data_of(b, AgentPaths).slot[0] >= 0).sum()) for b in (few, more)] == [1, 2]
     assert both.prepare(more) is more
 
 
 def test_nobody_reacts_where_nobody_can():
     bank = TRAFFIC.prepare(bank_of(straight_road([car(0, 0, 0, 8)])))
-    assert int((np.asarray(bank.paths.slot) >= 0).sum()) == 1  # ego, when it is not driven
+    assert int((np.asarray(data_of(bank, AgentPaths).slot) >= 0).sum()) == 1  # ego, when it is not driven
     frames, _ = _drive(TRAFFIC, bank, 0, jnp.zeros((151, 4)))
     assert not np.asarray(frames.valid)[:, 1:].any()

@@ -11,6 +11,8 @@ from drivax.geometry.boxes import overlap
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.build.assemble import assemble
+from drivax.simulator.traffic.agent_paths import AgentPaths
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import DRIVES, WAITS
 from drivax.synthetic.world import generate_recording
 from traffic_oracle import SIMULATOR, TRAFFIC, Path, compare, meetings, rolled, runs_of
@@ -43,9 +45,9 @@ def test_every_vehicle_does_what_the_law_says(bank, runs):
 
 def test_nobody_leaves_the_path_and_nobody_enters_an_occupied_place(bank, runs):
     for index, (frames, traffic) in enumerate(runs):
-        slots = np.asarray(bank.paths.slot[index])
+        slots = np.asarray(data_of(bank, AgentPaths).slot[index])
         for row in np.flatnonzero((traffic.phase == DRIVES).any(0) & (slots > 0)):
-            path, slot = Path(bank.paths, index, row), slots[row]
+            path, slot = Path(data_of(bank, AgentPaths), index, row), slots[row]
             there = np.flatnonzero(frames.valid[1:, slot]) + 1
             for t in there[::5]:
                 assert path.project(frames.box[t, slot, :2].astype(np.float64), 0, np.inf)[1] < 0.01
@@ -68,7 +70,7 @@ def test_the_same_again_and_beside_others(bank):
 
 def test_a_state_is_small_however_many_react(bank):
     state = jax.eval_shape(lambda b: SIMULATOR.reset(b, 0), bank)
-    rows = bank.paths.slot.shape[1]
+    rows = data_of(bank, AgentPaths).slot.shape[1]
     whole, traffic = (
         sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(part))
         for part in (state, state.context.traffic)
@@ -95,7 +97,7 @@ def test_company_changes_nothing():
         evaluate(ConstantVelocity(), ScenarioBank.from_scenarios(some), scenario_names(some), traffic=TRAFFIC)
         for some in (scenarios, scenarios[1:])
     )
-    np.testing.assert_array_equal(whole.motion[1:], part.motion)
+    np.testing.assert_array_equal(whole.trajectories.ego[1:], part.trajectories.ego)
     for name, values in whole.metrics.items():
         np.testing.assert_array_equal(values[1:], part.metrics[name], err_msg=name)
     assert whole.traffic == "idm"

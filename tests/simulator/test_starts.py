@@ -18,7 +18,7 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.dynamics import GRIP_MPS2, command_between
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import LogStart, NoisyStart
-from drivax.simulator.traffic.override import OverrideTraffic, with_given
+from drivax.simulator.traffic.override import OverrideTraffic, with_override
 from drivax.tasks.task import Task
 from scenes import LANE_M, SMALL, bank_of, car, straight_road
 
@@ -113,7 +113,7 @@ def test_a_start_is_free_of_those_who_are_told_where_to_be():
     # The log has nobody near; the other car is told to stand where a tenth of the draws would lead.
     bank = bank_of(straight_road([car(0, 0.9, 0, 6), car(80, 0.9, 0, 6)]))
     told = jnp.tile(jnp.asarray([5.3, 2.4, 0.0, 0.0]), (1, bank.steps, 1, 1))
-    given = with_given(bank, jnp.asarray([[1]]), told)
+    given = with_override(bank, jnp.asarray([[1]]), told)
     simulator = Simulator(Task(metrics=("collision",)), OverrideTraffic(), NoisyStart(tries=16))
     state = jax.jit(jax.vmap(lambda key: simulator.reset(given, 0, 10, 0, key)))(keys(256))
     # Who overlaps at the start is ignored.
@@ -184,10 +184,10 @@ def test_evaluation_begins_where_the_noise_leads_and_counts_from_there():
         for seed in (3, 4)
     )
     for found in (same, other):
-        motion = found.motion[0]
+        motion = found.trajectories.ego[0]
         assert len(motion) == 81 and motion[0, 3] > 2.0
         assert found.metrics["distance"][0] == pytest.approx(8.0 * motion[0, 3], rel=1e-3)
         assert 0.0 <= found.metrics["progress_ratio"][0] <= 1.0
-    assert same.motion[0, 0, 3] != other.motion[0, 0, 3]
-    with pytest.raises(UsageError, match="cannot begin elsewhere"):
+    assert same.trajectories.ego[0, 0, 3] != other.trajectories.ego[0, 0, 3]
+    with pytest.raises(UsageError, match="cannot start elsewhere"):
         evaluate(Expert(), data, start=NoisyStart())

@@ -10,6 +10,8 @@ import pytest
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.together import is_driven, slots_of
+from drivax.simulator.traffic.agent_paths import AgentPaths
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tasks.observations import ObservationConfig
 from drivax.tasks.task import Task
@@ -105,7 +107,7 @@ def check_finite(states, done):
 def test_reactive_traffic_sees_every_driven_agent(bank, braking):
     slots, _, ((states, _), _) = braking
     behind = int(np.argmin(np.asarray(bank.agents[0, 10, :4, 0])))
-    row = int(np.flatnonzero(np.asarray(bank.paths.slot[0]) == behind)[0])
+    row = int(np.flatnonzero(np.asarray(data_of(bank, AgentPaths).slot[0]) == behind)[0])
     free = np.asarray(states.context.traffic.speed)[:, :, -1, row]
     # All states of the stack hold the same traffic.
     np.testing.assert_array_equal(free[:, 0], free[:, 1])

@@ -57,9 +57,7 @@ def test_a_damaged_row_is_named(tmp_path: Path):
     file = tmp_path / "metrics.jsonl"
     for damaged in ("nonsense", "[]", "{}", '{"x": 1}'):
         file.write_text(f'{{"step": 0}}\n{damaged}\n{{"step": 2}}\n')
-        with pytest.raises(
-            DataError, match=r"metrics\.jsonl: record 2: is no row of metrics; delete the row"
-        ):
+        with pytest.raises(DataError, match=r"metrics\.jsonl: record 2: not a metrics row; delete the row"):
             MetricLog(tmp_path, resume_step=5, tensorboard=False)
 
 

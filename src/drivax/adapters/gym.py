@@ -8,31 +8,30 @@ device between steps. Importing this module registers ``drivax/<task>-v0`` for e
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from drivax.adapters.driving import (
-    LIMIT,
-    Scenarios,
-    advance,
-    advance_all,
-    begin,
-    begin_all,
-    judged,
-    judged_all,
-    opened,
-)
-from drivax.errors import UsageError
+from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
+from drivax.learning.policies import find_traffic
+from drivax.metrics.episode import episode_metrics
+from drivax.metrics.scores import Value
 from drivax.report.pictures.still import draw_pixels
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.build.assemble import assemble
+from drivax.scenario.schema import Scenario
+from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.types import AgentContext, SimState
+from drivax.simulator.sparse import map_where
+from drivax.simulator.traffic.bank_data import prepare_bank
+from drivax.simulator.types import AgentContext, SimState, Traffic
+from drivax.synthetic.world import generate_recording
 from drivax.tasks.actions import DISCRETE, DirectState, Discrete
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.rewards import RewardConfig
@@ -43,7 +42,104 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ModuleNotFoundError as error:
-    raise UsageError("gymnasium is not installed", cure="pip install 'drivax[gym]'") from error
+    raise missing_package(error) or error from error
+
+#: Observations are clipped to this (5 km, 1.5 km/s): Gymnasium needs finite bounds.
+LIMIT = 100.0
+
+
+@runtime_checkable
+class Scenarios(Protocol):
+    """Scenarios on the device and as they are stored; what ``drivax.load`` returns."""
+
+    @property
+    def bank(self) -> ScenarioBank:
+        """The scenarios, stacked."""
+        ...
+
+    @property
+    def names(self) -> Sequence[Mapping[str, str]]:
+        """``scenario_id`` (and more) of each row of the bank."""
+        ...
+
+    @property
+    def scenarios(self) -> Sequence[Scenario]:
+        """The stored scenarios."""
+        ...
+
+
+def _open(data: Scenarios | str | Path | int) -> tuple[ScenarioBank, list[str], Sequence[Scenario]]:
+    """Return bank, ids and stored scenarios of loaded data, a set's folder, or ``data`` generated scenarios."""
+    if isinstance(data, int):
+        made = [assemble(generate_recording(seed=0, index=index)) for index in range(data)]
+        return ScenarioBank.from_scenarios(made), [scenario.id for scenario in made], made
+    if isinstance(data, str | Path):
+        stored = ScenarioSet.open(data)
+        return ScenarioBank.from_scenarios(stored), [scenario.id for scenario in stored], stored
+    if len(data.names) != len(data.bank):
+        raise DrivaxError(f"{len(data.names)} scenario names for a bank of {len(data.bank)}")
+    return data.bank, [name["scenario_id"] for name in data.names], data.scenarios
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset(simulator: Simulator, bank: ScenarioBank, row: Any) -> tuple[SimState, dict[str, Array]]:
+    """Return the first state of an episode and its observation."""
+    state = simulator.reset(bank, row)
+    return state, _observe(simulator, bank, state)
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset_all(simulator: Simulator, bank: ScenarioBank, rows: Any) -> tuple[SimState, dict[str, Array]]:
+    """Batched."""
+    return jax.vmap(partial(_reset, simulator, bank))(rows)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(
+    simulator: Simulator, bank: ScenarioBank, state: SimState, action: Float[Any, " D"]
+) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:
+    """Return state, observation, and (reward, terminated, truncated)."""
+    state, transition = simulator.step(bank, state, jnp.asarray(action))
+    ending = (transition.reward, transition.terminated, transition.truncated)
+    return state, _observe(simulator, bank, state), ending
+
+
+@partial(jax.jit, static_argnums=0)
+def _step_all(
+    simulator: Simulator, bank: ScenarioBank, states: SimState, actions: Float[Any, "B D"],
+    begins: Bool[Any, " B"], rows: Any,
+) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
+    """Step a batch; where an episode ``begins``, the scenario of ``rows`` starts instead with reward 0."""
+    begins = jnp.asarray(begins)
+    fresh = map_where(begins, partial(simulator.beginning, bank), jnp.asarray(rows))
+    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
+    states, transition = step(bank, states, jnp.asarray(actions), begins, fresh)
+    reward = jnp.where(begins, 0.0, transition.reward)
+    seen = jax.vmap(partial(_observe, simulator, bank))(states)
+    return states, seen, (reward, transition.terminated, transition.truncated)
+
+
+@jax.jit
+def _metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
+    """Return the episode metrics."""
+    return episode_metrics(bank, state)
+
+
+@jax.jit
+def _metrics_all(bank: ScenarioBank, states: SimState) -> dict[str, Value]:
+    """Batched."""
+    return jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
+
+
+def _observe(simulator: Simulator, bank: ScenarioBank, state: SimState) -> dict[str, Array]:
+    """Return the observation within the bounds of its space, without empty groups."""
+    seen = simulator.observe(bank, state.context)
+    return {
+        name: leaf.astype(jnp.int8) if leaf.dtype == bool else jnp.clip(leaf, -LIMIT, LIMIT)
+        for name, leaf in seen.items()
+        if leaf.size
+    }
+
 
 #: Scenarios of the built-in world that an environment drives where no data is given.
 BUILT_IN = 16
@@ -58,29 +154,30 @@ Observation = dict[str, Any]
 class _Worlds:
     """What both environments share: scenarios on the CPU, a simulator, the spaces of one agent."""
 
-    def __init__(self, data: Scenarios | str | Path | int, task: Task | None) -> None:
-        bank, self.ids, self.scenarios = opened(data)
-        self.bank = jax.device_put(bank, jax.devices("cpu")[0])
+    def __init__(self, data: Scenarios | str | Path | int, task: Task | None, traffic: str | Traffic) -> None:
+        bank, self.ids, self.scenarios = _open(data)
         self.task = task or Task()
-        self.simulator = Simulator(self.task)
+        self.simulator = Simulator(self.task, find_traffic(traffic) if isinstance(traffic, str) else traffic)
+        cpu = jax.devices("cpu")[0]
+        self.bank = jax.device_put(prepare_bank(self.simulator.traffic, bank), cpu)
         self.actions = _action_space(self.task)
-        seen = jax.eval_shape(partial(begin, self.simulator), self.bank, 0)[1]
+        seen = jax.eval_shape(partial(_reset, self.simulator), self.bank, 0)[1]
         self.observations = gymnasium.spaces.Dict({name: _space(leaf) for name, leaf in seen.items()})
 
-    def row(self, wanted: Any) -> int:
-        """A row of the bank that a user names."""
+    def row(self, scenario: Any) -> int:
+        """Return a requested row of the bank."""
         try:
-            row = operator.index(wanted)
+            row = operator.index(scenario)
         except TypeError:
             row = -1
         if not 0 <= row < len(self.ids):
             raise UsageError(
-                f"there is no scenario {wanted!r}", cure=f"use a row from 0 to {len(self.ids) - 1}"
+                f"there is no scenario {scenario!r}", cure=f"use a row from 0 to {len(self.ids) - 1}"
             )
         return row
 
     def commands(self, actions: Any, lead: tuple[int, ...]) -> Float[Any, "*lead D"]:
-        """Actions of the space as the simulator takes them."""
+        """Return actions in the form of the simulator."""
         space = self.task.actions
         if isinstance(space, Discrete):
             chosen = np.asarray(actions)
@@ -93,15 +190,15 @@ class _Worlds:
             row, column = np.divmod(chosen, space.curvatures)
             return np.stack([accelerations[row], curvatures[column]], axis=-1).astype(np.float32)
         commands = np.asarray(actions, np.float32)
-        wanted = (*lead, space.size)
-        if commands.shape != wanted or not np.isfinite(commands).all():
-            numbers = " x ".join(map(str, wanted))
+        shape = (*lead, space.size)
+        if commands.shape != shape or not np.isfinite(commands).all():
+            numbers = " x ".join(map(str, shape))
             raise UsageError(f"{actions!r} is no action", cure=f"give {numbers} finite numbers in [-1, 1]")
         return commands
 
 
 class DrivingEnv(gymnasium.Env[Observation, Any]):
-    """Drives ego through recorded traffic (``log``), from the current step of a scenario, one episode at a time.
+    """Drives ego from the current step of a scenario to the end of its log, one episode at a time.
 
     Observations are the task's groups: ``Box`` for features, ``MultiBinary`` for masks (1 where a row is valid).
     Actions are the task's, in [-1, 1], or ``Discrete`` choices. A failure that ends the episode is ``terminated``, the
@@ -112,6 +209,8 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         data: What ``drivax.load`` returned, the folder of a scenario set, or how many scenarios of the built-in world.
         task: Action space, observation, reward and what ends an episode; the default one otherwise.
         render_mode: ``rgb_array`` draws the scenario from above (needs the extra ``show``).
+        traffic: How the other agents move: ``log``, ``idm``, the folder of a trained policy, ``zoo:NAME``,
+            ``package.module:name``, or a traffic model.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (Gymnasium's own spelling)
@@ -121,8 +220,9 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         data: Scenarios | str | Path | int = BUILT_IN,
         task: Task | None = None,
         render_mode: str | None = None,
+        traffic: str | Traffic = "log",
     ) -> None:
-        self._worlds = _Worlds(data, task)
+        self._worlds = _Worlds(data, task, traffic)
         self._state: SimState | None = None
         self._row, self._path = 0, np.zeros((0, 4), np.float32)
         self.render_mode = _known(render_mode)
@@ -132,10 +232,10 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode.
+        """Start an episode.
 
         Args:
-            seed: Starts the random choice of scenarios anew.
+            seed: Seed of the random choice of scenarios.
             options: ``{"scenario": i}`` chooses row i; otherwise a row is drawn, each as likely as any other.
 
         Raises:
@@ -145,36 +245,36 @@ class DrivingEnv(gymnasium.Env[Observation, Any]):
         chosen = _option(options, "scenario")
         worlds = self._worlds
         self._row = int(self.np_random.integers(len(worlds.ids))) if chosen is None else worlds.row(chosen)
-        state, observation = begin(worlds.simulator, worlds.bank, self._row)
+        state, observation = _reset(worlds.simulator, worlds.bank, self._row)
         self._state = state
         self._path = _path_of(state.context)
         return _plain(observation), {"scenario_id": worlds.ids[self._row]}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Drives 0.1 s.
+        """Drive 0.1 s.
 
         Raises:
             UsageError: The action is not in the action space.
-            gymnasium.error.ResetNeeded: No episode is under way.
+            gymnasium.error.ResetNeeded: No episode is running.
         """
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("no episode is under way; call reset() first")
+            raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
         worlds = self._worlds
         command = worlds.commands(action, ())
-        state, observation, ending = advance(worlds.simulator, worlds.bank, self._state, command)
+        state, observation, ending = _step(worlds.simulator, worlds.bank, self._state, command)
         self._state = state
         if self.render_mode is not None:
             self._path = _path_of(state.context, self._path)
         reward, terminated, truncated = (leaf.item() for leaf in jax.device_get(ending))
         info: dict[str, Any] = {"scenario_id": worlds.ids[self._row]}
         if terminated or truncated:
-            metrics = jax.device_get(judged(worlds.bank, state))
+            metrics = jax.device_get(_metrics(worlds.bank, state))
             info["metrics"] = {name: float(v.value) for name, v in metrics.items() if v.defined}
             self._state = None
         return _plain(observation), reward, terminated, truncated, info
 
     def render(self) -> Any:
-        """The scenario from above as ``[height, width, 3]`` bytes; None without a render mode."""
+        """Return the scenario from above as ``[height, width, 3]`` bytes; None without a render mode."""
         if self.render_mode is None:
             return None
         if not len(self._path):
@@ -186,15 +286,16 @@ class VectorDrivingEnv(VectorEnv):
     """Many :class:`DrivingEnv` in one compiled call.
 
     Autoreset is Gymnasium's ``NEXT_STEP``: the step after an episode's last one ignores that environment's action,
-    begins its next episode and rewards nothing; an episode's last observation is what its last step returned.
+    starts its next episode with reward 0; the last observation of an episode is that of its last step.
     ``info`` holds ``scenario_id`` of every environment and, for those whose episode ended, ``metrics`` as arrays with
     ``_metrics`` masks, as Gymnasium's own vector environments do.
 
     Args:
-        num_envs: How many.
+        num_envs: Number of environments.
         data: As in :class:`DrivingEnv`.
         task: As in :class:`DrivingEnv`.
         render_mode: As in :class:`DrivingEnv`; ``render`` returns one picture per environment.
+        traffic: As in :class:`DrivingEnv`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -207,8 +308,9 @@ class VectorDrivingEnv(VectorEnv):
         data: Scenarios | str | Path | int = BUILT_IN,
         task: Task | None = None,
         render_mode: str | None = None,
+        traffic: str | Traffic = "log",
     ) -> None:
-        self._worlds = _Worlds(data, task)
+        self._worlds = _Worlds(data, task, traffic)
         self.num_envs = num_envs
         self.render_mode = _known(render_mode)
         self.single_action_space = self._worlds.actions
@@ -223,10 +325,10 @@ class VectorDrivingEnv(VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode in every environment.
+        """Start an episode in every environment.
 
         Args:
-            seed: Starts the random choice of scenarios anew; one number for all environments.
+            seed: Seed of the random choice of scenarios; one number for all environments.
             options: ``{"scenarios": [i, ...]}`` chooses a row per environment.
 
         Raises:
@@ -243,23 +345,23 @@ class VectorDrivingEnv(VectorEnv):
                 cure="give one per environment",
             )
         self._over[:] = False
-        self._state, observation = begin_all(self._worlds.simulator, self._worlds.bank, self._rows)
+        self._state, observation = _reset_all(self._worlds.simulator, self._worlds.bank, self._rows)
         self._follow(self._over | True)
         return _plain(observation), self._info()
 
     def step(self, actions: Any) -> tuple[Observation, Any, Any, Any, dict[str, Any]]:
-        """Drives 0.1 s everywhere; an environment whose episode is over begins its next one instead.
+        """Drive 0.1 s in every environment; one whose episode is over starts its next episode instead.
 
         Raises:
             UsageError: The actions are not in the action space.
             gymnasium.error.ResetNeeded: ``reset`` was never called.
         """
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("no episode is under way; call reset() first")
+            raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
         worlds, begins = self._worlds, self._over
         commands = worlds.commands(actions, (self.num_envs,))
         self._rows = np.where(begins, self._drawn(), self._rows)
-        self._state, observation, ending = advance_all(
+        self._state, observation, ending = _step_all(
             worlds.simulator, worlds.bank, self._state, commands, begins, self._rows
         )
         reward, terminated, truncated = (np.array(leaf) for leaf in jax.device_get(ending))
@@ -267,14 +369,14 @@ class VectorDrivingEnv(VectorEnv):
         self._follow(begins)
         info = self._info()
         if self._over.any():
-            metrics = jax.device_get(judged_all(worlds.bank, self._state))
+            metrics = jax.device_get(_metrics_all(worlds.bank, self._state))
             for number in np.flatnonzero(self._over):
                 own = {n: float(v.value[number]) for n, v in metrics.items() if v.defined[number]}
                 info = self._add_info(info, {"metrics": own}, int(number))
         return _plain(observation), reward, terminated, truncated, info
 
     def render(self) -> tuple[Any, ...] | None:
-        """Every scenario from above; None without a render mode."""
+        """Return every scenario from above; None without a render mode."""
         if self.render_mode is None:
             return None
         if not self._paths:
@@ -292,15 +394,31 @@ class VectorDrivingEnv(VectorEnv):
         return {"scenario_id": ids, "_scenario_id": np.ones(self.num_envs, bool)}
 
     def _follow(self, begins: Any) -> None:
-        """Keeps the driven paths where they are drawn."""
+        """Record the driven paths if they are rendered."""
         if self.render_mode is None or self._state is None:
             return
-        scenes = [jax.tree.map(lambda leaf, n=n: leaf[n], self._state.context) for n in range(self.num_envs)]
+        contexts = [
+            jax.tree.map(lambda leaf, n=n: leaf[n], self._state.context) for n in range(self.num_envs)
+        ]
         old = self._paths or [None] * self.num_envs
         self._paths = [
             _path_of(context, None if new else path)
-            for context, path, new in zip(scenes, old, begins, strict=True)
+            for context, path, new in zip(contexts, old, begins, strict=True)
         ]
+
+
+def make(
+    task: str | Task = "optimal", data: Scenarios | str | Path | int = BUILT_IN, *, num_envs: int | None = None,
+    traffic: str | Traffic = "log", render_mode: str | None = None,
+) -> DrivingEnv | VectorDrivingEnv:  # fmt: skip
+    """Make an environment of a task, or of a name in :data:`TASKS`; a vector environment if ``num_envs`` is given."""
+    if isinstance(task, str):
+        if task not in TASKS:
+            raise UsageError(f"there is no task {task!r}", cure=did_you_mean(task, TASKS))
+        task = TASKS[task]
+    if num_envs is None:
+        return DrivingEnv(data, task, render_mode, traffic)
+    return VectorDrivingEnv(num_envs, data, task, render_mode, traffic)
 
 
 def _known(render_mode: str | None) -> Any:

@@ -52,8 +52,8 @@ def run(args: Compare) -> int:
     from drivax import settings
     from drivax.errors import UsageError
     from drivax.evaluation.comparison import compare
+    from drivax.evaluation.episode_table import EpisodeTable
     from drivax.evaluation.plan import ComparisonPlan
-    from drivax.evaluation.stored import open_driven_set, read_seeds
     from drivax.files import check_output, write_text
     from drivax.report.comparison import comparison_text
     from drivax.report.pages.comparison import write_comparison
@@ -75,8 +75,8 @@ def run(args: Compare) -> int:
         return 0
     if plan.a is None or plan.b is None:
         raise UsageError("no runs are named", cure="write drivax compare A B, or name a and b in the plan")
-    a, b = read_seeds(plan.a), read_seeds(plan.b)
-    entries = open_driven_set(a[0], args.data).entries if plan.split == "stratified" else ()
+    a, b = EpisodeTable.read_seeds(plan.a), EpisodeTable.read_seeds(plan.b)
+    entries = a[0].open_set(args.data).entries if plan.split == "stratified" else ()
     found = compare(plan, a, b, entries)
     print(json.dumps(found.as_dict(), indent=1, allow_nan=False) if args.json else comparison_text(found))
     if args.html is not None:

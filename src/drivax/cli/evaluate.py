@@ -16,7 +16,7 @@ from drivax.evaluation.run_evaluation import (
     format_summary,
     run_evaluation,
 )
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.metrics.selection import select_metrics
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.scenario.store import ScenarioSet

@@ -136,7 +136,7 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics
     from drivax.learning.config import TrainConfig
-    from drivax.learning.policy_traffic import find_traffic
+    from drivax.learning.policies import find_traffic
     from drivax.planners.simple import Expert
     from drivax.report.pictures.observation import draw_log_observation
     from drivax.scenario.bank.scenario_bank import ScenarioBank

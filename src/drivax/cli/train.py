@@ -7,22 +7,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from drivax import settings
 from drivax.cli.curate import scored
-from drivax.curation.arms import AGENTS, Agent, weighted
-from drivax.curation.methods import Wanted, refuse_stale
+from drivax.curation.arms import ARMS, Arm, weighted
+from drivax.curation.methods import Request, check_current
 from drivax.curation.scores import ScoreTable, read_scores
-from drivax.curation.weights import WeightConfig, weights_of
+from drivax.curation.weights import WeightConfig, sampling_weights
 from drivax.errors import UsageError
 from drivax.learning.config import TrainConfig
-from drivax.learning.devices import widen_pool
 from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
+from drivax.learning.program import widen_pool
 from drivax.scenario.store import ScenarioSet
+
+if TYPE_CHECKING:
+    ArmName = str
+else:
+    ArmName = tyro.extras.literal_type_from_choices(ARMS)
 
 
 @dataclass(frozen=True)
@@ -31,11 +36,11 @@ class Train:
 
     SIGTERM writes a checkpoint and ends the run; --resume goes on from there.
 
-    CONFIG is a YAML file or the name of a preset; any of its settings can be given behind as --section.key VALUE.
+    CONFIG is a YAML file or the name of a preset; each of its settings can be overridden as --section.key VALUE.
 
     Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
 
-    Example: drivax train offline/cql --data sets/train --agent heuristic --out runs/cql-heuristic
+    Example: drivax train offline/cql --data sets/train --arm heuristic --out runs/cql-heuristic
 
     Example: drivax train offline/iql --data sets/train --scores scores.npz --out runs/iql-critical
     """
@@ -51,19 +56,11 @@ class Train:
     scores: Path | None = None
     """Scores of DATA by drivax curate: bc and offline algorithms draw each recorded step by its weight."""
     scale: Literal["step", "scenario"] | None = None
-    """Whether steps are weighted one by one (the default), or as their scenarios are; with --scores."""
-    agent: (
-        Literal[
-            "bc", "baseline", "cql_bc", "heuristic", "heuristic_scenario", "ensemble", "ensemble_scenario",
-            "action_rarity", "action_rarity_scenario", "random_matched", "random_matched_ensemble",
-            "random_matched_action_rarity", "random_matched_scenario", "oracle", "oracle_strong",
-            "random_matched_oracle",
-        ]
-        | None
-    ) = None  # fmt: skip
-    """Curation of the agent of that name in the long-tail study: scores DATA first, or takes --scores."""
+    """Whether weights are of steps (the default) or of scenarios; with --scores."""
+    arm: Annotated[ArmName | None, tyro.conf.arg(aliases=["--agent"])] = None
+    """Curation of that arm of the long-tail study: scores DATA first, or takes --scores."""
     weighting: WeightConfig = field(default_factory=WeightConfig)
-    """How scores become weights; with --scores or --agent."""
+    """How scores become weights; with --scores or --arm."""
     seeds: int = 1
     """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
@@ -93,65 +90,63 @@ def run(args: Train, overrides: Sequence[str] = ()) -> int:
         resume=args.resume,
         overwrite=args.overwrite,
         seeds=args.seeds,
-        say=lambda line: print(line, file=sys.stderr),
+        log=lambda line: print(line, file=sys.stderr),
     )
     print(f"wrote {folder.path}")
     return 0
 
 
 def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
-    """The set, with weights if scores or an agent are asked for."""
+    """Return the set, with weights if scores or an arm are given."""
     data, weighting = ScenarioSet.open(args.data), args.weighting
-    if args.agent is None:
+    if args.arm is None:
         if args.scores is None:
             if weighting != WeightConfig():
-                raise UsageError("--weighting without scores to weight", cure="pass --scores or --agent")
+                raise UsageError("--weighting without scores to weight", cure="pass --scores or --arm")
             if args.scale is not None:
                 raise UsageError("--scale without scores to weight", cure="pass --scores")
             return data
         table = read_scores(args.scores, data)
         return WeightedSet(
-            data, weights_of(table, weighting, args.scale or "step", usable_steps(config, data))
+            data, sampling_weights(table, weighting, args.scale or "step", usable_steps(config, data))
         )
-    agent = AGENTS[args.agent]
-    _refuse_other(args, agent, config)
+    arm = ARMS[args.arm]
+    _check_arm(args, arm, config)
     return weighted(
-        agent, data, partial(_table, args, data), weighting, usable_steps(config, data), config.seed
+        arm, data, partial(_table, args, data), weighting, usable_steps(config, data), config.seed
     )
 
 
-def _refuse_other(args: Train, agent: Agent, config: TrainConfig) -> None:
-    """Refuses a training that is not that of the agent, and flags that the agent would ignore."""
-    own, wanted = (_trained_by(one) for one in (config, settings.load(TrainConfig, agent.preset)))
-    if own != wanted:
-        raise UsageError(
-            f"the agent {args.agent} is trained by {wanted}, not {own}", cure=f"use {agent.preset}"
-        )
+def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
+    """Refuse another training than the arm's, and flags that the arm would ignore."""
+    own, expected = (_algorithm(each) for each in (config, settings.load(TrainConfig, arm.preset)))
+    if own != expected:
+        raise UsageError(f"arm {args.arm} is trained by {expected}, not {own}", cure=f"use {arm.preset}")
     if args.scale is not None:
         raise UsageError(
-            f"the agent {args.agent} has its own scale", cure="leave out --scale, or choose another --agent"
+            f"arm {args.arm} has its own scale", cure="leave out --scale, or choose another --arm"
         )
-    if agent.weights is not None and args.weighting != WeightConfig():
-        raise UsageError(f"the agent {args.agent} has its own weights", cure="leave out --weighting")
-    if agent.by_lot and args.seeds > 1:
+    if arm.weights is not None and args.weighting != WeightConfig():
+        raise UsageError(f"arm {args.arm} has its own weights", cure="leave out --weighting")
+    if arm.permuted and args.seeds > 1:
         raise UsageError(
-            f"{args.seeds} agents {args.agent} in one program would share one lot",
-            cure="train each by itself: --seeds 1 --seed NUMBER",
+            f"{args.seeds} seeds of {args.arm} in one program would share one permutation",
+            cure="train each seed separately: --seeds 1 --seed NUMBER",
         )
 
 
-def _trained_by(config: TrainConfig) -> str:
-    """The algorithm, and whether it imitates beside."""
+def _algorithm(config: TrainConfig) -> str:
+    """Return the algorithm's name, and whether it has an imitation loss."""
     imitates = getattr(config.algorithm, "imitation", 0.0) > 0.0
     return settings.kind_of(type(config.algorithm)) + (" with imitation" if imitates else "")
 
 
 def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
-    """Scores by a method of an agent of the study."""
+    """Return the scores of an arm's method, from --scores if given."""
     if args.scores is None:
-        return scored(method, Wanted(data))
+        return scored(method, Request(data))
     table = read_scores(args.scores, data)
-    # Scores of another method have no settings to compare; who weights refuses them.
+    # `weighted` refuses scores of another method.
     if table.method == method:
-        refuse_stale(table, file=args.scores)
+        check_current(table, file=args.scores)
     return table

@@ -1,124 +1,112 @@
-"""The agents of the long-tail study: what each is trained with, and by which scores its recorded steps are drawn."""
+"""Arms of a curation study: training preset, method that scores the logged steps, and how scores become weights."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
-from drivax.curation.controls import matched
+from drivax import settings
+from drivax.curation.controls import permute_scores
 from drivax.curation.scores import ScoreTable
-from drivax.curation.weights import Scale, WeightConfig, weights_of
+from drivax.curation.weights import Scale, WeightConfig, sampling_weights
 from drivax.errors import UsageError
 from drivax.learning.experience import WeightedSet
 from drivax.scenario.store import ScenarioSet
 
-#: From the name of a method to its table of a set.
+#: Against the baseline, against the permuted control, by kind of scenario, other failures, between methods.
+ClaimGroup = Literal["baseline", "control", "where", "failures", "methods"]
+#: From the name of a method to its score table of a set.
 Tables = Callable[[str], ScoreTable]
 
 
 @dataclass(frozen=True)
-class Agent:
-    """An agent of the study.
+class Arm:
+    """An arm of a study.
 
     Attributes:
         preset: Its training configuration.
-        method: What its steps are drawn by (:data:`~drivax.curation.methods.METHODS`).
-        scale: Whether steps are weighted one by one, or as their scenarios are.
-        by_lot: Whether the scores are dealt out anew by lot: the control of ``method``.
-        weights: How scores become weights, in place of what is asked for.
+        method: Name of the curation method that scores its steps.
+        scale: Whether weights are of steps or of scenarios.
+        permuted: Whether the scores are permuted among scenarios: the matched random control of ``method``.
+        weights: How scores become weights; None: as the study or the command line says.
     """
 
     preset: str = "offline/cql"
     method: str = "uniform"
     scale: Scale = "step"
-    by_lot: bool = False
+    permuted: bool = False
     weights: WeightConfig | None = None
 
 
-#: Of labels, which are 0 or 1: such a share of the draws goes to steps of an event, beside what uniform draws find. On
-#: the benchmark's training set, where every fortieth step is of an event, 0.115 makes the effective sample that scores
-#: make by their ranks, 0.66.
-_LABELS, _STRONG_LABELS = (
-    WeightConfig(normalise="none", temperature=1.0, most=math.inf, uniform=1.0 - share)
-    for share in (0.115, 0.3)
-)
-#: By default weights go by the ranks of scores, so that those of all methods have one distribution at either scale. By
-#: step each method has a lot of its own, since its scores spread over scenarios in their own way.
-AGENTS: Mapping[str, Agent] = MappingProxyType(
-    {
-        "bc": Agent("offline/bc"),
-        "baseline": Agent(),
-        "cql_bc": Agent("offline/cql_bc"),
-        "heuristic": Agent(method="kinematic"),
-        "heuristic_scenario": Agent(method="kinematic", scale="scenario"),
-        "ensemble": Agent(method="ensemble"),
-        "ensemble_scenario": Agent(method="ensemble", scale="scenario"),
-        "action_rarity": Agent(method="action_rarity"),
-        "action_rarity_scenario": Agent(method="action_rarity", scale="scenario"),
-        "random_matched": Agent(method="kinematic", by_lot=True),
-        "random_matched_ensemble": Agent(method="ensemble", by_lot=True),
-        "random_matched_action_rarity": Agent(method="action_rarity", by_lot=True),
-        "random_matched_scenario": Agent(method="kinematic", scale="scenario", by_lot=True),
-        "oracle": Agent(method="oracle", weights=_LABELS),
-        "oracle_strong": Agent(method="oracle", weights=_STRONG_LABELS),
-        "random_matched_oracle": Agent(method="oracle", by_lot=True, weights=_LABELS),
-    }
-)
-#: Agents that are curated, whose scores are not those of a control.
-CURATED = tuple(name for name in AGENTS if name.startswith(("heuristic", "ensemble", "action_rarity")))
+@dataclass(frozen=True)
+class Claim:
+    """A claim about two arms.
 
-
-def control_of(name: str) -> str:
-    """The agent whose weights are those of another one, dealt out by lot.
-
-    Raises:
-        StopIteration: It has none.
+    Attributes:
+        words: The claim.
+        one: The arm that is claimed to be better.
+        other: The arm that it is compared with.
+        group: Claims whose p-values are adjusted together.
+        metric: Metric of the comparison.
+        rows: ``ordinary``, ``common`` or ``rare`` scenarios.
+        change: Claimed relative change, at least; None: only its direction is claimed.
     """
-    one = AGENTS[name]
-    return next(
-        other
-        for other, lot in AGENTS.items()
-        if lot.by_lot
-        and (lot.scale, lot.weights) == (one.scale, one.weights)
-        and (one.scale == "scenario" or lot.method == one.method)
-    )
+
+    words: str
+    one: str
+    other: str
+    group: ClaimGroup
+    metric: str = "collision"
+    rows: str = "ordinary"
+    change: float | None = None
+
+
+@dataclass(frozen=True)
+class StudyDefinition:
+    """Arms and claims of a study, as ``configs/studies/NAME.yaml`` declares them."""
+
+    arms: dict[str, Arm]
+    claims: tuple[Claim, ...]
+
+
+#: The long-tail study.
+LONGTAIL = settings.load(StudyDefinition, "studies/longtail")
+ARMS: Mapping[str, Arm] = MappingProxyType(LONGTAIL.arms)
 
 
 def weighted(
-    agent: Agent,
+    arm: Arm,
     data: ScenarioSet,
     tables: Tables,
     config: WeightConfig,
     usable: np.ndarray | None = None,
     seed: int = 0,
 ) -> WeightedSet:
-    """A set with the weights of an agent.
+    """Return a set with the sampling weights of an arm.
 
     Args:
-        agent: The agent.
+        arm: The arm.
         data: The set.
-        tables: Scores of the set.
-        config: How scores become weights, unless the agent has its own way.
-        usable: Which steps its training learns from (:func:`~drivax.curation.weights.weights_of`).
-        seed: Of the lot, for agents ``by_lot``.
+        tables: Score tables of the set.
+        config: How scores become weights, for arms without ``weights``.
+        usable: Steps that the training learns from (:func:`~drivax.curation.weights.sampling_weights`).
+        seed: Seed of the permutation.
 
     Raises:
-        UsageError: The table is of another method, or nothing has a weight or a label.
+        UsageError: The table is of another method, or no step has a weight or a label.
     """
-    table = tables(agent.method)
-    if table.method != agent.method:
+    table = tables(arm.method)
+    if table.method != arm.method:
         raise UsageError(
-            f"scores of {table.method!r} for an agent that is curated by {agent.method!r}",
-            cure=f"drivax curate {agent.method} --data {data.path} --out SCORES",
+            f"scores of {table.method!r} for an arm that is curated by {arm.method!r}",
+            cure=f"drivax curate {arm.method} --data {data.path} --out SCORES",
         )
-    if agent.method == "oracle" and not table.steps.any():
-        raise UsageError(
-            "no scenario has a labelled event", file=data.path, cure="use an agent that needs no labels"
-        )
-    if agent.by_lot:
-        table = matched(table, seed, usable)
-    return WeightedSet(data, weights_of(table, agent.weights or config, agent.scale, usable))
+    if arm.method == "oracle" and not table.steps.any():
+        raise UsageError("no scenario has a labelled event", file=data.path, cure="use an arm without labels")
+    if arm.permuted:
+        table = permute_scores(table, seed, usable)
+    return WeightedSet(data, sampling_weights(table, arm.weights or config, arm.scale, usable))

@@ -1,4 +1,4 @@
-"""From components to scores: their weighted mean at every step, and one score of every scenario."""
+"""Combine components to step scores (weighted mean) and aggregate steps to scenario scores."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Combination:
     """How components become scores.
 
     Attributes:
-        weights: Of each component that counts; not negative. What they are among each other counts, not their sum.
-        scenario: How steps become the score of their scenario: ``max``, ``mean``, ``std``, ``p99`` (a percentile,
-            any from p0 to p100) or ``top10`` (the mean of the ten largest, or of so many others). One for the combined
-            score, or one for each component, whose results are then weighted.
+        weights: Non-negative weight of each component; only their ratios matter.
+        scenario: Aggregator of steps: ``max``, ``mean``, ``std``, ``p0`` to ``p100`` (percentile) or ``topN`` (mean of
+            the N largest). A string aggregates the combined score; a mapping names an aggregator for each component,
+            and the results are weighted.
     """
 
     weights: Mapping[str, float]
@@ -39,38 +39,36 @@ class Combination:
                 raise UsageError(f"the weight of {name!r} is {weight}", cure="use 0 or more")
         if not any(self.weights.values()):
             raise UsageError("no component has a weight", cure="give one a weight above 0")
-        each = {"": self.scenario} if isinstance(self.scenario, str) else self.scenario
-        for name in each.values():
+        aggregators = {"": self.scenario} if isinstance(self.scenario, str) else self.scenario
+        for name in aggregators.values():
             check_aggregator(name)
         if not isinstance(self.scenario, str):
-            lacking = sorted(set(self.weights) - set(self.scenario))
-            if lacking:
+            missing = sorted(set(self.weights) - set(self.scenario))
+            if missing:
                 raise UsageError(
-                    f"there is no aggregator for {lacking[0]!r}", cure="name one for each component"
+                    f"there is no aggregator for {missing[0]!r}", cure="name one for each component"
                 )
 
-    def check_components(self, there: Collection[str]) -> None:
-        """Refuses to weigh or to aggregate what is not there.
-
-        Raises:
-            UsageError: A component that has a weight, or an aggregator of its own, is not there.
-        """
+    def check_components(self, available: Collection[str]) -> None:
+        """Refuse weights and aggregators of components that are not available."""
         for name in (*self.weights, *(() if isinstance(self.scenario, str) else self.scenario)):
-            if name not in there:
-                raise UsageError(f"there is no component {name!r}", cure=did_you_mean(name, sorted(there)))
+            if name not in available:
+                raise UsageError(
+                    f"there is no component {name!r}", cure=did_you_mean(name, sorted(available))
+                )
 
     def combine(self, components: Mapping[str, Steps], valid: Valid) -> tuple[Steps, Scenarios]:
-        """Scores in [0, 1]: of every step the weighted mean of its components, and of every scenario.
+        """Return the scores of steps and of scenarios, in [0, 1].
 
-        Steps that are not valid score 0, and count for no scenario.
+        Invalid steps score 0 and do not count for their scenario.
 
         Raises:
-            UsageError: A component that has a weight is not there.
+            UsageError: A component that has a weight is missing.
         """
         self.check_components(components)
         shares = {name: weight / sum(self.weights.values()) for name, weight in self.weights.items()}
         steps = sum(share * components[name] for name, share in shares.items())
-        # A mean of ones may be a rounding above 1.
+        # A mean of ones may exceed 1 by rounding.
         steps = np.where(valid, np.minimum(steps, 1.0), 0.0)
         if isinstance(self.scenario, str):
             return steps, aggregate(steps, valid, self.scenario)
@@ -80,46 +78,41 @@ class Combination:
 
 
 def check_aggregator(name: str) -> None:
-    """Refuses what is no aggregator.
-
-    Raises:
-        UsageError: It is none.
-    """
-    found = _NUMBERED.fullmatch(name)
-    known = name in ("max", "mean", "std") if found is None else _allowed(found[1], int(found[2]))
+    """Refuse an unknown aggregator."""
+    match = _NUMBERED.fullmatch(name)
+    if match is None:
+        known = name in ("max", "mean", "std")
+    else:
+        known = int(match[2]) <= 100 if match[1] == "p" else int(match[2]) >= 1
     if not known:
         raise UsageError(
-            f"{name!r} aggregates no steps", cure="use max, mean, std, p0 to p100, or top1, top2, ..."
+            f"unknown aggregator {name!r}", cure="use max, mean, std, p0 to p100, or top1, top2, ..."
         )
 
 
-def _allowed(kind: str, number: int) -> bool:
-    return number <= 100 if kind == "p" else number >= 1
-
-
 def aggregate(steps: Steps, valid: Valid, name: str) -> Scenarios:
-    """One number of the valid steps of every scenario; 0 where it has none.
+    """Aggregate the valid steps of every scenario; 0 where there are none.
 
-    ``pQ`` is the Q-th percentile, linear between the two nearest (NumPy's default); ``std`` that of the population.
+    Percentiles interpolate linearly (NumPy's default); ``std`` is the population's.
     """
     check_aggregator(name)
     count = valid.sum(axis=1)
-    some = np.maximum(count, 1)
+    divisor = np.maximum(count, 1)
     masked = np.where(valid, steps, 0.0)
-    mean = masked.sum(axis=1) / some
+    mean = masked.sum(axis=1) / divisor
     if name == "mean":
         return mean
     if name == "std":
-        return np.sqrt(np.where(valid, (steps - mean[:, None]) ** 2, 0.0).sum(axis=1) / some)
+        return np.sqrt(np.where(valid, (steps - mean[:, None]) ** 2, 0.0).sum(axis=1) / divisor)
     ordered = np.sort(np.where(valid, steps, np.inf), axis=1)
     ordered = np.where(np.isinf(ordered), 0.0, ordered)
-    found = _NUMBERED.fullmatch(name)
-    if found is not None and found[1] == "top":
-        place = np.arange(steps.shape[1])
-        largest = (place < count[:, None]) & (place >= count[:, None] - int(found[2]))
+    match = _NUMBERED.fullmatch(name)
+    if match is not None and match[1] == "top":
+        rank = np.arange(steps.shape[1])
+        largest = (rank < count[:, None]) & (rank >= count[:, None] - int(match[2]))
         return np.where(largest, ordered, 0.0).sum(axis=1) / np.maximum(largest.sum(axis=1), 1)
-    at = (some - 1) * (1.0 if found is None else int(found[2]) / 100.0)
-    low = np.floor(at).astype(int)
-    high, row = np.minimum(low + 1, some - 1), np.arange(len(steps))
-    part = at - low
-    return ordered[row, low] * (1.0 - part) + ordered[row, high] * part
+    position = (divisor - 1) * (1.0 if match is None else int(match[2]) / 100.0)
+    low = np.floor(position).astype(int)
+    high, scenario = np.minimum(low + 1, divisor - 1), np.arange(len(steps))
+    fraction = position - low
+    return ordered[scenario, low] * (1.0 - fraction) + ordered[scenario, high] * fraction

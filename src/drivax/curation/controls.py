@@ -1,4 +1,4 @@
-"""What curation has to be compared with: no preference, a preference by lot, and the truth."""
+"""Controls of curation: permuted scores, and the event labels of the built-in world."""
 
 from __future__ import annotations
 
@@ -16,28 +16,27 @@ from drivax.synthetic.events import EventKind
 Array = np.ndarray[Any, Any]
 
 
-def matched(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
-    """The scores of a table, dealt out anew by lot: each scenario is given those of another, from a random step on.
+def permute_scores(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = None) -> ScoreTable:
+    """Return the matched random control of a table: every scenario gets the scores of another one, cyclically shifted.
 
-    What weights prefer is chance then, but how they are spread stays: over all steps, within a scenario, and among
-    scenarios; exactly where equally many steps of all scenarios can be drawn. (A row that is too long is cut, one that
-    is too short begins anew.) Steps that were dealt out one by one would spread over all scenarios alike, and a
-    weighting of single steps would be compared with more scenarios than it sees itself.
+    The distribution of the scores is kept over all steps, within a scenario, and among scenarios; exactly where all
+    scenarios have the same number of drawable steps. (Longer sequences are cut, shorter ones repeated.) Permuting
+    single steps would spread large scores evenly over all scenarios, and the control would see more scenarios.
 
     Args:
-        table: What to match.
-        seed: Of the lot.
-        usable: Which steps can be drawn (:func:`drivax.curation.weights.weights_of`).
+        table: The table to match.
+        seed: Seed of the permutation.
+        usable: Steps that can be drawn (:func:`drivax.curation.weights.sampling_weights`).
     """
     rng = np.random.default_rng(seed)
-    drawn = table.drawn if usable is None else usable
+    drawable = table.drawable if usable is None else usable
     steps, scenarios = table.steps.copy(), table.scenarios.copy()
-    rows = np.flatnonzero(drawn.any(axis=1))
-    for row, other in zip(rows, rng.permutation(rows), strict=True):
-        scores = table.steps[other, drawn[other]]
+    indices = np.flatnonzero(drawable.any(axis=1))
+    for index, other in zip(indices, rng.permutation(indices), strict=True):
+        scores = table.steps[other, drawable[other]]
         scores = np.roll(scores, rng.integers(len(scores)))
-        steps[row, drawn[row]] = np.resize(scores, int(drawn[row].sum()))
-        scenarios[row] = table.scenarios[other]
+        steps[index, drawable[index]] = np.resize(scores, int(drawable[index].sum()))
+        scenarios[index] = table.scenarios[other]
     config = {"like": table.method, "like_config": dict(table.config), "seed": seed}
     return replace(
         table, method="random_matched", config=config, steps=steps, scenarios=scenarios, components={}
@@ -45,26 +44,26 @@ def matched(table: ScoreTable, seed: int, usable: Bool[Array, "N T"] | None = No
 
 
 def event_steps(data: ScenarioSet) -> Bool[Array, "N T"]:
-    """At which steps a labelled event of the built-in world goes on.
+    """Return the steps within a labelled event of the built-in world.
 
     Raises:
-        DataError: The set is not of the built-in world, or of before its labels.
+        DataError: The set is not of the built-in world.
     """
     dataset = {str(entry["dataset"]) for entry in data.entries}
     if dataset != {"drivax"}:
         raise DataError(
-            f"only the built-in world knows its rare events, this set is of {', '.join(sorted(dataset))}",
+            f"only the built-in world has event labels, this set is of {', '.join(sorted(dataset))}",
             file=data.path,
             cure="use another method, or a set that `drivax generate` made",
         )
     step = np.arange(data.capacity.steps)
-    rows = []
+    events = []
     for scenario in data:
         kind, first, last = (scenario.record[f"event_{name}"][:, None] for name in ("kind", "start", "end"))
-        rows.append(((kind > EventKind.NONE) & (step >= first) & (step <= last)).any(axis=0))
-    return np.stack(rows)
+        events.append(((kind > EventKind.NONE) & (step >= first) & (step <= last)).any(axis=0))
+    return np.stack(events)
 
 
 def event_kinds(data: ScenarioSet) -> Int[Array, " N"]:
-    """Kind of the first event of every scenario (:class:`drivax.synthetic.events.EventKind`), 0 where there is none."""
+    """Return the :class:`~drivax.synthetic.events.EventKind` of every scenario's first event, 0 where it has none."""
     return np.array([max(int(scenario.record["event_kind"][0]), 0) for scenario in data])

@@ -1,9 +1,8 @@
-"""Scouts: an ensemble of cloned drivers that have seen different recordings. Where they disagree, data are scarce.
+"""Ensemble of behaviour-cloning policies, trained on different folds of the recordings; they disagree on rare data.
 
-Each scout leaves one fold of the recordings out; all are trained side by side in one program, and differ in their first
-parameters, too. They look at the same steps, drawn and observed once for all; each leaves those of its own fold out of
-its loss, so that what it learns from is drawn as it would be for it alone. Deep ensembles: Lakshminarayanan et al.
-2017, arXiv 1612.01474.
+Each member leaves one fold of the recordings out. All members are trained in one program, from different initial
+parameters, on the same drawn steps; each masks the steps of its own fold. Deep ensembles: Lakshminarayanan et al. 2017,
+arXiv 1612.01474.
 """
 
 from __future__ import annotations
@@ -19,14 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from drivax.curation.logged import Progress, map_batches
 from drivax.curation.rarity import KernelRarity, rarity_steps
-from drivax.curation.scoring import Progress, each_batch
 from drivax.errors import UsageError
 from drivax.evaluation.memory import free_memory
-from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, updated
+from drivax.learning.algorithms.behaviour_cloning import Bc, BcConfig, imitation_update
 from drivax.learning.driving import Driving
-from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded
-from drivax.learning.sampler import draw, sampler
+from drivax.learning.experience import Experience, ExperienceConfig, draw, expert_actions, recorded, sampler
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.distributions import Distribution
 from drivax.networks.entity import EntityConfig
@@ -38,36 +36,34 @@ from drivax.tasks.features import Features
 from drivax.tasks.observations import PRESETS
 from drivax.tasks.task import Task
 
-#: Logs whose steps are observed at once.
-_AT_ONCE = 8
-#: Scenarios whose opinions are computed with at once.
+#: Logs that are observed at once.
+_LOG_BATCH = 8
+#: Scenarios whose predictions are reduced at once: float64 copies of a large set take several times its memory.
 _BLOCK = 4096
-#: Actions that are drawn from every scout to measure how much their distributions differ.
-_DRAWN = 16
-
-#: Nothing that a driver could copy instead of looking: no past steps, no last action.
-_SEEN = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
+#: Actions drawn from every member to estimate the mutual information.
+_SAMPLES = 16
+#: No past steps and no last action, which a policy could copy instead of observing the scene.
+_OBSERVATION = replace(PRESETS["minimal"], agents=16, features=Features(ego_static=("length", "width")))
 
 Numbers = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
-class ScoutsConfig:
-    """An ensemble of scouts.
+class EnsembleConfig:
+    """Configuration of an ensemble.
 
     Attributes:
-        folds: How many scouts; each leaves out every so manieth recording, chosen by lot.
-        cloning: How each is trained; of every ``batch`` each scout takes the share of the other folds, steps of its own
-            being left out. With ``loss: mse`` scouts disagree by the variance of what they would do; with
-            ``likelihood`` by how much their distributions differ, so that ``network.distribution: mixture`` can
-            disagree about modes.
-        learn_from: About so many scenarios are learned from, whole recordings chosen by lot; null: all, which have to
-            fit on the device. All are scored.
-        total_steps: Recorded steps that are drawn for all of them, rounded up to whole iterations of ``cloning``.
-        weighted: ``plain``: all steps alike; ``rarity``: drawn by inverse density of the expert's action, clipped
-            (:class:`~drivax.curation.rarity.KernelRarity` with its exponent at 1).
-        task: What scouts see, and what actions are.
-        seed: Of folds, networks and draws.
+        folds: Number of members; each leaves out a random 1 / ``folds`` of the recordings.
+        cloning: Training of each member; each uses the steps of the other folds in every ``batch``. With ``loss: mse``
+            the disagreement is the variance of the predicted actions; with ``likelihood`` the mutual information of
+            their distributions, so that ``network.distribution: mixture`` can disagree about modes.
+        learn_from: Approximate number of scenarios to train on, as randomly chosen whole recordings; null: all, which
+            must fit on the device. All are scored.
+        total_steps: Logged steps drawn for all members, rounded up to whole iterations of ``cloning``.
+        weighted: ``plain``: uniform draws; ``rarity``: by clipped inverse density of the expert's action
+            (:class:`~drivax.curation.rarity.KernelRarity` with exponent 1).
+        task: Observation and action space.
+        seed: Seed of folds, networks and draws.
     """
 
     folds: int = 5
@@ -79,14 +75,12 @@ class ScoutsConfig:
     learn_from: int | None = None
     total_steps: int = 384_000
     weighted: Literal["plain", "rarity"] = "plain"
-    task: Task = field(default_factory=lambda: Task(observation=_SEEN, metrics="none"))
+    task: Task = field(default_factory=lambda: Task(observation=_OBSERVATION, metrics="none"))
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.folds < 2:
-            raise UsageError(
-                f"{self.folds} folds", cure="use 2 or more: one scout has nobody to disagree with"
-            )
+            raise UsageError(f"{self.folds} folds", cure="use 2 or more: disagreement needs two members")
         if self.learn_from is not None and self.learn_from < 1:
             raise UsageError(f"learn_from is {self.learn_from}", cure="use 1 or more, or leave it out")
 
@@ -97,14 +91,14 @@ class ScoutsConfig:
 
 
 @dataclass(frozen=True)
-class Opinions:
-    """What scouts make of every step of a set.
+class Predictions:
+    """Predictions of the members at every step of a set.
 
     Attributes:
-        action: What each would do, by the mode, in units of the action space.
-        expert: What the expert did.
-        known: Where what the expert did is known, and an action does it.
-        information: Mutual information of action and scout, nats, if they were trained by likelihood.
+        action: Mode of each member, in units of the action space.
+        expert: Action of the expert.
+        known: Whether the expert's action is known and within the bounds.
+        information: Mutual information of action and member, nats, for members trained by likelihood.
     """
 
     action: Float[Numbers, "N T K D"]
@@ -113,108 +107,101 @@ class Opinions:
     information: Float[Numbers, "N T"] | None
 
     def disagreement(self, deviation: Float[Numbers, " D"]) -> Float[Numbers, "N T D"]:
-        """Variance among the scouts (unbiased), in units of the variance of what experts do."""
-        variance = [self.action[rows].astype(np.float64).var(axis=2, ddof=1) for rows in self._blocks()]
+        """Return the unbiased variance among the members over the variance of the expert's actions."""
+        variance = [self.action[block].astype(np.float64).var(axis=2, ddof=1) for block in self._blocks()]
         return np.concatenate(variance) / deviation**2
 
     def error(
         self, deviation: Float[Numbers, " D"], fold: Int[Numbers, " N"] | None
     ) -> Float[Numbers, "N T"]:
-        """Squared error over the expert's variance, summed over the action.
+        """Return the squared error over the expert's variance, summed over the action's dimensions.
 
         Args:
-            deviation: Standard deviation of what experts do.
-            fold: Of each scenario, whose scout is judged since it has not seen it; -1, or None for all: nobody has
-                seen it, and their mean is judged.
+            deviation: Standard deviation of the expert's actions.
+            fold: Member that has not seen the scenario and is evaluated on it; -1, or None for all: no member has seen
+                it, and their mean is evaluated.
         """
-        judged = np.full(len(self.action), -1) if fold is None else fold
-        found = []
-        for rows in self._blocks():
-            action, place = self.action[rows].astype(np.float64), judged[rows, None, None]
-            own = np.take_along_axis(action, place[..., None], axis=2)[:, :, 0]
-            one = np.where(place < 0, action.mean(axis=2), own)
-            found.append((((one - self.expert[rows]) / deviation) ** 2).sum(axis=-1))
-        return np.concatenate(found)
+        members = np.full(len(self.action), -1) if fold is None else fold
+        errors = []
+        for block in self._blocks():
+            action, member = self.action[block].astype(np.float64), members[block, None, None]
+            own = np.take_along_axis(action, member[..., None], axis=2)[:, :, 0]
+            predicted = np.where(member < 0, action.mean(axis=2), own)
+            errors.append((((predicted - self.expert[block]) / deviation) ** 2).sum(axis=-1))
+        return np.concatenate(errors)
 
     def _blocks(self) -> list[slice]:
-        """Rows that are computed with at once: in double precision all of a large set take several times its memory."""
         return [slice(first, first + _BLOCK) for first in range(0, len(self.action), _BLOCK)]
 
 
-@dataclass(frozen=True)
-class Scouts:
+@dataclass(frozen=True, eq=False)
+class Ensemble:
     """A trained ensemble.
 
     Attributes:
-        config: What it is.
-        learner: What one scout is.
-        parameters: Of all, along a leading axis.
-        set_hash: ``ScenarioSet.hash`` of what it was trained on.
-        fold: Of every scenario of that; -1 of those that no scout has seen.
-        deviation: Standard deviation of what the experts of those did, in units of the action space.
+        config: Its configuration.
+        learner: The learner of one member.
+        parameters: Parameters of all members, along a leading axis.
+        set_hash: ``ScenarioSet.hash`` of the training set.
+        fold: Fold of every scenario of that set; -1 for scenarios that no member has seen.
+        deviation: Standard deviation of the expert's actions there, in units of the action space.
     """
 
-    config: ScoutsConfig
+    config: EnsembleConfig
     learner: Bc
     parameters: Any
     set_hash: str
     fold: Int[Numbers, " N"]
     deviation: Float[Numbers, " D"]
 
-    def opinions(self, data: ScenarioSet, progress: Progress | None = None) -> Opinions:
-        """What they make of a set, which need not be the one that they were trained on."""
-        found = each_batch(data, lambda bank: self._of_bank(self.parameters, bank), progress)
-        return Opinions(**{"information": None, **found})
+    def predictions(self, data: ScenarioSet, progress: Progress | None = None) -> Predictions:
+        """Return the predictions on a set, which need not be the training set."""
+        values = map_batches(data, lambda bank: self._of_bank(self.parameters, bank), progress)
+        return Predictions(**{"information": None, **values})
 
     @partial(jax.jit, static_argnums=0)
     def _of_bank(self, parameters: Any, bank: ScenarioBank) -> dict[str, Array]:
         environment = recorded(self.learner.environment)
         steps = jnp.arange(bank.steps)
 
-        def one(index: Array) -> dict[str, Array]:
-            seen = environment.observe_recorded(bank, (jnp.full_like(steps, index), steps))
-            act = partial(self.learner.distribution, observation=seen)
-            found = {"action": jnp.moveaxis(jax.vmap(lambda own: act(own).mode())(parameters), 0, 1)}
+        def predict(index: Array) -> dict[str, Array]:
+            observation = environment.observe_recorded(bank, (jnp.full_like(steps, index), steps))
+            act = partial(self.learner.distribution, observation=observation)
+            values = {"action": jnp.moveaxis(jax.vmap(lambda own: act(own).mode())(parameters), 0, 1)}
             if self.config.cloning.loss == "likelihood":
-                found["information"] = mutual_information(jax.vmap(act)(parameters), jax.random.key(0))
-            return found
+                values["information"] = mutual_information(jax.vmap(act)(parameters), jax.random.key(0))
+            return values
 
         expert = environment.expert_steps(bank)
-        found = jax.lax.map(one, jnp.arange(len(bank)), batch_size=_AT_ONCE)
-        return {**found, "expert": expert.action, "known": expert.usable & ~expert.clipped}
-
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
+        values = jax.lax.map(predict, jnp.arange(len(bank)), batch_size=_LOG_BATCH)
+        return {**values, "expert": expert.action, "known": expert.usable & ~expert.clipped}
 
 
-def mutual_information(scouts: Distribution, key: Array) -> Float[Array, "*batch"]:
-    """How much an action tells of whose it is, nats: from 0, where all distributions are the same, to ``ln K``.
+def mutual_information(members: Distribution, key: Array) -> Float[Array, "*batch"]:
+    """Return the mutual information of action and member, nats: 0 for equal distributions, at most ``ln K``.
 
-    The mean of ``ln p_k(a) - ln (1/K sum_j p_j(a))`` over scouts k and actions that they draw (Jensen-Shannon
-    divergence; Lin 1991), estimated from 16 of each.
+    The mean of ``ln p_k(a) - ln (1/K sum_j p_j(a))`` over members k and actions drawn from them (Jensen-Shannon
+    divergence; Lin 1991), estimated from 16 samples of each.
 
     Args:
-        scouts: Distributions along a leading axis of K.
-        key: Of the draws.
+        members: Distributions along a leading axis of K.
+        key: Random key.
     """
-    count = jax.tree.leaves(scouts)[0].shape[0]
-    density = jax.vmap(lambda one, choice: one.log_prob(choice), (0, None))
+    count = jax.tree.leaves(members)[0].shape[0]
+    density = jax.vmap(lambda member, action: member.log_prob(action), (0, None))
 
-    def of_draw(key: Array) -> Array:
-        choice = jax.vmap(lambda one, key: one.sample(key))(scouts, jax.random.split(key, count))
-        log_prob = jax.vmap(density, (None, 0))(scouts, choice)  # [whose action, whose density, ...]
+    def estimate(key: Array) -> Array:
+        actions = jax.vmap(lambda member, key: member.sample(key))(members, jax.random.split(key, count))
+        log_prob = jax.vmap(density, (None, 0))(members, actions)  # [sampled from, density of, ...]
         own = jnp.moveaxis(jnp.diagonal(log_prob), -1, 0)
         return jnp.mean(own - jax.nn.logsumexp(log_prob, axis=1) + math.log(count), axis=0)
 
-    found = jnp.mean(jax.lax.map(of_draw, jax.random.split(key, _DRAWN)), axis=0)
-    return jnp.clip(found, 0.0, math.log(count))
+    mean = jnp.mean(jax.lax.map(estimate, jax.random.split(key, _SAMPLES)), axis=0)
+    return jnp.clip(mean, 0.0, math.log(count))
 
 
-def folds_of(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers, " N"]:
-    """A fold of every scenario: recordings, shuffled, are dealt out one by one, so that none is cut apart.
+def assign_folds(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers, " N"]:
+    """Return a random fold of every scenario; all scenarios of a recording have the same one.
 
     Raises:
         UsageError: There are fewer recordings than folds.
@@ -228,26 +215,26 @@ def folds_of(clusters: Sequence[str], folds: int, seed: int) -> Int[Numbers, " N
     return np.random.default_rng(seed).permutation(len(names))[number] % folds
 
 
-def some_of(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
-    """Rows of whole recordings, chosen by lot until there are ``count`` or more, in order; None: all."""
+def sample_recordings(clusters: Sequence[str], count: int | None, seed: int) -> Int[Numbers, " n"]:
+    """Return the scenarios of random whole recordings, at least ``count`` together, in order; None: all."""
     names, number = np.unique(clusters, return_inverse=True)
     if count is None:
         return np.arange(len(number))
-    place = np.random.default_rng(seed).permutation(len(names))
-    sizes = np.bincount(place[number])
-    # A recording is taken as long as those before it are too few.
-    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[place[number]])
+    rank = np.random.default_rng(seed).permutation(len(names))
+    sizes = np.bincount(rank[number])
+    # Take recordings until there are enough scenarios.
+    return np.flatnonzero((np.cumsum(sizes) - sizes < count)[rank[number]])
 
 
-def train_scouts(
-    config: ScoutsConfig, data: ScenarioSet, say: Callable[[int, int], None] | None = None
-) -> Scouts:
-    """Trains an ensemble.
+def train_ensemble(
+    config: EnsembleConfig, data: ScenarioSet, log: Callable[[int, int], None] | None = None
+) -> Ensemble:
+    """Train an ensemble.
 
     Args:
-        config: What it is.
-        data: Scenarios; those that are learned from are held on the device.
-        say: Called with (iterations done, iterations).
+        config: Its configuration.
+        data: The scenarios; those to learn from are held on the device.
+        log: Called with (iterations done, iterations).
 
     Raises:
         UsageError: There are fewer recordings than folds, or the scenarios do not fit on the device.
@@ -255,65 +242,65 @@ def train_scouts(
     """
     environment = Driving(Simulator(config.task))
     clusters = np.array(recordings_of(data.entries))
-    rows = some_of(clusters.tolist(), config.learn_from, config.seed)
+    chosen = sample_recordings(clusters.tolist(), config.learn_from, config.seed)
     fold = np.full(len(data), -1)
-    fold[rows] = folds_of(clusters[rows].tolist(), config.folds, config.seed)
-    _refuse_too_many(config, data, len(rows), free_memory(jax.devices()[0]))
-    bank = ScenarioBank.from_scenarios(data[row] for row in rows)
+    fold[chosen] = assign_folds(clusters[chosen].tolist(), config.folds, config.seed)
+    _check_memory(config, data, len(chosen), free_memory(jax.devices()[0]))
+    bank = ScenarioBank.from_scenarios(data[index] for index in chosen)
     experience, deviation = experience_of(config, environment, bank)
     learner = config.cloning.build(environment, bank, config.iterations)
-    parameters = fit(config, learner, experience, fold[rows], say)
-    return Scouts(config, learner, parameters, data.hash, fold, deviation)
+    parameters = fit(config, learner, experience, fold[chosen], log)
+    return Ensemble(config, learner, parameters, data.hash, fold, deviation)
 
 
-def _refuse_too_many(config: ScoutsConfig, data: ScenarioSet, count: int, free: int | None) -> None:
-    """Refuses more scenarios than the device holds."""
+def _check_memory(config: EnsembleConfig, data: ScenarioSet, count: int, free: int | None) -> None:
+    """Refuse more scenarios than fit on the device."""
     if free is None:
         return
-    one = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
-    # Each is there twice while a bank is made.
-    if 2 * one * count > free:
-        fits = free // (4 * one)
+    size = ScenarioBank.from_scenarios([data[0]], trim=Sizes.used(data)).nbytes
+    # A bank exists twice while it is made.
+    if 2 * size * count > free:
+        fits = free // (4 * size)
         raise UsageError(
-            f"{count:,} scenarios take some {2e-9 * one * count:,.0f} GB, and {free / 1e9:,.0f} GB are free",
+            f"{count:,} scenarios take some {2e-9 * size * count:,.0f} GB, and {free / 1e9:,.0f} GB are free",
             file=data.path,
-            cure=f"pass --learn_from {fits}: scouts learn from so many, and score all"
+            cure=f"pass --learn_from {fits} to train on fewer scenarios; all are scored"
             if fits >= config.folds
             else "free memory",
         )
 
 
 def experience_of(
-    config: ScoutsConfig, environment: Driving, bank: ScenarioBank
+    config: EnsembleConfig, environment: Driving, bank: ScenarioBank
 ) -> tuple[Experience, Float[Numbers, " D"]]:
-    """What scouts learn from and how it is drawn, and the deviation of what experts do."""
-    made = ExperienceConfig(mask_clipped=config.cloning.mask_clipped).of(environment, bank)
-    usable = np.asarray(made.usable)
-    action = np.asarray(made.expert.action, np.float64)
+    """Return the experience that members learn from, and the standard deviation of the expert's actions."""
+    experience = ExperienceConfig(mask_clipped=config.cloning.mask_clipped).of(environment, bank)
+    usable = np.asarray(experience.usable)
+    action = np.asarray(experience.expert.action, np.float64)
     if config.weighted == "rarity":
         weights = rarity_steps(KernelRarity(temper=1.0), action, usable)
-        made = replace(made, critic=sampler(np.where(usable, weights, 0.0)))
-    return made, np.maximum(action[usable].std(axis=0), 1e-6)
+        experience = replace(experience, critic=sampler(np.where(usable, weights, 0.0)))
+    return experience, np.maximum(action[usable].std(axis=0), 1e-6)
 
 
 def fit(
-    config: ScoutsConfig,
+    config: EnsembleConfig,
     learner: Bc,
     experience: Experience,
     fold: Int[Numbers, " N"],
-    say: Callable[[int, int], None] | None = None,
+    log: Callable[[int, int], None] | None = None,
     together: bool | None = None,
 ) -> Any:
-    """Parameters of all scouts, along a leading axis.
+    """Return the trained parameters of all members, along a leading axis.
 
     Args:
-        config: What they are.
-        learner: What one is.
-        experience: What they learn from.
-        fold: Of every scenario.
-        say: Called with (iterations done, iterations).
-        together: Whether an update of all is stacked, or done one after the other; the same either way. By default it
-            is stacked but on CPUs, where products of stacked small matrices take thrice as long.
+        config: Configuration of the ensemble.
+        learner: The learner of one member.
+        experience: What members learn from.
+        fold: Fold of every scenario.
+        log: Called with (iterations done, iterations).
+        together: Update all members in one stacked computation instead of one after the other; same results. None:
+            stacked except on CPUs, where products of stacked small matrices take three times as long.
     """
     environment, cloning = recorded(learner.environment), config.cloning
     if together is None:
@@ -321,22 +308,24 @@ def fit(
     used = math.ceil(cloning.batch * (1.0 - 1.0 / config.folds))
 
     def update(experience: Experience, fold: Array, trained: Any, key: Array) -> tuple[tuple[Any, Any], None]:
-        places = draw(experience.critic, key, (cloning.batch,))
-        observation, action, _ = moments(environment, experience, places)
+        indices = draw(experience.critic, key, (cloning.batch,))
+        observation, action, _ = expert_actions(environment, experience, indices)
 
-        def one(each: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
-            others = fold[places[0]] != each[0]
-            # Those of its fold last; steps are drawn independently, so that which others are too many is chance.
-            rows = jnp.argsort(~others, stable=True)[:used]
-            seen = jax.tree.map(lambda leaf: leaf[rows], observation)
+        def update_member(member: tuple[Array, tuple[Any, Any]]) -> tuple[Any, Any]:
+            others = fold[indices[0]] != member[0]
+            # Steps of its own fold last. Steps are drawn independently, so which of the others are cut is random.
+            order = jnp.argsort(~others, stable=True)[:used]
+            batch = jax.tree.map(lambda leaf: leaf[order], observation)
 
             def loss(parameters: Any) -> tuple[Array, dict[str, Array]]:
-                return cloning.of_moments(learner.distribution(parameters, seen), action[rows], others[rows])
+                return cloning.imitation_loss(
+                    learner.distribution(parameters, batch), action[order], others[order]
+                )
 
-            return updated(each[1], learner.optimiser, loss)[0]
+            return imitation_update(member[1], learner.optimiser, loss)[0]
 
         size = config.folds if together else None
-        return jax.lax.map(one, (jnp.arange(config.folds), trained), batch_size=size), None
+        return jax.lax.map(update_member, (jnp.arange(config.folds), trained), batch_size=size), None
 
     @partial(jax.jit, donate_argnums=2)
     def iterate(experience: Experience, fold: Array, trained: Any, key: Array) -> Any:
@@ -350,6 +339,6 @@ def fit(
     for done in range(config.iterations):
         trained = iterate(experience, jnp.asarray(fold), trained, jax.random.fold_in(key, done))
         jax.block_until_ready(trained)
-        if say is not None:
-            say(done + 1, config.iterations)
+        if log is not None:
+            log(done + 1, config.iterations)
     return trained[0]

@@ -1,22 +1,20 @@
-"""Criticality from motion: how soon, and how hard, a recorded driver had to act, and how it drove.
+"""Kinematic criticality: surrogate safety measures and driving behaviour of the logged driver.
 
-Per step of the log, all in [0, 1]:
+Components of every step, all in [0, 1]:
 
-- urgency is the inverse of the time to collision (Hayward, 1972; the inverse so that no conflict is 0), scaled from
-  0 at the horizon of 5 s to 1 at ``urgent_s``;
-- braking is the deceleration that avoids reaching the nearest agent on the driver's own way if it keeps its speed,
-  ``(v - v_leader)^2 / (2 gap)``, where one that drives towards it counts as standing: its own part of the closing speed
-  no braking takes away (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), as a share of what the car
-  can do (the brake threat number of Braennstroem, Sjoeberg and Coelingh, A Situation and Threat Assessment Algorithm
-  for a Rear-End Collision Avoidance System, 2008);
-- volatility is the larger of jerk and yaw acceleration, each as a share of a limit, over a Savitzky-Golay window
-  (Savitzky and Golay, 1964) that is centred at the action of the step;
-- off_road is how near a corner of the car is to the road's edge, or beyond it;
-- lane_deviation is the distance to the nearest lane centre;
-- density is how many agents there are.
+- urgency: inverse time to collision (Hayward, 1972), scaled from 0 at the horizon of 5 s to 1 at ``urgent_s``;
+- braking: required deceleration to the nearest agent on ego's path at constant speed, ``(v - v_leader)^2 / (2 gap)``
+  (Cooper and Ferguson, Traffic Studies at T-Junctions, 1976), over the car's maximum deceleration (brake threat number
+  of Braennstroem, Sjoeberg and Coelingh, 2008). Oncoming agents count as standing: ego's braking cannot reduce their
+  share of the closing speed;
+- volatility: the larger of jerk and yaw acceleration, each over a limit, from a Savitzky-Golay filter (1964) centred at
+  the action of the step;
+- off_road: closeness of a corner of the car to the road's edge, or beyond it;
+- lane_deviation: distance to the nearest lane centre;
+- density: number of agents.
 
-Time to collision sees crossing traffic but takes headings as fixed, so that it finds oncoming traffic in bends.
-Required braking follows the way through bends but sees only who is on it.
+Time to collision detects crossing traffic but assumes fixed headings, so it reports oncoming traffic in bends.
+Required braking follows the path through bends but only considers agents on it.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import STOPPED_MPS, TTC_HORIZON_S, time_to_collision
 from drivax.simulator.types import Frame
 
-#: Middles of the two windows of the map query that cover about 75 m of the way ahead, m.
+#: Centres of the two windows of the map query that cover about 75 m of the path ahead, m.
 _WINDOWS_M = (6.0, 45.0)
 #: nuPlan's window of 1.5 s, at its orders: jerk from accelerations, yaw acceleration from headings.
 _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
@@ -47,15 +45,15 @@ _WINDOW, _JERK_ORDER, _YAW_ORDER = 15, 2, 3
 
 @dataclass(frozen=True)
 class KinematicConfig:
-    """Scales of the components: where each is 1.
+    """Scales of the components: the value at which each is 1.
 
     Attributes:
-        urgent_s: Time to collision at and below which urgency is 1; the bound of the metric ``ttc_ok``.
-        full_braking_mps2: Required deceleration at and above which braking is 1; the physical action space's limit.
-        full_jerk_mps3, full_yaw_rps2: Jerk, and yaw acceleration (rad/s2), of volatility 1; twice nuPlan's limits.
-        edge_m: A corner this far inside the road's edge has off_road 0.
-        lane_m: Distance to the lane centre of lane_deviation 1.
-        crowd: Agents, ego included, of density 1.
+        urgent_s: Time to collision; the bound of the metric ``ttc_ok``.
+        full_braking_mps2: Required deceleration; the limit of the physical action space.
+        full_jerk_mps3, full_yaw_rps2: Jerk, and yaw acceleration (rad/s2); twice nuPlan's limits.
+        edge_m: Distance of a corner inside the road's edge at which off_road is 0.
+        lane_m: Distance to the lane centre.
+        crowd: Number of agents, ego included.
     """
 
     urgent_s: float = 0.95
@@ -75,7 +73,7 @@ class KinematicConfig:
         check_positive({name: getattr(self, name) for name in names})
 
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
-        """The components of every step of a log."""
+        """Return the components of every step of a log."""
         return {
             "urgency": _urgencies(self, log),
             "braking": jnp.clip(_required(bank, log) / self.full_braking_mps2, 0.0, 1.0),
@@ -87,11 +85,7 @@ class KinematicConfig:
 
 
 def check_positive(values: dict[str, float]) -> None:
-    """Refuses scales that are not positive and finite.
-
-    Raises:
-        UsageError: The first of them.
-    """
+    """Refuse scales that are not positive and finite."""
     for name, value in values.items():
         if not 0.0 < value < float("inf"):
             raise UsageError(f"{name} is {value}", cure="use a positive number")
@@ -100,7 +94,7 @@ def check_positive(values: dict[str, float]) -> None:
 def urgency(
     ttc_s: Float[Array, ""], speed_mps: Float[Array, ""], config: KinematicConfig
 ) -> Float[Array, ""]:
-    """Inverse time to collision between 0 (none within 5 s, or standing) and 1 (``urgent_s`` or less)."""
+    """Return the scaled inverse time to collision: 0 beyond 5 s or standing, 1 at ``urgent_s`` or less."""
     least, most = 1.0 / TTC_HORIZON_S, 1.0 / config.urgent_s
     share = (1.0 / jnp.maximum(ttc_s, 1e-3) - least) / (most - least)
     return jnp.where(speed_mps >= STOPPED_MPS, jnp.clip(share, 0.0, 1.0), 0.0)
@@ -110,19 +104,19 @@ def required_braking(
     bank: ScenarioBank, index: Any, frame: Frame, counts: Bool[Array, " S"], along_m: Float[Array, ""],
     speed_mps: Float[Array, ""],
 ) -> Float[Array, ""]:  # fmt: skip
-    """Deceleration (m/s2) that avoids reaching the nearest agent on the log's own way at its present speed.
+    """Return the deceleration (m/s2) that avoids reaching the nearest agent on ego's logged path.
 
-    An agent is on the way where its box reaches into the strip as wide as ego along the log's route, on ego's level,
-    up to about 75 m ahead. One that comes towards ego counts as standing, so that who stands, or has slowed down to let
-    somebody pass, need not brake. 0 where nobody is on the way, or the nearest one is not approached.
+    An agent is on the path where its box reaches into a strip of ego's width along the logged route, on ego's level,
+    up to about 75 m ahead. Oncoming agents count as standing, so that ego need not brake while it stands or gives way.
+    0 where no agent is on the path, or the nearest one is not approached.
 
     Args:
         bank: The scenarios.
-        index: Row of the bank.
-        frame: Everyone now; ego is slot 0.
-        counts: Who may be on the way.
-        along_m: Arc length of ego along the log's route.
-        speed_mps: Of ego.
+        index: Scenario of the bank.
+        frame: All agents at the step; ego is slot 0.
+        counts: Agents that are considered.
+        along_m: Arc length of ego along the logged route.
+        speed_mps: Speed of ego.
     """
     me, xy = frame.box[0], frame.box[:, :2]
 
@@ -130,7 +124,7 @@ def required_braking(
         near = along_m + offset_m
         return jax.vmap(lambda point: project_on_route(bank, index, point, near, route=LOG_ROUTE))(xy)
 
-    # Beyond the end of a window a hit is its last point, so each agent counts where it is nearest.
+    # Beyond a window the projection is its end point, so take the nearer of the two.
     first, second = map(window, _WINDOWS_M)
     nearer = first.distance_m <= second.distance_m
     hits = jax.tree.map(lambda a, b: jnp.where(nearer.reshape(-1, *(1,) * (a.ndim - 1)), a, b), first, second)
@@ -138,9 +132,9 @@ def required_braking(
     sin = jnp.sqrt(jnp.maximum(1.0 - cos * cos, 0.0))
     length, width = frame.box[:, 4] / 2, frame.box[:, 5] / 2
     counts = counts & (jnp.abs(frame.z - frame.z[0]) <= LEVEL_M)
-    on_way = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
+    on_path = hits.distance_m < jnp.abs(sin) * length + jnp.abs(cos) * width + me[5] / 2
     gap = hits.along_m - along_m - (jnp.abs(cos) * length + sin * width) - me[4] / 2
-    gap = jnp.where(counts & on_way & (hits.along_m > along_m), gap, jnp.inf)
+    gap = jnp.where(counts & on_path & (hits.along_m > along_m), gap, jnp.inf)
     nearest = jnp.argmin(gap)
     away = jnp.maximum(jnp.sum(frame.velocity[nearest] * hits.heading[nearest]), 0.0)
     closing = jnp.maximum(speed_mps - away, 0.0)
@@ -148,37 +142,37 @@ def required_braking(
 
 
 def crowding(log: Logged, crowd: int) -> Float[Array, " T"]:
-    """Agents that are there, ego included, as a share of ``crowd``, at most 1."""
+    """Return the number of valid agents, ego included, over ``crowd``, at most 1."""
     return jnp.minimum(log.frame.valid.sum(axis=1) / crowd, 1.0)
 
 
 def _urgencies(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
-    def one(frame: Frame, left_out: Array, motion: Array) -> Array:
-        return urgency(time_to_collision(frame, jnp.int32(0), left_out), motion[3], config)
+    def at_step(frame: Frame, ignored: Array, motion: Array) -> Array:
+        return urgency(time_to_collision(frame, jnp.int32(0), ignored), motion[3], config)
 
-    return jax.vmap(one)(log.frame, log.left_out, log.motion)
+    return jax.vmap(at_step)(log.frame, log.ignored, log.motion)
 
 
 def _required(bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
-    def one(frame: Frame, left_out: Array, along_m: Array, speed: Array) -> Array:
-        counts = frame.valid & ~left_out & (jnp.arange(len(frame.valid)) > 0)
+    def at_step(frame: Frame, ignored: Array, along_m: Array, speed: Array) -> Array:
+        counts = frame.valid & ~ignored & (jnp.arange(len(frame.valid)) > 0)
         return required_braking(bank, log.index, frame, counts, along_m, speed)
 
-    return jax.vmap(one)(log.frame, log.left_out, log.along_m, log.motion[:, 3])
+    return jax.vmap(at_step)(log.frame, log.ignored, log.along_m, log.motion[:, 3])
 
 
 def _volatility(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
-    """Of the action between step t and the next; the last step, which has none, has that of the one before.
+    """Return the volatility of the action between a step and the next one; the last step repeats the one before.
 
-    The derivatives are nuPlan's (``metrics.comfort``): of a polynomial fitted to 1.5 s, so that a centimetre per second
-    of noise in the speed is some hundredths of a m/s3.
+    Derivatives are nuPlan's (``metrics.comfort``), of a polynomial fitted to 1.5 s: noise of 1 cm/s in the speed gives
+    some hundredths of a m/s3.
     """
     speed, heading = log.motion[:, 3], log.motion[:, 2]
     known = log.valid[1:] & log.valid[:-1]
     acceleration = (speed[1:] - speed[:-1]) / DT_S
     turned = jnp.concatenate([jnp.zeros(1), jnp.cumsum(wrap(heading[1:] - heading[:-1]))])
     jerk = _derivative(acceleration, known, _JERK_ORDER, 1)
-    # At the middle of the action, where the jerk is too.
+    # At the middle of the action, as the jerk.
     yaw = _derivative((turned[1:] + turned[:-1]) / 2, known, _YAW_ORDER, 2)
     share = jnp.maximum(jnp.abs(jerk) / config.full_jerk_mps3, jnp.abs(yaw) / config.full_yaw_rps2)
     share = jnp.minimum(share, 1.0)
@@ -188,32 +182,32 @@ def _volatility(config: KinematicConfig, log: Logged) -> Float[Array, " T"]:
 def _derivative(
     signal: Float[Array, " K"], known: Bool[Array, " K"], order: int, derivative: int
 ) -> Float[Array, " K"]:
-    """Of the polynomial through the window around each sample, moved so that all of it is known; 0 where none is."""
-    place = jnp.arange(len(signal))
-    first = jax.lax.cummax(jnp.where(known, -1, place)) + 1
-    last = jax.lax.cummin(jnp.where(known, len(signal), place), reverse=True) - 1
-    start = jnp.clip(place - _WINDOW // 2, first, last - (_WINDOW - 1))
+    """Differentiate a polynomial fitted to the known window around each sample; 0 where there is none."""
+    sample = jnp.arange(len(signal))
+    first = jax.lax.cummax(jnp.where(known, -1, sample)) + 1
+    last = jax.lax.cummin(jnp.where(known, len(signal), sample), reverse=True) - 1
+    start = jnp.clip(sample - _WINDOW // 2, first, last - (_WINDOW - 1))
     window = signal[jnp.clip(start[:, None] + jnp.arange(_WINDOW), 0, len(signal) - 1)]
-    # One row for each place in a window.
-    rows = jnp.asarray(savgol_matrix(_WINDOW, _WINDOW, order, derivative), jnp.float32)
-    found = jnp.sum(rows[place - start] * window, axis=-1) / DT_S**derivative
-    return jnp.where(known & (last - first >= _WINDOW - 1), found, 0.0)
+    # One filter for each position in a window.
+    filters = jnp.asarray(savgol_matrix(_WINDOW, _WINDOW, order, derivative), jnp.float32)
+    value = jnp.sum(filters[sample - start] * window, axis=-1) / DT_S**derivative
+    return jnp.where(known & (last - first >= _WINDOW - 1), value, 0.0)
 
 
 def _edge_nearness(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
-    def one(box: Array, ground: Array) -> Array:
-        # Where no edge and no stored side tells, a logged car is on the road: on a driveway, or beyond the map.
+    def at_step(box: Array, ground: Array) -> Array:
+        # A logged car without an edge nearby is on the road: on a driveway, or beyond the map.
         road = jnp.ones(4, bool)
         beyond = offroad_distance(bank, log.index, box[:2], corners(box), road, ground)
         return jnp.max(jnp.clip(1.0 + beyond / config.edge_m, 0.0, 1.0))
 
-    return jax.vmap(one)(log.frame.box[:, 0], log.ground_m)
+    return jax.vmap(at_step)(log.frame.box[:, 0], log.ground_m)
 
 
 def _deviation(config: KinematicConfig, bank: ScenarioBank, log: Logged) -> Float[Array, " T"]:
-    def one(xy: Array, ground: Array) -> Array:
+    def at_step(xy: Array, ground: Array) -> Array:
         distance = lane_distance(bank, log.index, xy, ground)
-        # Beyond the cut-off there is no lane to deviate from: a car park, a driveway, the end of the map.
+        # Beyond the cut-off there is no lane: a car park, a driveway, the end of the map.
         return jnp.where(jnp.isfinite(distance), jnp.minimum(distance / config.lane_m, 1.0), 0.0)
 
-    return jax.vmap(one)(log.motion[:, :2], log.ground_m)
+    return jax.vmap(at_step)(log.motion[:, :2], log.ground_m)

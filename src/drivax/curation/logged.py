@@ -1,40 +1,48 @@
-"""A log as its ego drove it, step by step: what every score of recorded driving looks at."""
+"""Logs as scores read them, and the evaluation of score functions over whole scenario sets."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import norm
 from drivax.planners.simple import logged_motion
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import project_on_route
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes
 from drivax.scenario.record import record
+from drivax.scenario.store import ScenarioSet
 from drivax.simulator.contact import overlaps
 from drivax.simulator.traffic.log import alone, frame_of
 from drivax.simulator.types import HISTORY, AgentContext, Frame
 
-#: Row of ``bank.routes`` that holds the log's own way.
+#: Index into ``bank.routes`` of the logged route.
 LOG_ROUTE = 1
+#: Scenarios that are scored in one batch.
+BATCH = 64
+#: Called with (scenarios done, scenarios).
+Progress = Callable[[int, int], None]
+Numbers = np.ndarray[Any, Any]
 
 
 @record
 class Logged:
-    """One log. Where ego is not there, its last motion stands for it.
+    """One log; where ego is not observed, its last motion is repeated.
 
     Attributes:
-        context: What the simulator would know of ego at every step.
+        context: Context of ego at every step, as in simulation.
         motion: x, y (m), heading (rad), speed (m/s) of ego.
-        velocity: As recorded, m/s.
-        valid: Whether ego is there.
-        frame: Everyone at every step.
-        left_out: Who overlapped ego when it appeared, until it parts: it counts for nothing, as in metrics.
-        along_m: Arc length of ego along the log's route.
+        velocity: As logged, m/s.
+        valid: Whether ego is observed.
+        frame: All agents at every step.
+        ignored: Agents that overlapped ego when they appeared, until they part: metrics ignore them, too.
+        along_m: Arc length of ego along the logged route.
         ground_m: Height of the ground under ego.
     """
 
@@ -43,24 +51,24 @@ class Logged:
     velocity: Float[Array, "T 2"]
     valid: Bool[Array, " T"]
     frame: Frame
-    left_out: Bool[Array, "T S"]
+    ignored: Bool[Array, "T S"]
     along_m: Float[Array, " T"]
     ground_m: Float[Array, " T"]
 
     @property
     def index(self) -> Int[Array, ""]:
-        """Row of the bank."""
+        """Scenario of the bank."""
         return self.context.index[0]
 
 
 def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
-    """The log of one scenario."""
-    rows = bank.agents[index, :, 0]
-    valid, steps = rows[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
-    known = jnp.maximum(jax.lax.cummax(jnp.where(valid, steps, -1)), jnp.argmax(valid))
-    contexts = jax.vmap(lambda step: _scene(bank, index, step))(known)
+    """Return the log of one scenario."""
+    ego = bank.agents[index, :, 0]
+    valid, steps = ego[:, AgentColumn.VALID] > 0, jnp.arange(bank.steps)
+    last_valid = jnp.maximum(jax.lax.cummax(jnp.where(valid, steps, -1)), jnp.argmax(valid))
+    contexts = jax.vmap(lambda step: _context(bank, index, step))(last_valid)
     motion = jax.vmap(lambda context: logged_motion(bank, context, 0))(contexts)
-    contexts = jax.vmap(lambda step, now: _scene(bank, index, step, now))(steps, motion)
+    contexts = jax.vmap(lambda step, now: _context(bank, index, step, now))(steps, motion)
     frame = jax.vmap(
         lambda context: frame_of(
             bank, index, context.step, bank.agents[index, context.step], alone(context), 0
@@ -70,34 +78,34 @@ def logged(bank: ScenarioBank, index: Int[Array, ""]) -> Logged:
     return Logged(
         context=contexts,
         motion=motion,
-        velocity=rows[known, AgentColumn.VELOCITY],
+        velocity=ego[last_valid, AgentColumn.VELOCITY],
         valid=valid,
         frame=frame,
-        left_out=_left_out(touching, frame.valid),
+        ignored=_ignored(touching, frame.valid),
         along_m=_along_route(bank, index, motion[:, :2]),
         ground_m=frame.z[:, 0] - bank.height_m(index, 0) / 2,
     )
 
 
-def _scene(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> AgentContext:
+def _context(bank: ScenarioBank, index: Any, step: Any, motion: Any = None) -> AgentContext:
     history = jnp.zeros((HISTORY, 4)) if motion is None else jnp.broadcast_to(motion, (HISTORY, 4))
     z, zero = bank.agents[index, step, 0, AgentColumn.Z], jnp.zeros(())
     return AgentContext(index, step, jnp.int32(0), history, jnp.zeros(2), zero, z, ())
 
 
-def _left_out(touching: Bool[Array, "T S"], there: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
+def _ignored(touching: Bool[Array, "T S"], valid: Bool[Array, "T S"]) -> Bool[Array, "T S"]:
     def step(carry: tuple[Array, Array], now: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-        (ignored, was_there), (touches, is_there) = carry, now
-        ignored = touches & (ignored | ~was_there)
-        return (ignored, is_there), ignored
+        (ignored, was_valid), (touches, is_valid) = carry, now
+        ignored = touches & (ignored | ~was_valid)
+        return (ignored, is_valid), ignored
 
-    nobody = jnp.zeros(touching.shape[1], bool)
-    return jax.lax.scan(step, (nobody, nobody), (touching, there))[1]
+    none = jnp.zeros(touching.shape[1], bool)
+    return jax.lax.scan(step, (none, none), (touching, valid))[1]
 
 
 def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 2"]) -> Float[Array, " T"]:
     def step(along: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-        # No further than the car can have come, as the simulator follows its own route.
+        # Search no further than the car can have moved, as the simulator does.
         point, moved = now
         hit = project_on_route(bank, index, point, along, 1.5 * moved + 2.0, route=LOG_ROUTE)
         along = jnp.maximum(along, hit.along_m)
@@ -108,6 +116,48 @@ def _along_route(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, "T 
 
 
 @partial(jax.jit, static_argnums=0)
-def of_logs(of: Any, bank: ScenarioBank) -> dict[str, Array]:
-    """What a hashable ``(bank, log) -> {name: [T, ...]}`` says of every log of a bank: ``{name: [N, T, ...]}``."""
-    return jax.vmap(lambda index: of(bank, logged(bank, index)))(jnp.arange(len(bank)))
+def score_bank(score: Any, bank: ScenarioBank) -> dict[str, Array]:
+    """Apply a hashable ``(bank, log) -> {name: [T, ...]}`` to every log of a bank: ``{name: [N, T, ...]}``."""
+    return jax.vmap(lambda index: score(bank, logged(bank, index)))(jnp.arange(len(bank)))
+
+
+def score_steps(data: ScenarioSet, score: Any, progress: Progress | None = None) -> dict[str, Numbers]:
+    """Apply a score function to every log of a set, in batches.
+
+    Args:
+        data: The scenarios.
+        score: A hashable ``(bank, log) -> {name: [T, ...]}``.
+        progress: Called after every batch.
+
+    Returns:
+        By name ``[N, T, ...]``.
+
+    Raises:
+        DataError: A scenario has no future.
+    """
+    return map_batches(data, lambda bank: score_bank(score, bank), progress)
+
+
+def map_batches(
+    data: ScenarioSet, function: Callable[[ScenarioBank], dict[str, Any]], progress: Progress | None = None
+) -> dict[str, Numbers]:
+    """Apply a function to banks of one shape that hold ``BATCH`` scenarios each: by name ``[N, ...]``."""
+    sizes = Sizes.used(data)
+    batches: list[dict[str, Any]] = []
+    for first in range(0, len(data), BATCH):
+        scenarios = data[first : first + BATCH]
+        count = len(scenarios)
+        if len(data) > BATCH:
+            scenarios += [scenarios[-1]] * (BATCH - count)
+        result = function(ScenarioBank.from_scenarios(scenarios, trim=sizes))
+        # Stack the next bank while this one is computed; at most one result is pending.
+        jax.block_until_ready(batches[-1:])
+        batches.append({name: values[:count] for name, values in result.items()})
+        if progress is not None:
+            progress(first + count, len(data))
+    return {name: np.concatenate([np.asarray(batch[name]) for batch in batches]) for name in batches[0]}
+
+
+def valid_steps(data: ScenarioSet) -> Bool[Numbers, "N T"]:
+    """Return the steps at which ego is observed."""
+    return np.stack([np.asarray(scenario.record["agent_valid"][:, 0], bool) for scenario in data])

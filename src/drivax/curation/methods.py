@@ -1,4 +1,4 @@
-"""The methods of curation by name: from a set to its table of scores."""
+"""Registered curation methods: each turns a scenario set into a score table."""
 
 from __future__ import annotations
 
@@ -12,55 +12,49 @@ from typing import Any
 
 import numpy as np
 
+from drivax import settings
 from drivax.curation.combining import Combination
-from drivax.curation.controls import event_steps, matched
-from drivax.curation.ensemble import Scouts, ScoutsConfig, train_scouts
+from drivax.curation.controls import event_steps, permute_scores
+from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
 from drivax.curation.kinematic import KinematicConfig
+from drivax.curation.logged import Progress, score_steps, valid_steps
 from drivax.curation.published import PublishedConfig
 from drivax.curation.rarity import ExpertActions, KernelRarity, PublishedRarity, rarity_steps
 from drivax.curation.scores import ScoreTable, read_scores
-from drivax.curation.scoring import Progress, score_steps, valid_steps
 from drivax.errors import DataError, UsageError, did_you_mean
 from drivax.networks.distributions import Actions
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import plain
 from drivax.stats.ranking import rank_correlation
 
-#: The kinematic heuristic. A scenario is as critical as its most critical second. Weights and the second were chosen on
-#: the validation set of the built-in world's benchmark (docs/results/curation.md).
+#: Weights of the kinematic heuristic, chosen on the validation set of the built-in world's benchmark
+#: (docs/results/curation.md). A scenario scores as its most critical second.
 KINEMATIC = Combination(
     {"urgency": 0.35, "braking": 0.20, "volatility": 0.30, "lane_deviation": 0.10, "off_road": 0.05}, "top10"
 )
-#: The published heuristic: weights of steps, and of the numbers that make a scenario's score.
+#: Weights and aggregators of the published heuristic.
 PUBLISHED = Combination(
     {"volatility": 0.40, "interaction": 0.05, "off_road": 0.05, "lane_deviation": 0.47, "density": 0.03},
-    {
-        "volatility": "p99",
-        "interaction": "p99",
-        "off_road": "p99",
-        "lane_deviation": "std",
-        "density": "mean",
-    },
-)
-#: Rarity: a scenario is as rare as its rarest steps, of which the few very rarest may be noise.
+    {"volatility": "p99", "interaction": "p99", "off_road": "p99", "lane_deviation": "std", "density": "mean"},
+)  # fmt: skip
+#: The 95th percentile: the very rarest steps may be noise.
 RARITY = Combination({"rarity": 1.0}, "p95")
-#: A single component.
-ALL = Combination({"all": 1.0})
-#: Disagreement at this percentile of a set scores a half.
+_ALL = Combination({"all": 1.0})
+#: Percentile of a set's disagreement that scores 0.5.
 _HALF = 99.0
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What is asked of a method.
+class Request:
+    """Arguments of a method.
 
     Attributes:
         data: The set.
         like: Table to match (``random_matched`` only).
-        seed: Of what is drawn by lot (``random_matched`` only; an ensemble has its own).
-        config: Settings of the method, of the type of ``METHODS[name].config``; None: those.
+        seed: Seed of the permutation (``random_matched`` only; an ensemble has its own).
+        config: Settings of the method, of the type of its ``Method.config``; None: the defaults.
         progress: Called with (scenarios done, scenarios).
-        training: Called with (iterations done, iterations) while scouts are trained.
+        training: Called with (iterations done, iterations) while an ensemble is trained.
     """
 
     data: ScenarioSet
@@ -73,220 +67,234 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Method:
-    """A method of curation.
+    """A registered method.
 
     Attributes:
-        score: From what is asked, with settings, to the table.
-        config: Settings by default; None: it has none.
+        name: Its name, on the command line too.
+        score: From a request, with settings, to the table.
+        config: Default settings; None: it has none.
         combination: How its components become scores, from its settings.
-        beside: Components that weigh nothing in it, from its settings.
+        unweighted: Components without a weight, from its settings.
     """
 
-    score: Callable[[Wanted], ScoreTable]
+    name: str
+    score: Callable[[Request], ScoreTable]
     config: Any = None
-    combination: Callable[[Any], Combination] = lambda _: ALL
-    beside: Callable[[Any], tuple[str, ...]] = lambda _: ()
+    combination: Callable[[Any], Combination] = lambda _: _ALL
+    unweighted: Callable[[Any], tuple[str, ...]] = lambda _: ()
 
 
-def curate(name: str, wanted: Wanted) -> ScoreTable:
-    """Scores a set.
+def curate(name: str, request: Request) -> ScoreTable:
+    """Score a set.
 
     Raises:
-        UsageError: There is no such method, it lacks what it asks for, or has no such settings.
+        UsageError: The method is unknown, lacks an argument, or has other settings.
         DataError: It cannot score this set.
     """
     if name not in METHODS:
         raise UsageError(f"there is no method {name!r}", cure=did_you_mean(name, sorted(METHODS)))
-    if (wanted.like is not None) != (name == "random_matched"):
+    if (request.like is not None) != (name == "random_matched"):
         raise UsageError(
             "random_matched needs --like, a table of the same set, and no other method takes it",
             cure="drivax curate random_matched --like SCORES ...",
         )
-    own = METHODS[name].config
-    if wanted.config is not None and type(wanted.config) is not type(own):
+    default = METHODS[name].config
+    if request.config is not None and type(request.config) is not type(default):
         raise UsageError(
-            f"{name} has no settings of the kind {type(wanted.config).__name__}",
-            cure="leave them out" if own is None else f"use {type(own).__name__}",
+            f"{name} has no settings of type {type(request.config).__name__}",
+            cure="leave them out" if default is None else f"use {type(default).__name__}",
         )
-    table = METHODS[name].score(replace(wanted, config=own if wanted.config is None else wanted.config))
-    if wanted.progress is not None:
-        wanted.progress(len(wanted.data), len(wanted.data))
+    config = default if request.config is None else request.config
+    table = METHODS[name].score(replace(request, config=config))
+    if request.progress is not None:
+        request.progress(len(request.data), len(request.data))
     return table
 
 
-def refuse_stale(table: ScoreTable, config: Any = None, file: Path | None = None) -> None:
-    """Refuses a table that its method would not make now, of the same set.
+def check_current(table: ScoreTable, config: Any = None, file: Path | None = None) -> None:
+    """Refuse a table that differs in settings from what its method would write.
 
     Args:
         table: The table.
-        config: Settings that the method would have; None: those by default.
-        file: Where the table is from.
+        config: Settings of the method; None: the defaults.
+        file: Source of the table.
 
     Raises:
-        DataError: It was made with other settings, or its components were weighted otherwise.
+        DataError: It has other settings or another combination.
     """
-    method, told = METHODS[table.method], dict(table.config)
-    now: dict[str, Any] = {} if method.config is None else plain(method.config if config is None else config)
+    method, stored = METHODS[table.method], dict(table.config)
+    config = method.config if config is None else config
+    current: dict[str, Any] = {} if method.config is None else plain(config)
     if table.components:
-        now["combination"] = asdict(method.combination(method.config if config is None else config))
-    # A table that was read has lists where one that was made has tuples.
-    told, now = (json.loads(json.dumps(values)) for values in (told, now))
-    for name, value in now.items():
-        if told.get(name) != value:
+        current["combination"] = asdict(method.combination(config))
+    if method.config is not None:  # fields of older tables by their present names
+        own = {name: stored[name] for name in current if name in stored and name != "combination"}
+        own = plain(settings.load(type(config), json.loads(json.dumps(own))))
+        stored |= {name: own[name] for name in own if name in stored}
+    # Through JSON: a table that was read has lists instead of tuples.
+    stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
+    for name, value in current.items():
+        if stored.get(name) != value:
             raise DataError(
-                f"scores of {table.method!r} with {name} {told.get(name)}, which is {value} here",
+                f"scores of {table.method!r} with {name} {stored.get(name)}, which is {value} here",
                 file=file,
                 cure="score again with `drivax curate`",
             )
 
 
 def check_combination(name: str, config: Any, changes: Mapping[str, Any]) -> None:
-    """Refuses other weights or another aggregator (fields of :class:`Combination`) before anything is scored.
-
-    Raises:
-        UsageError: A method with these settings has no such component, or there is no such aggregator or weight.
-    """
-    usual = METHODS[name].combination(config)
-    replace(usual, **changes).check_components({*usual.weights, *METHODS[name].beside(config)})
+    """Refuse other weights or aggregators (fields of :class:`Combination`) that a method cannot apply."""
+    default = METHODS[name].combination(config)
+    replace(default, **changes).check_components({*default.weights, *METHODS[name].unweighted(config)})
 
 
-def _disagreement(config: ScoutsConfig) -> Combination:
-    """A scenario is as uncertain as its most uncertain second."""
-    name = "information" if config.cloning.loss == "likelihood" else "disagreement"
-    return Combination({name: 1.0}, "top10")
-
-
-def _numbers(config: ScoutsConfig) -> tuple[str, ...]:
-    return () if config.cloning.loss == "likelihood" else tuple(_number(i) for i in range(Actions().size))
-
-
-def _number(place: int) -> str:
-    return f"action_{place}"
-
-
-def _heuristic(name: str) -> Callable[[Wanted], ScoreTable]:
-    def score(wanted: Wanted) -> ScoreTable:
-        components = score_steps(wanted.data, wanted.config, wanted.progress)
-        return table_of(name, wanted.config, wanted.data, components)
-
-    return score
-
-
-def _rarity(name: str) -> Callable[[Wanted], ScoreTable]:
-    def score(wanted: Wanted) -> ScoreTable:
-        found = score_steps(wanted.data, ExpertActions(), wanted.progress)
-        components = {"rarity": rarity_steps(wanted.config, found["action"], found["known"])}
-        return table_of(name, wanted.config, wanted.data, components)
-
-    return score
-
-
-def _ensemble(wanted: Wanted) -> ScoreTable:
-    return ensemble_table(
-        train_scouts(wanted.config, wanted.data, wanted.training), wanted.data, wanted.progress
-    )
-
-
-def ensemble_table(
-    scouts: Scouts, data: ScenarioSet, progress: Progress | None = None, scale: float | None = None
-) -> ScoreTable:
-    """Scores by the disagreement of an ensemble, which may have been trained on another set.
-
-    The component is ``d / (d + scale)`` of the disagreement d, so that the order of d stays to the top; beside it is
-    the same of each number of the action. Of scouts trained by likelihood there is one, the mutual information over its
-    largest possible value. The table's configuration says how scores and errors of the scouts correlate by rank, over
-    all steps: on the set that they were trained on, errors of the one that has not seen the scenario; where they
-    learned from a part of it, errors of their mean, over the rest.
-
-    Args:
-        scouts: The ensemble.
-        data: The set.
-        progress: Called with (scenarios done, scenarios).
-        scale: Disagreement that scores a half; by default the percentile 99 of the set; of what scouts learned from
-            and of the rest, of which they know less, apart.
-    """
-    opinions = scouts.opinions(data, progress)
-    valid, own = valid_steps(data), data.hash == scouts.set_hash
-    unseen = scouts.fold < 0 if own else np.ones(len(data), bool)
-    groups = [rows for rows in (~unseen, unseen) if rows.any()]
-    scales: list[Any] = [scale] * len(groups)
-    if opinions.information is None:
-        parts = opinions.disagreement(scouts.deviation)
-        whole = parts.sum(axis=-1)
-        if scale is None:
-            scales = [float(np.percentile(whole[rows][valid[rows]], _HALF)) for rows in groups]
-        half = np.zeros((len(data), 1))
-        for rows, one in zip(groups, scales, strict=True):
-            half[rows] = np.maximum(one, np.finfo(np.float64).tiny)
-        components = {
-            _number(place): part / (part + half) for place, part in enumerate(np.moveaxis(parts, -1, 0))
-        }
-        components["disagreement"] = whole / (whole + half)
-    else:
-        components = {"information": opinions.information / math.log(scouts.config.folds)}
-    error = opinions.error(scouts.deviation, scouts.fold if own else None)
-    about = {"trained_on": scouts.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
-    table = table_of("ensemble", scouts.config, data, components, about)
-    known = opinions.known & groups[-1][:, None]
-    told = {"error_rank_correlation": rank_correlation(table.steps[known], error[known])}
-    return replace(table, config={**table.config, **told})
-
-
-def _uniform(wanted: Wanted) -> ScoreTable:
-    return table_of("uniform", None, wanted.data, {"all": np.ones(_shape(wanted.data))})
-
-
-def _oracle(wanted: Wanted) -> ScoreTable:
-    components = {"all": event_steps(wanted.data).astype(np.float64)}
-    return table_of("oracle", None, wanted.data, components)
-
-
-def _random_matched(wanted: Wanted) -> ScoreTable:
-    assert wanted.like is not None
-    return matched(read_scores(wanted.like, wanted.data), wanted.seed)
-
-
-def _shape(data: ScenarioSet) -> tuple[int, int]:
-    return len(data), data.capacity.steps
-
-
-def table_of(
+def make_table(
     name: str,
     config: Any,
     data: ScenarioSet,
     components: Mapping[str, np.ndarray[Any, Any]],
-    about: Mapping[str, Any] = MappingProxyType({}),
+    details: Mapping[str, Any] = MappingProxyType({}),
 ) -> ScoreTable:
-    """The table of a set, from what a method says of every step.
+    """Return the score table of a set.
 
     Args:
-        name: Of the method.
+        name: Name of the method.
         config: Its settings; None: it has none.
         data: The set.
-        components: By name, of every step and in [0, 1].
-        about: What else the table says of how it was made, as plain values.
+        components: By name, of every step, in [0, 1].
+        details: Further entries of the table's configuration, as plain values.
     """
     ids = tuple(entry["scenario_id"] for entry in data.entries)
     valid = valid_steps(data)
-    blank = np.zeros(valid.shape)
-    told = {**({} if config is None else plain(config)), **about}
-    table = ScoreTable(name, told, data.hash, ids, valid, blank, blank[:, 0], components)
+    empty = np.zeros(valid.shape)
+    settings = {**({} if config is None else plain(config)), **details}
+    table = ScoreTable(name, settings, data.hash, ids, valid, empty, empty[:, 0], components)
     return table.combined(METHODS[name].combination(config))
 
 
+def ensemble_table(
+    ensemble: Ensemble, data: ScenarioSet, progress: Progress | None = None, scale: float | None = None
+) -> ScoreTable:
+    """Return scores by the disagreement d of an ensemble, which may have been trained on another set.
+
+    The component ``disagreement`` is ``d / (d + scale)``, which keeps the order of d; ``action_0``, ``action_1`` are
+    the same of each dimension of the action. An ensemble trained by likelihood has ``information`` instead, the mutual
+    information over its maximum. ``error_rank_correlation`` in the table's configuration is the rank correlation of
+    scores and squared errors over steps: on its training set, of the member that has not seen the scenario; where the
+    ensemble learned from a part of the set, of the members' mean over the rest.
+
+    Args:
+        ensemble: The ensemble.
+        data: The set.
+        progress: Called with (scenarios done, scenarios).
+        scale: Disagreement that scores 0.5; None: the 99th percentile of the set, separately for scenarios of the
+            training and for the rest.
+    """
+    predictions = ensemble.predictions(data, progress)
+    valid, own = valid_steps(data), data.hash == ensemble.set_hash
+    unseen = ensemble.fold < 0 if own else np.ones(len(data), bool)
+    groups = [group for group in (~unseen, unseen) if group.any()]
+    scales: list[Any] = [scale] * len(groups)
+    if predictions.information is None:
+        dimensions = predictions.disagreement(ensemble.deviation)
+        total = dimensions.sum(axis=-1)
+        if scale is None:
+            scales = [float(np.percentile(total[group][valid[group]], _HALF)) for group in groups]
+        half = np.zeros((len(data), 1))
+        for group, value in zip(groups, scales, strict=True):
+            half[group] = np.maximum(value, np.finfo(np.float64).tiny)
+        components = {
+            _action(index): values / (values + half)
+            for index, values in enumerate(np.moveaxis(dimensions, -1, 0))
+        }
+        components["disagreement"] = total / (total + half)
+    else:
+        components = {"information": predictions.information / math.log(ensemble.config.folds)}
+    error = predictions.error(ensemble.deviation, ensemble.fold if own else None)
+    details = {"trained_on": ensemble.set_hash, "scale": scales[0] if len(scales) == 1 else scales}
+    table = make_table("ensemble", ensemble.config, data, components, details)
+    known = predictions.known & groups[-1][:, None]
+    correlation = {"error_rank_correlation": rank_correlation(table.steps[known], error[known])}
+    return replace(table, config={**table.config, **correlation})
+
+
+def _action(index: int) -> str:
+    return f"action_{index}"
+
+
+def _by_likelihood(config: EnsembleConfig) -> bool:
+    return config.cloning.loss == "likelihood"
+
+
+def _ensemble_combination(config: EnsembleConfig) -> Combination:
+    """Score a scenario as its most uncertain second."""
+    return Combination({"information" if _by_likelihood(config) else "disagreement": 1.0}, "top10")
+
+
+def _action_components(config: EnsembleConfig) -> tuple[str, ...]:
+    return () if _by_likelihood(config) else tuple(map(_action, range(Actions().size)))
+
+
+def _heuristic(name: str) -> Callable[[Request], ScoreTable]:
+    def score(request: Request) -> ScoreTable:
+        components = score_steps(request.data, request.config, request.progress)
+        return make_table(name, request.config, request.data, components)
+
+    return score
+
+
+def _rarity(name: str) -> Callable[[Request], ScoreTable]:
+    def score(request: Request) -> ScoreTable:
+        expert = score_steps(request.data, ExpertActions(), request.progress)
+        components = {"rarity": rarity_steps(request.config, expert["action"], expert["known"])}
+        return make_table(name, request.config, request.data, components)
+
+    return score
+
+
+def _ensemble(request: Request) -> ScoreTable:
+    ensemble = train_ensemble(request.config, request.data, request.training)
+    return ensemble_table(ensemble, request.data, request.progress)
+
+
+def _uniform(request: Request) -> ScoreTable:
+    ones = np.ones((len(request.data), request.data.capacity.steps))
+    return make_table("uniform", None, request.data, {"all": ones})
+
+
+def _oracle(request: Request) -> ScoreTable:
+    return make_table("oracle", None, request.data, {"all": event_steps(request.data).astype(np.float64)})
+
+
+def _random_matched(request: Request) -> ScoreTable:
+    assert request.like is not None
+    return permute_scores(read_scores(request.like, request.data), request.seed)
+
+
+#: All methods by name.
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
-        "kinematic": Method(
-            _heuristic("kinematic"), KinematicConfig(), lambda _: KINEMATIC, lambda _: ("density",)
-        ),
-        "published": Method(_heuristic("published"), PublishedConfig(), lambda _: PUBLISHED),
-        "action_rarity": Method(_rarity("action_rarity"), KernelRarity(), lambda _: RARITY),
-        "ensemble": Method(_ensemble, ScoutsConfig(), _disagreement, _numbers),
-        "action_rarity_published": Method(
-            _rarity("action_rarity_published"), PublishedRarity(), lambda _: RARITY
-        ),
-        "uniform": Method(_uniform),
-        "random_matched": Method(_random_matched),
-        "oracle": Method(_oracle),
+        method.name: method
+        for method in (
+            Method(
+                "kinematic",
+                _heuristic("kinematic"),
+                KinematicConfig(),
+                lambda _: KINEMATIC,
+                lambda _: ("density",),
+            ),
+            Method("published", _heuristic("published"), PublishedConfig(), lambda _: PUBLISHED),
+            Method("ensemble", _ensemble, EnsembleConfig(), _ensemble_combination, _action_components),
+            Method("action_rarity", _rarity("action_rarity"), KernelRarity(), lambda _: RARITY),
+            Method(
+                "action_rarity_published",
+                _rarity("action_rarity_published"),
+                PublishedRarity(),
+                lambda _: RARITY,
+            ),
+            Method("uniform", _uniform),
+            Method("random_matched", _random_matched),
+            Method("oracle", _oracle),
+        )
     }
 )

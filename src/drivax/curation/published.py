@@ -1,11 +1,10 @@
-"""The published heuristic, as its study has it, so that it can be compared: five components of every step.
+"""The published kinematic heuristic, for comparison: five components of every step.
 
-From the inventory of the study's code: backward differences at 10 Hz, the product of distance and closing speed, and
-distances to the points of the map. What that leads to is shown in ``tests/curation/test_published.py``: noise of 1 cm/s
-scores like violent driving, and traffic that is far away like a conflict. :mod:`drivax.curation.kinematic` repairs it.
+Backward differences at 10 Hz, the product of distance and closing speed, and distances to the points of the map.
+``tests/curation/test_published.py`` shows the consequences: noise of 1 cm/s scores like violent driving, and distant
+traffic like a conflict. :mod:`drivax.curation.kinematic` fixes both.
 
-The study's maps are points; ours are segments, which are given a point every half metre, as Waymo's maps have them.
-Only lanes for cars count.
+The published maps are points. Ours are segments, sampled every 0.5 m as in Waymo's maps. Only lanes for cars count.
 """
 
 from __future__ import annotations
@@ -27,14 +26,14 @@ from drivax.simulator.types import Frame
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """Scales of the components: where each is 1.
+    """Scales of the components: the value at which each is 1.
 
     Attributes:
         jerk_mps3, yaw_rps2: Jerk, and yaw acceleration (rad/s2).
         interaction_m2ps: Product of distance and closing speed.
         edge_m: Distance of ego's centre to the nearest point of a road edge at which off_road is 0.
-        lane_m: Distance to the nearest point of a lane centre of lane_deviation 1.
-        crowd: Agents, ego included, of density 1.
+        lane_m: Distance to the nearest point of a lane centre.
+        crowd: Number of agents, ego included.
         spacing_m: Distance between the points of the map.
     """
 
@@ -50,9 +49,9 @@ class PublishedConfig:
         check_positive(dict(vars(self)))
 
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Float[Array, " T"]]:
-        """The components of every step of a log."""
+        """Return the components of every step of a log."""
         xy = log.motion[:, :2]
-        edge_m, lane_m = jax.vmap(lambda at: vertex_distances(bank, log.index, at, self.spacing_m))(xy)
+        edge_m, lane_m = jax.vmap(lambda point: vertex_distances(bank, log.index, point, self.spacing_m))(xy)
         return {
             "volatility": _volatility(self, log),
             "interaction": _interaction(self, log),
@@ -63,7 +62,7 @@ class PublishedConfig:
 
 
 def _volatility(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
-    """Of the two steps that led to step t: backward differences twice, the first ones 0."""
+    """Return jerk and yaw acceleration from two backward differences, 0 at the start."""
     heading = log.motion[:, 2]
     acceleration = _backward(norm(log.velocity)) / DT_S
     yaw_rate = wrap(_backward(heading)) / DT_S
@@ -76,12 +75,12 @@ def _backward(values: Float[Array, " T"]) -> Float[Array, " T"]:
 
 
 def _interaction(config: PublishedConfig, log: Logged) -> Float[Array, " T"]:
-    """The largest product of distance and closing speed, ``max(0, -dp . dv)``, over everyone."""
+    """Return the largest product of distance and closing speed, ``max(0, -dp . dv)``, over all agents."""
 
-    def one(frame: Frame, velocity: Array) -> Array:
-        apart, relative = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
-        closing = -jnp.sum(apart * relative, axis=-1)
+    def largest(frame: Frame, velocity: Array) -> Array:
+        offset, relative = frame.box[:, :2] - frame.box[0, :2], frame.velocity - velocity
+        closing = -jnp.sum(offset * relative, axis=-1)
         counts = frame.valid & (jnp.arange(len(closing)) > 0)
         return jnp.max(jnp.where(counts, jnp.clip(closing / config.interaction_m2ps, 0.0, 1.0), 0.0))
 
-    return jax.vmap(one)(log.frame, log.velocity)
+    return jax.vmap(largest)(log.frame, log.velocity)

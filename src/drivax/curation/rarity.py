@@ -1,7 +1,6 @@
-"""Action rarity: how seldom the expert of a set does what it does at a step.
+"""Action rarity: inverse density of the expert's action among all expert actions of a set.
 
-The density of its actions is estimated from all steps of the set, in units of the action space ([-1, 1] in either
-dimension); a step's score is the inverse of the density at its action.
+Actions are in units of the action space, [-1, 1] in both dimensions.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ Values = Float[np.ndarray[Any, Any], " n"]
 Others = Float[np.ndarray[Any, Any], "m 2"]
 OtherValues = Float[np.ndarray[Any, Any], " m"]
 
-#: What actions mean: that in which imitation and offline learning see them by default.
+#: The default action space of imitation and offline learning.
 _SPACE = Physical()
 
 
@@ -36,9 +35,9 @@ class ExpertActions:
     """The action that follows the log from every step, in units of the default action space."""
 
     def __call__(self, bank: ScenarioBank, log: Logged) -> dict[str, Array]:
-        """``action [T, 2]`` within the bounds, and ``known [T]``: ego is there at the step and at the next two.
+        """Return ``action [T, 2]``, clipped, and ``known [T]``: ego is observed at the step and at the next two.
 
-        The second of them tells the curvature; without it the action that follows the log is a guess.
+        The curvature needs the second of them.
         """
         action = jax.vmap(lambda context: expert_action(bank, context, _SPACE))(log.context)
         later = jnp.concatenate([log.valid, jnp.zeros(2, bool)])
@@ -51,15 +50,15 @@ class KernelRarity:
     """Inverse density by Gaussian kernels, tempered and clipped.
 
     The density (Rosenblatt, 1956; Parzen, 1962) is computed on a grid: counts per cell, convolved with the kernel and
-    mirrored at the bounds, so that it integrates to 1 over the action space; between the cells' centres it is linear.
-    The score of density p is ``min((p_median / p) ** temper, most) / most``, where ``p_median`` is that of the median
-    step: usual actions score 1 / most, and from some rarity on all score 1.
+    mirrored at the bounds, so that it integrates to 1 over the action space; linear between the cells' centres.
+    The score at density p is ``min((p_median / p) ** temper, most) / most``, where ``p_median`` is the density at the
+    median step: usual actions score 1 / most, very rare ones 1.
 
     Attributes:
         bandwidth: Standard deviation of the kernel, in units of the action space.
         cells: Cells of the grid along either dimension.
-        temper: Exponent: 1 is inverse frequency, 0 makes all alike.
-        most: How many times rarer, after tempering, than the median step a step is at which clipping begins.
+        temper: Exponent: 1 is inverse frequency, 0 gives all actions the same score.
+        most: Tempered ratio of densities, median over own, at which scores are clipped.
     """
 
     bandwidth: float = 0.05
@@ -77,48 +76,46 @@ class KernelRarity:
             raise UsageError(f"most is {self.most}", cure="use 1 or more")
 
     def density(self, actions: Actions, at: Others) -> OtherValues:
-        """Density of actions, per unit of area of the action space, at others; both in [-1, 1]."""
+        """Return the density of ``actions`` at the points ``at``, per unit of area; both in [-1, 1]."""
         edges = np.linspace(-1.0, 1.0, self.cells + 1)
         counts = np.histogram2d(actions[:, 0], actions[:, 1], [edges, edges])[0]
         cell = 2.0 / self.cells
         smooth = gaussian_filter(counts, self.bandwidth / cell, mode="reflect", truncate=6.0)
-        place = (np.asarray(at, np.float64).T + 1.0) / cell - 0.5
-        return map_coordinates(smooth, place, order=1, mode="nearest") / (len(actions) * cell * cell)
+        position = (np.asarray(at, np.float64).T + 1.0) / cell - 0.5
+        return map_coordinates(smooth, position, order=1, mode="nearest") / (len(actions) * cell * cell)
 
     def scores(self, actions: Actions, at: Others) -> OtherValues:
-        """Scores of actions ``at``, in [0, 1], by the density of ``actions``."""
+        """Return the scores of the actions ``at``, in [0, 1], by the density of ``actions``."""
         usual = np.median(self.density(actions, actions))
-        with np.errstate(
-            divide="ignore", over="ignore"
-        ):  # where nobody ever was, rarity is infinite, and clipped
+        with np.errstate(divide="ignore", over="ignore"):  # infinite where the density is 0, and clipped
             rarity = (usual / self.density(actions, at)) ** self.temper
         return np.minimum(rarity, self.most) / self.most
 
 
 @dataclass(frozen=True)
 class PublishedRarity:
-    """Inverse frequency in the study's histogram of acceleration (m/s2) and curvature (1/m).
+    """Inverse frequency in the published histogram of acceleration (m/s2) and curvature (1/m).
 
-    A cell with h of the actions weighs ``1 / (h + 1)``, over the mean of all cells, empty ones and those without width
-    included; the score is ``min(weight, most) / most + 0.01``, cut at 1; the constant is most of it. Actions beyond
-    the bins do not occur: the space is narrower. The study looks up an action on the edge of two bins in the lower one
-    though it counts it in the upper one, so that standing still is looked up beside itself; here both are the upper.
+    A cell with h actions has the weight ``1 / (h + 1)``, over the mean of all cells, including empty ones and those
+    without width. The score is ``min(weight, most) / most + 0.01``, at most 1; the constant dominates it. The action
+    space is within the bins. The published code counts an action on the edge of two bins in the upper one and looks
+    it up in the lower one, which affects standing still; here both use the upper one.
 
     Attributes:
-        most: Weight at which clipping begins. It never does: no cell weighs so much.
+        most: Weight at which scores are clipped; no cell reaches it.
     """
 
     most: float = 3.0
 
     @property
     def edges(self) -> tuple[Values, Values]:
-        """Edges of the 89 bins of acceleration and of curvature; where two parts meet an edge comes twice."""
+        """Edges of the 89 bins of acceleration and of curvature; edges where two ranges meet occur twice."""
         acceleration = [np.linspace(-10, -2, 20), np.linspace(-2, 1.5, 50), np.linspace(1.5, 8, 20)]
         curvature = [np.linspace(-1, -0.2, 25), np.linspace(-0.2, 0.2, 40), np.linspace(0.2, 1, 25)]
         return np.concatenate(acceleration), np.concatenate(curvature)
 
     def scores(self, actions: Actions, at: Others) -> OtherValues:
-        """Scores of actions ``at``, in [0, 1], by how often ``actions`` are in their cells."""
+        """Return the scores of the actions ``at``, in [0, 1], by the counts of ``actions`` in their cells."""
         cells = 89 * 89
         weight = 1.0 / (np.bincount(self._cell(actions), minlength=cells) + 1.0)
         rarity = np.minimum((weight / weight.mean())[self._cell(at)], self.most) / self.most
@@ -127,11 +124,11 @@ class PublishedRarity:
     def _cell(self, actions: Others) -> Int[np.ndarray[Any, Any], " m"]:
         scale = np.where(actions[:, 0] < 0, _SPACE.braking_mps2, _SPACE.acceleration_mps2)
         values = (actions[:, 0] * scale, actions[:, 1] * _SPACE.steering)
-        row, column = (
+        first, second = (
             np.searchsorted(edges, value, side="right") - 1
             for edges, value in zip(self.edges, values, strict=True)
         )
-        return row * 89 + column
+        return first * 89 + second
 
 
 def rarity_steps(
@@ -139,13 +136,13 @@ def rarity_steps(
     actions: Float[np.ndarray[Any, Any], "N T 2"],
     known: Bool[np.ndarray[Any, Any], "N T"],
 ) -> Float[np.ndarray[Any, Any], "N T"]:
-    """Score of every step of a set; 0 where the expert's action is not known.
+    """Return the score of every step of a set; 0 where the expert's action is unknown.
 
     Raises:
         DataError: No action is known.
     """
     if not known.any():
-        raise DataError("no log has two steps on end, so that no action is known", cure="check the set")
+        raise DataError("no log has three consecutive steps, so no action is known", cure="check the set")
     own = np.asarray(actions[known], np.float64)
     steps = np.zeros(known.shape)
     steps[known] = config.scores(own, own)

@@ -1,4 +1,4 @@
-"""The most critical scenarios of a set, as a set of their own that holds their scores."""
+"""Write the most critical scenarios of a set as a scenario set that includes their scores."""
 
 from __future__ import annotations
 
@@ -18,55 +18,54 @@ from drivax.stats.clusters import recordings_of
 def check_top(
     data: ScenarioSet, out: Path, count: int, overwrite: bool = False, all_windows: bool = False
 ) -> None:
-    """Refuses a subset that cannot be written, before any work is done.
+    """Refuse a subset that cannot be written, before any work is done.
 
     Raises:
-        UsageError: There are not so many recordings (with ``all_windows``: scenarios), or ``out`` exists, or is the
-            set itself.
+        UsageError: There are fewer recordings (with ``all_windows``: scenarios), ``out`` exists, or is the set itself.
     """
-    total, found = len(data), len(set(recordings_of(data.entries)))
-    if not all_windows and found < total and not 1 <= count <= found:
+    total, recordings = len(data), len(set(recordings_of(data.entries)))
+    if not all_windows and recordings < total and not 1 <= count <= recordings:
         raise UsageError(
-            f"the {count} most critical of {found} recordings, one scenario of each",
-            cure=f"ask for 1 to {found}, or pass --all-windows to choose among all {total} scenarios",
+            f"the {count} most critical of {recordings} recordings, one scenario of each",
+            cure=f"ask for 1 to {recordings}, or pass --all-windows to choose among all {total} scenarios",
         )
     if not 1 <= count <= total:
         raise UsageError(f"the {count} most critical of {total} scenarios", cure=f"ask for 1 to {total}")
     refuse_part(data, out)
-    ScenarioWriter(out, data.capacity, overwrite=overwrite)  # nothing is written before it is entered
+    ScenarioWriter(out, data.capacity, overwrite=overwrite)  # writes only when entered
 
 
 def top_rows(table: ScoreTable, count: int, recordings: Sequence[str] | None = None) -> list[int]:
-    """Rows of the most critical scenarios, in their order (``ScoreTable.order``).
+    """Return the indices of the ``count`` most critical scenarios, in the order of ``ScoreTable.order``.
 
     Args:
         table: The scores.
-        count: How many, at most.
-        recordings: Of every row; only the most critical scenario of each counts. None: all scenarios do.
+        count: Maximum number.
+        recordings: Recording of every scenario; only the most critical scenario of each is taken. None: all are.
     """
-    rows = table.order
+    indices = table.order
     if recordings is not None:
-        first = np.unique(np.asarray(recordings)[rows], return_index=True)[1]
-        rows = rows[np.sort(first)]
-    return rows[:count].tolist()
+        first = np.unique(np.asarray(recordings)[indices], return_index=True)[1]
+        indices = indices[np.sort(first)]
+    return indices[:count].tolist()
 
 
-def part_of_table(table: ScoreTable, rows: Sequence[int], part: ScenarioSet) -> ScoreTable:
-    """The scores of a part of a set; which one and of what, its configuration says as ``part_of``.
+def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioSet) -> ScoreTable:
+    """Return the scores of a subset; their configuration names the whole set as ``part_of``.
 
     Args:
         table: Scores of the whole set.
-        rows: Which of them, in the order of the part.
-        part: The part, as :func:`~drivax.datasets.export.writer.write_part` writes it.
+        indices: Scenarios of the whole set, in the order of the subset.
+        subset: The subset, as :func:`~drivax.datasets.export.subset.write_part` writes it.
     """
-    chosen = list(rows)
-    told = part.manifest["source"]["part_of"]
-    told = {name: value for name, value in told.items() if name not in ("method", "config")}
+    chosen = list(indices)
+    source = subset.manifest["source"]["part_of"]
+    source = {name: value for name, value in source.items() if name not in ("method", "config")}
     return replace(
         table,
-        config={**table.config, "part_of": told},
-        set_hash=part.hash,
-        scenario_ids=tuple(table.scenario_ids[row] for row in chosen),
+        config={**table.config, "part_of": source},
+        set_hash=subset.hash,
+        scenario_ids=tuple(table.scenario_ids[index] for index in chosen),
         valid=table.valid[chosen],
         steps=table.steps[chosen],
         scenarios=table.scenarios[chosen],
@@ -83,7 +82,7 @@ def write_top(
     progress: Callable[[int, int], None] | None = None,
     all_windows: bool = False,
 ) -> Exported:
-    """Writes the most critical scenarios as a scenario set, the most critical first, and their scores in its folder.
+    """Write the most critical scenarios as a scenario set, the most critical first, with their scores in its folder.
 
     Args:
         table: Scores of ``data``.
@@ -95,14 +94,15 @@ def write_top(
         all_windows: Choose among all scenarios, not only the most critical one of each recording.
 
     Raises:
-        UsageError: There are not so many, or ``out`` exists.
+        UsageError: There are fewer, or ``out`` exists.
     """
     check_top(data, out, count, overwrite, all_windows)
-    rows = top_rows(table, count, None if all_windows else recordings_of(data.entries))
-    how = {"most_critical": count, "all_windows": all_windows}
-    chosen_by = {**how, "method": table.method, "config": dict(table.config)}
+    indices = top_rows(table, count, None if all_windows else recordings_of(data.entries))
+    chosen_by = {
+        "most_critical": count, "all_windows": all_windows, "method": table.method, "config": dict(table.config)
+    }  # fmt: skip
 
-    def further(folder: Path) -> None:
-        write_scores(part_of_table(table, rows, ScenarioSet.open(folder)), folder / OWN_SCORES)
+    def write_own_scores(folder: Path) -> None:
+        write_scores(subset_of_table(table, indices, ScenarioSet.open(folder)), folder / OWN_SCORES)
 
-    return write_part(data, rows, out, overwrite, progress, chosen_by, further)
+    return write_part(data, indices, out, overwrite, progress, chosen_by, write_own_scores)

@@ -1,4 +1,4 @@
-"""From scores to weights of a sampler, and what the weights do to the data that is drawn."""
+"""Turn scores into sampling weights, and describe the draws that weights lead to."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class WeightConfig:
-    """How a score becomes a weight. All of it is global: over every step of a set that can be drawn.
+    """How a score becomes a weight, over all steps of a set that can be drawn.
 
-    For score s of a step, or of its scenario, in this order:
+    For the score s of a step, or of its scenario:
 
-    1. ``quantile``: u is the mid-rank of s among all n steps, over n, in (0, 1): what a score means no longer depends
-       on how it is spread, and equal scores have equal weights; ``none``: u = s. Then u + ``floor``.
-    2. w = u ** (1 / ``temperature``): 1 leaves it, a higher temperature evens it out, a lower one sharpens it.
-    3. w clipped so that none is more than ``most`` times the mean of what is then left (where fewer than n / ``most``
-       are above 0, those weigh alike), over that mean.
-    4. ``(1 - uniform) w + uniform``: a mixture with uniform sampling, whose mean is 1.
+    1. ``quantile``: u is the mid-rank of s among all n steps, over n, in (0, 1), so that equal scores have equal
+       weights and the distribution of the scores does not matter; ``none``: u = s. Then u + ``floor``.
+    2. w = u ** (1 / ``temperature``): 1 keeps the ratios, a higher temperature flattens, a lower one sharpens them.
+    3. w, clipped to at most ``most`` times the mean of the clipped weights (where fewer than n / ``most`` are above 0,
+       these become equal), and divided by that mean.
+    4. ``(1 - uniform) w + uniform``: a mixture with uniform sampling, of mean 1.
 
     Attributes:
         normalise: See 1.
@@ -44,98 +44,93 @@ class WeightConfig:
     uniform: float = 0.2
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.floor < float("inf"):
-            raise UsageError(f"floor is {self.floor}", cure="use 0 or more")
-        if not 0.0 < self.temperature < float("inf"):
-            raise UsageError(f"temperature is {self.temperature}", cure="use a positive number")
-        if not self.most > 1.0:
-            raise UsageError(f"most is {self.most}", cure="use more than 1, inf for no limit")
-        if not 0.0 <= self.uniform <= 1.0:
-            raise UsageError(f"uniform is {self.uniform}", cure="use 0 to 1")
+        for name, holds, cure in (
+            ("floor", 0.0 <= self.floor < float("inf"), "use 0 or more"),
+            ("temperature", 0.0 < self.temperature < float("inf"), "use a positive number"),
+            ("most", self.most > 1.0, "use more than 1, inf for no limit"),
+            ("uniform", 0.0 <= self.uniform <= 1.0, "use 0 to 1"),
+        ):
+            if not holds:
+                raise UsageError(f"{name} is {getattr(self, name)}", cure=cure)
 
 
-#: As the study draws: in proportion to the score, plus a hundredth.
+#: Weights of the published study: proportional to the score plus 0.01.
 PUBLISHED = WeightConfig(normalise="none", floor=0.01, temperature=1.0, most=float("inf"), uniform=0.0)
 
 
-def weights_of(
+def sampling_weights(
     table: ScoreTable, config: WeightConfig, scale: Scale, usable: Bool[Array, "N T"] | None = None
 ) -> Float[Array, "N T"]:
-    """Weights of every step of a set, of mean 1 over the steps that can be drawn.
-
-    Other steps weigh 0. At the scale of scenarios every step of a scenario has the scenario's weight.
+    """Return the weight of every step: mean 1 over the steps that can be drawn, 0 elsewhere.
 
     Args:
         table: The scores.
         config: How scores become weights.
-        scale: Whether steps are weighted one by one, or as their scenarios are.
-        usable: Which steps can be drawn, where a training leaves some out (:func:`drivax.learning.loop.usable_steps`);
-            by default all of which the log knows what ego did (``ScoreTable.drawn``).
+        scale: ``step``: weights of steps; ``scenario``: every step has the weight of its scenario.
+        usable: Steps that can be drawn (:func:`drivax.learning.loop.usable_steps`); None: ``ScoreTable.drawable``.
 
     Raises:
-        UsageError: No step can be drawn, or none would have a weight.
+        UsageError: No step can be drawn, or all weights are 0.
     """
-    drawn = table.drawn if usable is None else usable
-    if not drawn.any():
+    drawable = table.drawable if usable is None else usable
+    if not drawable.any():
         raise UsageError("there is no step that can be drawn", cure="check the set")
-    weights = np.zeros(drawn.shape)
+    weights = np.zeros(drawable.shape)
     if scale == "step":
-        weights[drawn] = _weighted(table.steps[drawn], np.ones(int(drawn.sum())), config)
+        weights[drawable] = _weights(table.steps[drawable], np.ones(int(drawable.sum())), config)
     else:
-        some = drawn.any(axis=1)
-        each = _weighted(table.scenarios[some], drawn[some].sum(axis=1).astype(np.float64), config)
-        weights[some] = np.where(drawn[some], each[:, None], 0.0)
+        kept = drawable.any(axis=1)
+        each = _weights(table.scenarios[kept], drawable[kept].sum(axis=1).astype(np.float64), config)
+        weights[kept] = np.where(drawable[kept], each[:, None], 0.0)
     if not weights.any():
-        raise UsageError(
-            "every score is 0, so that nothing has a weight", cure="give floor, or normalise: quantile"
-        )
-    return weights / weights[drawn].mean()
+        raise UsageError("every score is 0, so all weights are 0", cure="set floor, or normalise: quantile")
+    return weights / weights[drawable].mean()
 
 
-def _weighted(
+def _weights(
     scores: Float[Array, " n"], mass: Float[Array, " n"], config: WeightConfig
 ) -> Float[Array, " n"]:
-    """Weights of scores that so many steps have each."""
+    """Return the weights of scores that ``mass`` steps have each."""
     score = np.asarray(scores, np.float64)
     if config.normalise == "quantile":
-        _, place = np.unique(score, return_inverse=True)
-        alike = np.bincount(place, mass)
-        score = ((np.cumsum(alike) - alike / 2.0) / mass.sum())[place]
-    # In logarithms, so that a low temperature neither overflows nor makes everything 0.
+        _, rank = np.unique(score, return_inverse=True)
+        ties = np.bincount(rank, mass)
+        score = ((np.cumsum(ties) - ties / 2.0) / mass.sum())[rank]
+    # In logarithms: a low temperature must neither overflow nor make all weights 0.
     with np.errstate(divide="ignore"):
         power = np.log(score + config.floor) / config.temperature
     if not np.isfinite(power.max()):
         return np.zeros(len(score))
-    weight = _capped(np.exp(power - power.max()), mass, config.most)
+    weight = _clipped(np.exp(power - power.max()), mass, config.most)
     return (1.0 - config.uniform) * weight / np.average(weight, weights=mass) + config.uniform
 
 
-def _capped(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> Float[Array, " n"]:
-    """The weights, the largest of them lowered to one value that is ``most`` times the mean of the result."""
+def _clipped(weight: Float[Array, " n"], mass: Float[Array, " n"], most: float) -> Float[Array, " n"]:
+    """Clip the largest weights to ``most`` times the mean of the result."""
     order = np.argsort(-weight, kind="stable")
     ordered, own = weight[order], mass[order]
     if ordered[0] <= most * np.average(weight, weights=mass):
         return weight
-    # If the first k, of mass m, are lowered to c, then c = most (m c + rest) / n, with rest the sum of all others.
-    lowered = np.cumsum(own) - own
+    # With the first k, of mass m, clipped to c: c = most (m c + rest) / n, where rest is the sum of all others.
+    clipped = np.cumsum(own) - own
     rest = np.cumsum((ordered * own)[::-1])[::-1]
-    left = mass.sum() - most * lowered
-    cap = most * rest / np.where(left > 0.0, left, np.inf)
-    enough = np.flatnonzero((left > 0.0) & (cap >= ordered) & (cap > 0.0))
-    return np.minimum(weight, cap[enough[0]] if len(enough) else ordered[ordered > 0].min())
+    left = mass.sum() - most * clipped
+    limit = most * rest / np.where(left > 0.0, left, np.inf)
+    enough = np.flatnonzero((left > 0.0) & (limit >= ordered) & (limit > 0.0))
+    return np.minimum(weight, limit[enough[0]] if len(enough) else ordered[ordered > 0].min())
 
 
 @dataclass(frozen=True)
-class Draws:
-    """What weights do to the data that is drawn.
+class DrawStatistics:
+    """Statistics of the draws under some weights.
 
     Attributes:
-        effective: Effective sample size over the number of steps that can be drawn, ``(sum w)^2 / (n sum w^2)`` (Kish,
-            1965): 1 for uniform weights, 1 / n where one step has all.
-        effective_scenarios: The same of the scenarios' sums of weights.
+        effective: Effective sample size over the number of drawable steps, ``(sum w)^2 / (n sum w^2)`` (Kish, 1965):
+            1 for uniform weights, 1 / n if one step has all weight.
+        effective_scenarios: The same for the scenarios' sums of weights.
         tilt: 99th percentile of the weights over their mean.
         largest: Largest weight over the mean.
-        concentration: Share of the draws that goes to the 5 % of the steps that weigh most; 0.05 for uniform weights.
+        concentration: Share of the draws from the 5 % of steps with the largest weights; 0.05 for uniform weights.
     """
 
     effective: float
@@ -145,20 +140,15 @@ class Draws:
     concentration: float
 
 
-def draws_of(weights: Float[Array, "N T"], drawn: Bool[Array, "N T"]) -> Draws:
-    """Measures weights.
-
-    Args:
-        weights: Of every step.
-        drawn: Which steps can be drawn, as :func:`weights_of` was told.
-    """
-    one = weights[drawn]
-    some = drawn.any(axis=1)
-    ordered = np.sort(one)[::-1]
-    return Draws(
-        effective=effective_size(one) / one.size,
-        effective_scenarios=effective_size(weights.sum(axis=1)[some]) / int(some.sum()),
-        tilt=float(np.quantile(one, 0.99) / one.mean()),
-        largest=float(ordered[0] / one.mean()),
-        concentration=float(ordered[: max(round(len(one) * 0.05), 1)].sum() / one.sum()),
+def draw_statistics(weights: Float[Array, "N T"], drawable: Bool[Array, "N T"]) -> DrawStatistics:
+    """Return statistics of weights over the steps that can be drawn."""
+    values = weights[drawable]
+    kept = drawable.any(axis=1)
+    ordered = np.sort(values)[::-1]
+    return DrawStatistics(
+        effective=effective_size(values) / values.size,
+        effective_scenarios=effective_size(weights.sum(axis=1)[kept]) / int(kept.sum()),
+        tilt=float(np.quantile(values, 0.99) / values.mean()),
+        largest=float(ordered[0] / values.mean()),
+        concentration=float(ordered[: max(round(len(values) * 0.05), 1)].sum() / values.sum()),
     )

@@ -1,1 +1,5 @@
-"""Closed-loop runner, statistics, tables and the audit."""
+"""Evaluate planners, compare evaluations, and audit scenarios."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

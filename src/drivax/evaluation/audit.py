@@ -1,6 +1,6 @@
-"""The audit: a log replayed through the metrics. Whatever the expert does wrong is a defect of map or converter.
+"""Audit scenarios: replay each log through the metrics. Any violation of the expert is a defect of map or converter.
 
-Steps at which the log does not know the ego are judged by nobody; :data:`~drivax.scenario.select.selection.FINDINGS`
+Steps without a logged ego are not evaluated; :data:`~drivax.scenario.select.selection.FINDINGS`
 says what each finding means.
 """
 
@@ -24,7 +24,7 @@ from drivax.tasks.actions import PHYSICAL, PUBLISHED
 
 Finding = dict[str, float | int | bool | str | None]
 
-#: Logs that are replayed side by side.
+#: Logs that are replayed in one batch.
 BATCH = 64
 
 #: A route leads to the goal when the log ends within this distance of it (semantics, ``reached_goal``).
@@ -33,7 +33,7 @@ _READ = (
     "collision", "offroad", "left_map", "red_light", "ignored", "moved_m", "route_deviation_m", "goal_distance_m",
     "logged", "log_divergence_m",
 )  # fmt: skip
-#: Action spaces whose bounds the audit holds against the log.
+#: Action spaces whose bounds the audit compares with the log.
 _SPACES = {"clipped_physical": PHYSICAL, "clipped_published": PUBLISHED}
 
 
@@ -43,14 +43,14 @@ def scenario_names(scenarios: Sequence[Scenario]) -> list[dict[str, str]]:
 
 
 def audit(scenarios: Sequence[Scenario]) -> list[Finding]:
-    """Replays the logs of scenarios exactly, from the current step to their end.
+    """Replay the logs of scenarios exactly, from the current step to their end.
 
     Args:
         scenarios: All of one capacity.
 
     Returns:
-        One finding each, by name. None stands for what cannot be said of a scenario (a route deviation without a
-        route); test splits without a future get only what needs no replay.
+        Findings by name, one mapping per scenario. None means not applicable (a route deviation without a route);
+        test splits without a future get only findings that need no replay.
     """
     usable = [scenario for scenario in scenarios if Flag.NO_FUTURE not in scenario.has]
     batches = (usable[first : first + BATCH] for first in range(0, len(usable), BATCH))
@@ -73,7 +73,7 @@ def _known(scenario: Scenario) -> Finding:
 
 
 class _Watch:
-    """A task that only watches: nothing is learned, accumulated or ended, which keeps the program small."""
+    """A task without observation, reward, metrics and termination, which keeps the program small."""
 
     @property
     def reads(self) -> frozenset[str]:
@@ -128,7 +128,7 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) ->
     """
     simulator = Simulator(_Watch())
 
-    def one(state: SimState, _: None) -> tuple[SimState, dict[str, Array]]:
+    def step(state: SimState, _: None) -> tuple[SimState, dict[str, Array]]:
         action = jnp.clip(expert_action(bank, state.context, PHYSICAL), -1.0, 1.0)
         if driven:
             after, _transition = simulator.step(bank, state, action)
@@ -143,7 +143,7 @@ def replay(bank: ScenarioBank, index: Int[Array, " B"], driven: bool = False) ->
     def episode(row: Array) -> dict[str, Array]:
         start = simulator.reset(bank, row)
         first = _read(start.facts) | dict.fromkeys(_SPACES, jnp.zeros((), bool))
-        _, later = jax.lax.scan(one, start, None, length=bank.steps - 1 - CURRENT_STEP)
+        _, later = jax.lax.scan(step, start, None, length=bank.steps - 1 - CURRENT_STEP)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
 
     return jax.vmap(episode)(index)
@@ -167,41 +167,41 @@ def _replayed(scenarios: Sequence[Scenario]) -> list[Finding]:
 def _findings(scenario: Scenario, series: Mapping[str, np.ndarray[Any, Any]]) -> Finding:
     """Findings of one replay; entry 0 of the series is the current step, which only the first steps look at."""
     flags, logged = scenario.has, series["logged"]
-    judged = logged.copy()
-    judged[0] = False
+    evaluated = logged.copy()
+    evaluated[0] = False
     mapped = int(scenario.segment_blocks[2]) > 0
-    hit, off, red = (series[name] & judged for name in ("collision", "offroad", "red_light"))
-    deviation = series["route_deviation_m"][judged] if Flag.ROUTE in flags else np.zeros(0)
+    hit, off, red = (series[name] & evaluated for name in ("collision", "offroad", "red_light"))
+    deviation = series["route_deviation_m"][evaluated] if Flag.ROUTE in flags else np.zeros(0)
     ran_red = bool(red.any()) if Flag.LIGHTS in flags else None
     return {
         "log_collides": bool(hit.any()),
         "first_collision_step": _first(hit),
-        "log_offroad_fraction": _rounded(off[judged].mean(), 4) if mapped and judged.any() else None,
+        "log_offroad_fraction": _rounded(off[evaluated].mean(), 4) if mapped and evaluated.any() else None,
         "first_offroad_step": _first(off) if mapped else None,
         "first_onroad_step": _first(logged & ~series["offroad"] & ~series["left_map"]) if mapped else None,
-        "log_left_map": bool((series["left_map"] & judged).any()) if mapped else None,
+        "log_left_map": bool((series["left_map"] & evaluated).any()) if mapped else None,
         "log_runs_red": ran_red,
-        "distance_m": _rounded(series["moved_m"][judged].sum()),
+        "distance_m": _rounded(series["moved_m"][evaluated].sum()),
         "route_deviation_mean_m": _rounded(deviation.mean()) if len(deviation) else None,
         "route_deviation_max_m": _rounded(deviation.max()) if len(deviation) else None,
-        "route_reaches_goal": bool(series["goal_distance_m"][judged][-1] <= GOAL_M)
+        "route_reaches_goal": bool(series["goal_distance_m"][evaluated][-1] <= GOAL_M)
         if len(deviation)
         else None,
         "ignored_overlaps": int(series["ignored"].max()),
-        **{name: _share(series[name], judged) for name in _SPACES},
+        **{name: _share(series[name], evaluated) for name in _SPACES},
         "clean": not hit.any() and not off.any() and not ran_red if mapped else None,
     }
 
 
-def _share(clipped: np.ndarray[Any, Any], judged: np.ndarray[Any, Any]) -> float | None:
-    """Share of the steps between two judged ones, or from the current step, that ask for more than a space allows."""
-    steps = judged.copy()
-    steps[2:] &= judged[1:-1]
+def _share(clipped: np.ndarray[Any, Any], evaluated: np.ndarray[Any, Any]) -> float | None:
+    """Share of the steps between evaluated steps, or from the current step, whose action a space clips."""
+    steps = evaluated.copy()
+    steps[2:] &= evaluated[1:-1]
     return _rounded(clipped[steps].mean(), 4) if steps.any() else None
 
 
 def _first(holds: np.ndarray[Any, Any]) -> int | None:
-    """Step of the log at which it holds first."""
+    """Return the first step of the log at which a condition holds."""
     return CURRENT_STEP + int(holds.argmax()) if holds.any() else None
 
 

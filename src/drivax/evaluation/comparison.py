@@ -1,7 +1,6 @@
-"""Is one planner better than another? Intervals, tests, power, and a decision by the rule of a plan.
+"""Compare two planners: intervals, tests, power, and a decision by the rule of a plan.
 
-The primary metric decides; secondary ones are told with p-values that are adjusted for their number. Differences are
-``A - B``.
+The primary metric decides; p-values of secondary metrics are adjusted for their number. Differences are ``A - B``.
 """
 
 from __future__ import annotations
@@ -17,12 +16,11 @@ from jaxtyping import Bool, Float64
 
 from drivax import settings
 from drivax.errors import UsageError
-from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, judged
+from drivax.evaluation.decision import Decision, MetricComparison, Sensitivity, decide, with_winner
+from drivax.evaluation.episode_table import RATES, SHARES, EpisodeTable, interval_of
+from drivax.evaluation.pairing import Pairs, check_metric, check_pairs, undefined_metric
 from drivax.evaluation.plan import ComparisonPlan
-from drivax.evaluation.results import RATES, SHARES, interval_of
 from drivax.evaluation.split import Split, assign, strata_of
-from drivax.evaluation.stored import EpisodeTable, Pairs
-from drivax.evaluation.unmatched import refuse_metric, refuse_misfits, refuse_undefined
 from drivax.stats.clusters import defined, design_effect
 from drivax.stats.effects import (
     ROUNDING,
@@ -34,7 +32,7 @@ from drivax.stats.effects import (
     scenarios_needed,
 )
 from drivax.stats.intervals import Interval, interquartile_bootstrap, paired_bootstrap, split_bootstrap
-from drivax.stats.seeds import Crossed, agents_interval, difference_interval
+from drivax.stats.seeds import Crossed, difference_interval, seeds_interval
 from drivax.stats.significance import (
     Evidence,
     holm,
@@ -64,26 +62,26 @@ class SeedSpread:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A plan carried out.
+    """The result of a comparison.
 
     Attributes:
-        plan: What was planned.
-        names: Of A and B.
+        plan: The plan.
+        names: Names of A and B.
         folders: Run folders of A and B.
-        traffic: In which both drove.
+        traffic: Traffic model of both.
         scenarios: Of A and of B; the same ones where they are paired.
         recordings: Of A and of B.
-        strata: How many strata the split kept alike; 1 without.
+        strata: Number of strata of the split; 1 without.
         primary: The metric that decides.
         secondary: The others.
         sensitivity: Of the primary metric; None where it does not vary.
         seeds: Spread over seeds of A and B; None for a single one.
-        decision: What follows.
+        decision: The decision.
     """
 
     plan: ComparisonPlan
     names: tuple[str, str]
-    folders: tuple[Path, Path]
+    folders: tuple[Path | None, Path | None]
     traffic: str
     scenarios: tuple[int, int]
     recordings: tuple[int, int]
@@ -95,9 +93,10 @@ class Comparison:
     decision: Decision
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what cannot be said is null."""
-        found = asdict(self) | {"plan": settings.plain(self.plan), "folders": [*map(str, self.folders)]}
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+        """Plain values for JSON; null where undefined."""
+        folders = [None if folder is None else str(folder) for folder in self.folders]
+        values = asdict(self) | {"plan": settings.plain(self.plan), "folders": folders}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -116,12 +115,14 @@ class _Side:
         return np.where(self.arm, self.by_seed(metric).mean(axis=0), np.nan)
 
     @property
-    def folder(self) -> Path:
-        return self.tables[0].folder if len(self.tables) == 1 else self.tables[0].folder.parent
+    def folder(self) -> Path | None:
+        folder = self.tables[0].folder
+        return folder if folder is None or len(self.tables) == 1 else folder.parent
 
     @property
     def name(self) -> str:
-        return self.tables[0].name if len(self.tables) == 1 else self.folder.name
+        folder = self.folder
+        return self.tables[0].name if folder is None or len(self.tables) == 1 else folder.name
 
     @property
     def recordings(self) -> int:
@@ -134,7 +135,7 @@ def compare(
     b: Sequence[EpisodeTable],
     entries: Sequence[Mapping[str, Any]] = (),
 ) -> Comparison:
-    """Carries a plan out.
+    """Compare two planners by a plan.
 
     Args:
         plan: What to compare and how to decide.
@@ -145,25 +146,25 @@ def compare(
     Raises:
         UsageError: The evaluations cannot be compared, or lack a metric of the plan.
     """
-    refuse_misfits(a, b)
+    check_pairs(a, b)
     for metric in (plan.primary, *plan.secondary):
-        refuse_metric(metric, (*a, *b), primary=metric == plan.primary)
+        check_metric(metric, (*a, *b), primary=metric == plan.primary)
     pairs = Pairs.of(*a, *b)
     if not pairs.keys:
         raise UsageError("A and B have no scenario in common", cure="evaluate both on the same scenarios")
     if plan.split != "paired" and max(len(a), len(b)) > 1:
         raise UsageError("a split takes one evaluation of A and of B", cure="compare seeds in pairs")
     split = None if plan.split == "paired" else _split(plan, pairs, entries)
-    everyone = np.ones(len(pairs.keys), bool)
-    arms = (everyone, everyone) if split is None else (split.first, ~split.first)
+    whole = np.ones(len(pairs.keys), bool)
+    arms = (whole, whole) if split is None else (split.first, ~split.first)
     sides = _Side(a, pairs, arms[0]), _Side(b, pairs, arms[1])
     first = _compared(plan, plan.primary, sides, split)
     if min(first.a.n, first.b.n) == 0:
-        refuse_undefined(plan.primary, (*a, *b))
+        raise undefined_metric(plan.primary, (*a, *b))
     others = [_compared(plan, metric, sides, split) for metric in plan.secondary]
-    adjusted = holm([one.evidence.p for one in others])
-    secondary = tuple(judged(plan, one, p) for one, p in zip(others, adjusted, strict=True))
-    primary = judged(plan, first, first.evidence.p)
+    adjusted = holm([metric.evidence.p for metric in others])
+    secondary = tuple(with_winner(plan, metric, p) for metric, p in zip(others, adjusted, strict=True))
+    primary = with_winner(plan, first, first.evidence.p)
     sensitivity = _sensitivity(plan, sides, split)
     return Comparison(
         plan=plan,
@@ -184,7 +185,8 @@ def compare(
 def _names(a: _Side, b: _Side) -> tuple[str, str]:
     if a.name != b.name:
         return a.name, b.name
-    return f"{a.name} ({a.folder.name})", f"{b.name} ({b.folder.name})"
+    labels = [side.folder.name if side.folder else arm for side, arm in ((a, "A"), (b, "B"))]
+    return f"{a.name} ({labels[0]})", f"{b.name} ({labels[1]})"
 
 
 def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, Any]]) -> Split:
@@ -203,7 +205,7 @@ def _split(plan: ComparisonPlan, pairs: Pairs, entries: Sequence[Mapping[str, An
 def _compared(
     plan: ComparisonPlan, metric: str, sides: tuple[_Side, _Side], split: Split | None
 ) -> MetricComparison:
-    """One metric, not yet judged."""
+    """Compare one metric, without its winner."""
     clusters, seeds = sides[0].pairs.clusters, max(len(side.tables) for side in sides)
     x, y = (side.values(metric) for side in sides)
     undefined = [int((np.isnan(v) & side.arm).sum()) for v, side in zip((x, y), sides, strict=True)]
@@ -225,8 +227,8 @@ def _compared(
         evidence = Evidence("t", p, units, exact=False)
     effects = asdict(cohens_d_paired(x, y)) if split is None else {"d": cohens_d(x, y)}
     a, b = (_interval(plan, metric, side, both) for side in sides)
-    found = sides[0].tables[0].metric(metric)
-    unit, better = ("", "-") if found is None else (found.unit, found.better)
+    column = sides[0].tables[0].metric(metric)
+    unit, better = ("", "-") if column is None else (column.unit, column.better)
     return MetricComparison(
         metric, unit, better, a, b, difference, effects, evidence, None, None, seeds, *undefined
     )
@@ -247,7 +249,7 @@ def _interval(plan: ComparisonPlan, metric: str, side: _Side, counts: Bool[np.nd
         x = np.where(counts, side.values(metric), np.nan)
         return interval_of(metric, x, clusters, plan.confidence, plan.seed)
     x = np.where(counts, side.by_seed(metric), np.nan)
-    return agents_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
+    return seeds_interval(x, clusters, confidence=plan.confidence, share=metric in SHARES)
 
 
 def _is_binary(x: Values) -> bool:
@@ -302,18 +304,18 @@ def _sensitivity(plan: ComparisonPlan, sides: tuple[_Side, _Side], split: Split 
 
 
 def _sensitivity_of_seeds(
-    plan: ComparisonPlan, found: Crossed | None, n: int, deviation: float, inflation: float
+    plan: ComparisonPlan, effect: Crossed | None, n: int, deviation: float, inflation: float
 ) -> Sensitivity | None:
     """The same where seeds vary too, which more scenarios do not change."""
-    if found is None or found.error == 0.0:
+    if effect is None or effect.error == 0.0:
         return None
     smallest = plan.smallest_difference or SMALL_EFFECT * deviation
-    chance, needed = found.power(smallest, plan.confidence), n
+    chance, needed = effect.power(smallest, plan.confidence), n
     if chance < plan.power:
-        clusters = replace(found, difference=smallest).clusters_needed(plan.power, plan.confidence)
-        needed = None if clusters is None else math.ceil(clusters * n / found.clusters)
+        clusters = replace(effect, difference=smallest).clusters_needed(plan.power, plan.confidence)
+        needed = None if clusters is None else math.ceil(clusters * n / effect.clusters)
     return Sensitivity(
-        deviation, inflation, smallest, chance, found.detectable(plan.power, plan.confidence), needed
+        deviation, inflation, smallest, chance, effect.detectable(plan.power, plan.confidence), needed
     )
 
 

@@ -41,7 +41,7 @@ class MetricComparison:
 
     Attributes:
         metric: Its name.
-        unit: ``-`` for shares, empty where nobody told.
+        unit: ``-`` for shares, empty where unknown.
         better: ``high`` or ``low``; ``-`` where neither is.
         a, b: Means over the scenarios that count.
         difference: ``A - B``.
@@ -80,18 +80,18 @@ class Decision:
     """
 
     recommendation: Literal["A", "B", "no difference", "not enough scenarios"]
-    because: Literal["test", "power", "minimum", "alike", "seeds"]
+    because: Literal["test", "power", "minimum", "equal", "seeds"]
     needed: int | None
     caveats: tuple[str, ...]
 
 
-def judged(plan: ComparisonPlan, one: MetricComparison, p: float | None) -> MetricComparison:
+def with_winner(plan: ComparisonPlan, comparison: MetricComparison, p: float | None) -> MetricComparison:
     """With its adjusted p-value, and the winner where that is small enough."""
-    judged = replace(one, p_adjusted=p)
-    mean = one.difference.mean
-    if one.better == "-" or not mean or p is None or p >= 1 - plan.confidence:
-        return judged
-    return replace(judged, winner="A" if (mean > 0) == (one.better == "high") else "B")
+    result = replace(comparison, p_adjusted=p)
+    mean = comparison.difference.mean
+    if comparison.better == "-" or not mean or p is None or p >= 1 - plan.confidence:
+        return result
+    return replace(result, winner="A" if (mean > 0) == (comparison.better == "high") else "B")
 
 
 def decide(
@@ -112,10 +112,10 @@ def decide(
     if n < plan.minimum_scenarios:
         return Decision("not enough scenarios", "minimum", needed, ())
     if primary.winner is not None:
-        worse = tuple(one.metric for one in secondary if one.winner not in (None, primary.winner))
+        worse = tuple(metric.metric for metric in secondary if metric.winner not in (None, primary.winner))
         return Decision(primary.winner, "test", None, worse)
     if sensitivity is None and primary.difference.mean == 0:
-        return Decision("no difference", "alike", None, ())
+        return Decision("no difference", "equal", None, ())
     if sensitivity is not None and sensitivity.power >= plan.power:
         return Decision("no difference", "power", None, ())
     if sensitivity is not None and sensitivity.needed is None:

@@ -1,4 +1,4 @@
-"""How much memory there is, how many scenarios are loaded at a time, and what is said when it was too little."""
+"""Choose the evaluation batch size from available memory, and report when memory runs out."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _MACHINE = Path("/proc/meminfo")
 
 def memory_of(device: Any, share: int = 1) -> int | None:
     """Bytes that a device has for us; of a CPU the machine's or the container's memory, divided by ``share``."""
-    told = device.memory_stats() or {}
-    if "bytes_limit" in told:
-        return int(told["bytes_limit"])
+    stats = device.memory_stats() or {}
+    if "bytes_limit" in stats:
+        return int(stats["bytes_limit"])
     if device.platform != "cpu":
         return None
     whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -38,9 +38,9 @@ def free_memory(device: Any) -> int | None:
 
     Files that Linux keeps in memory only because there is room for them count as free.
     """
-    told = device.memory_stats() or {}
-    if "bytes_limit" in told:
-        return int(told["bytes_limit"]) - int(told.get("bytes_in_use", 0))
+    stats = device.memory_stats() or {}
+    if "bytes_limit" in stats:
+        return int(stats["bytes_limit"]) - int(stats.get("bytes_in_use", 0))
     if device.platform != "cpu":
         return None
     free = []
@@ -56,7 +56,7 @@ def scenarios_at_a_time(scenario_bytes: int, lanes: int, free: int | None) -> in
     Args:
         scenario_bytes: What one takes; it is there twice while a bank is made.
         lanes: How many a program drives side by side.
-        free: Bytes; None where nobody knows.
+        free: Free bytes; None where unknown.
     """
     if free is None:
         return MOST
@@ -92,7 +92,7 @@ def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tupl
         groups: Where the system shows them.
         ours: The file that names ours: ``hierarchy:controllers:path`` (cgroups(7)).
     """
-    found = []
+    limits = []
     rows = ours.read_text(encoding="utf-8").splitlines() if ours.is_file() else []
     for _, controllers, path in (row.split(":", 2) for row in rows):
         if controllers and "memory" not in controllers.split(","):
@@ -107,8 +107,8 @@ def _group_limits(groups: Path = _GROUPS, ours: Path = _OUR_GROUPS) -> list[tupl
                     statistics = group / "memory.stat"
                     kept = _table(statistics) if statistics.is_file() else {}
                     files = kept.get("active_file", 0) + kept.get("inactive_file", 0)
-                    found.append((limit, max(used - files, 0)))
-    return found
+                    limits.append((limit, max(used - files, 0)))
+    return limits
 
 
 def _number(file: Path) -> int | None:

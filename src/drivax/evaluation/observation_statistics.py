@@ -24,7 +24,7 @@ from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import SimState, Traffic
 from drivax.tasks.features import Features, feature_names
@@ -40,7 +40,7 @@ class Looks:
     """Moments of episodes, ``[episode, look]``.
 
     Attributes:
-        state, carry: What the planner acts on beside the observation.
+        state, carry: What the planner acts on in addition to the observation.
         key: What it draws from.
         observation: The observation.
         hit: Whether ego has collided by then.
@@ -85,7 +85,7 @@ class ObservationStatistics:
     """Statistics of all columns.
 
     Attributes:
-        planner: Who drove.
+        planner: Name of the planner.
         episodes, collisions: How many episodes, and how many of them with a collision.
         states: Moments that were looked at.
         permuted: Moments on which features were permuted; 0 for none.
@@ -108,7 +108,7 @@ class ObservationStatistics:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON; what cannot be said is null."""
-        rows = [{name: _plain(value) for name, value in asdict(one).items()} for one in self.features]
+        rows = [{name: _plain(value) for name, value in asdict(feature).items()} for feature in self.features]
         about = {
             name: getattr(self, name) for name in ("planner", "episodes", "collisions", "states", "permuted")
         }
@@ -142,7 +142,7 @@ def observation_statistics(
             f"planner {planner.name} acts in another action space than the task", cure="use the task's"
         )
     traffic = traffic or LogTraffic()
-    simulator, bank = Simulator(judging(task), traffic), prepared(traffic, bank)
+    simulator, bank = Simulator(judging(task), traffic), prepare_bank(traffic, bank)
     looks = look_at(simulator, planner, bank, every, seed)
     seen = {name: np.asarray(leaf) for name, leaf in looks.observation.items()}
     hit, collides = np.asarray(looks.hit), np.asarray(looks.collides)
@@ -176,7 +176,7 @@ def described(
         importance: Of columns that were permuted, by group and number.
     """
     names = feature_names(features, {name: values.shape[2:] for name, values in observation.items()})
-    found = []
+    statistics = []
     for group, parts in names.items():
         for column, name in enumerate(parts):
             values = observation[group][..., column]
@@ -185,8 +185,8 @@ def described(
             moments = _moments(values, valid)
             correlation = collision_correlation(values, before, collides)
             importance_here = importance.get((group, column), float("nan"))
-            found.append(FeatureStatistics(group, name, *moments, correlation, importance_here))
-    return tuple(found)
+            statistics.append(FeatureStatistics(group, name, *moments, correlation, importance_here))
+    return tuple(statistics)
 
 
 def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: int, seed: int = 0) -> Looks:
@@ -197,9 +197,9 @@ def look_at(simulator: Simulator, planner: Planner, bank: ScenarioBank, every: i
         size = min(BATCH, len(bank))
         # A short last batch repeats its last scenario, so that one compilation serves all.
         index = jnp.asarray(np.pad(rows, (0, size - len(rows)), mode="edge"), jnp.int32)
-        found = _looks(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
+        looks = _looks(simulator, planner, bank, index, episode_keys(bank, index, seed), every)
         kept = len(rows)
-        parts.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], found))
+        parts.append(jax.tree.map(lambda leaf, kept=kept: leaf[:kept], looks))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 

@@ -17,11 +17,11 @@ class ComparisonPlan:
         name: For the heading of the page.
         a, b: Run folders of ``drivax evaluate``; the command line may name them instead.
         primary: The metric that decides.
-        secondary: Metrics that are told beside it.
+        secondary: Further metrics to report.
         split: ``paired`` compares on every common scenario; ``random`` and ``stratified`` give each planner its own
             scenarios.
         ratio: Share of the recordings that A gets in a split.
-        strata: Tags by which a stratified split keeps the arms alike.
+        strata: Tags by which a stratified split balances the arms.
         minimum_scenarios: With fewer, nothing is decided.
         confidence: Of intervals; tests reject at 1 - confidence.
         power: With which the smallest difference is to be found, before "no difference" is said.

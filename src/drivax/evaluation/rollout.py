@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int16
 
-from drivax.evaluation.results import FAILED
+from drivax.evaluation.episode_table import FAILED
 from drivax.evaluation.traffic_trajectories import packed
 from drivax.metrics.episode import episode_metrics, event_steps
 from drivax.metrics.scores import Value
@@ -37,8 +37,7 @@ class Episodes:
         events: Step of the first collision, off-road step and red light, -1 for none.
         motion: x, y, heading, speed of the driven agent from the start step to the end.
         actions: What was carried out in each step: within bounds, and as the actuators let it be.
-        others: Where everyone was at each step (``evaluation.traffic_trajectories``), if traffic does not replay the
-            log.
+        others: Poses of the other agents at each step (``evaluation.traffic_trajectories``); None in log traffic.
         offroad_steps: Number of steps off the road.
         crashed: First step whose action was no number, -1 for none. Nothing is measured from there on; motion stays.
     """
@@ -68,7 +67,7 @@ def drive(
     simulator: Simulator, planner: Planner, bank: ScenarioBank, index: Int[Array, " B"], keys: Array,
     start_step: int = CURRENT_STEP, slot: Any = 0,
 ) -> Episodes:  # fmt: skip
-    """Drives scenarios ``index`` with one planner; one compilation per planner kind, batch size and start step.
+    """Run one planner on scenarios ``index``; one compilation per planner kind, batch size and start step.
 
     Args:
         simulator: With a task whose episodes do not end early (:func:`judging`).
@@ -100,7 +99,7 @@ def _episode(
         traffic = simulator.traffic
         return None if traffic.name == LogTraffic.name else packed(traffic.agents(bank, state.context, 0))
 
-    def one(now: Any, key: Array) -> Any:
+    def step(now: Any, key: Array) -> Any:
         state, kept, carry, sound = now
         state, carry, step_sound = advanced(simulator, planner, bank, state, carry, key)
         sound &= step_sound
@@ -111,7 +110,7 @@ def _episode(
 
     keys = jax.random.split(key, bank.steps - 1 - start_step)
     first = (state, state, carry, jnp.ones((), bool))
-    (last, final, _, _), (motion, actions, offroad, sound, moved) = jax.lax.scan(one, first, keys)
+    (last, final, _, _), (motion, actions, offroad, sound, moved) = jax.lax.scan(step, first, keys)
     began = others(state)
     metrics, to_the_end = episode_metrics(bank, final), episode_metrics(bank, last)
     # What a scenario defines does not depend on how soon its planner crashed.
@@ -140,6 +139,7 @@ def advanced(
     observation = simulator.observe(bank, state.context)
     action, carry = planner.act(carry, bank, state, situation, observation, key)
     if planner.replays:
+        action = simulator.task.actuated(state.context.history[-1], action, state.context.action)
         logged = logged_motion(bank, state.context, 1)
         return simulator.replay(bank, state, logged, action)[0], carry, jnp.ones((), bool)
     context, sound = state.context, jnp.isfinite(action).all()

@@ -1,27 +1,27 @@
-"""Evaluation of a planner over all scenarios of a set, none dropped.
+"""Evaluate a planner on every scenario of a set.
 
-An episode follows from planner, task, traffic, start, seed and scenario alone. Chance follows from who a scenario is
-(``bank.identity``), and one program drives always as many scenarios side by side (a short batch is filled up), in banks
-of the same sizes; so neither order nor company nor how many are loaded at a time changes a bit of it.
+An episode depends on planner, task, traffic, start, seed and scenario alone. Random keys follow from the scenario's
+identity (``bank.identity``), and each program runs a fixed number of scenarios (a short batch is padded) in banks of
+fixed sizes. So neither order nor batch size nor the other scenarios of a batch change a bit of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, UInt32
 
 from drivax.errors import DataError, DrivaxError, UsageError
 from drivax.evaluation.actions import action_jerk, until_crash
 from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.episode_table import ADDED, KEYS, Crash, EpisodeTable, Trajectories, fail_crashed
 from drivax.evaluation.memory import free_memory, scenarios_at_a_time, telling_out_of_memory
-from drivax.evaluation.results import ADDED, KEYS, Crash, Results, with_crashes
 from drivax.evaluation.rollout import Episodes, drive, episode_keys, judging
 from drivax.metrics.catalogue import METRICS, Metric
 from drivax.metrics.selection import metric_specs
@@ -31,148 +31,137 @@ from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.scenario_bank import ScenarioBank, Sizes, identities
 from drivax.scenario.schema import CURRENT_STEP, STEPS, Flag, Scenario
 from drivax.simulator.simulator import Simulator
-from drivax.simulator.starts import LogStart
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.starts import LogStart, Start
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 
-#: Scenarios that a program drives side by side on a CPU, where more leave the caches and fewer cost overhead
-#: (docs/log/2026-11-22-evaluation.md), and on anything else.
+#: Scenarios per program call on a CPU, where more leave the caches and fewer cost overhead
+#: (docs/log/2026-11-22-evaluation.md), and on other devices.
 LANES, LANES_ELSEWHERE = 16, 256
 #: No more scenarios than these are named in an error.
-_TOLD = 5
+_NAMED = 5
+Names = Sequence[Mapping[str, str]]
 Progress = Callable[[int, int], None]
 
 
 def lanes() -> int:
-    """How many scenarios a program drives side by side on this platform."""
+    """Scenarios per program call on this platform."""
     return LANES if jax.default_backend() == "cpu" else LANES_ELSEWHERE
+
+
+class Options(TypedDict, total=False):
+    """Keyword options of :func:`evaluate`.
+
+    Attributes:
+        start_step: Step of the log at which episodes start, by default the current step.
+        seed: Seed of all random numbers, by default 0.
+        batch: Stored scenarios loaded at a time, by default as many as memory allows; no result depends on it.
+        sizes: Sizes of the banks, by default what the scenarios use. Subsets of a set that are given the sizes of the
+            whole share its compiled program.
+        progress: Called with (done, total) after every batch.
+    """
+
+    start_step: int
+    seed: int
+    batch: int | None
+    sizes: Sizes | None
+    progress: Progress | None
 
 
 def evaluate(
     planner: Planner,
-    bank: ScenarioBank,
-    scenarios: Sequence[Mapping[str, str]],
+    scenarios: ScenarioBank | Sequence[Scenario],
+    names: Names | None = None,
     *,
     task: Task | None = None,
     traffic: Traffic | None = None,
-    start_step: int = CURRENT_STEP,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Results:
-    """Drives every scenario of a bank to the end of its log and measures it.
+    start: Start | None = None,
+    **options: Unpack[Options],
+) -> EpisodeTable:
+    """Run a planner on every scenario to the end of its log, and measure each episode.
 
     Args:
-        planner: The driver.
-        bank: The scenarios.
-        scenarios: ``dataset``, ``scenario_id`` and ``segment`` of every row of the bank.
-        task: Action space and observation that the planner was made for; the default one otherwise.
-        traffic: How the others move; they replay the log by default. What it needs is precomputed in the bank.
-        start_step: Step of the log at which to begin.
-        seed: Every scenario's key is this one's with the scenario's identity folded in.
-        progress: Called with (done, total) after every batch.
+        planner: The planner.
+        scenarios: A bank, or stored scenarios of one capacity.
+        names: ``dataset``, ``scenario_id`` and ``segment`` of every scenario of a bank; stored scenarios know theirs.
+        task: Action space and observation of the planner; the default task if None. All metrics are measured, and no
+            episode ends early.
+        traffic: Traffic model, log replay if None; what it needs is precomputed here.
+        start: How episodes start, as logged if None. Random starts are the same for every planner.
+        options: See :class:`Options`.
 
     Raises:
-        UsageError: If the table and the bank disagree, or an episode cannot begin there.
-        DrivaxError: If the memory does not suffice.
-    """
-    simulator = Simulator(task or Task(), traffic or LogTraffic())
-    return evaluate_in(
-        simulator, planner, bank, scenarios, start_step=start_step, seed=seed, progress=progress
-    )
-
-
-def evaluate_in(
-    simulator: Simulator,
-    planner: Planner,
-    bank: ScenarioBank,
-    scenarios: Sequence[Mapping[str, str]],
-    *,
-    start_step: int = CURRENT_STEP,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Results:
-    """:func:`evaluate` in a simulator of your own, whose starts may be noisy; its task is judged to the end of the log.
-
-    A noisy start is drawn from the scenario's key, so every planner has the same ones under one seed.
-
-    Raises:
-        UsageError: As :func:`evaluate`; or a planner that replays the log is to begin elsewhere.
-        DrivaxError: As :func:`evaluate`.
-    """
-    if len(scenarios) != len(bank):
-        raise UsageError(
-            f"{len(scenarios)} scenario names for a bank of {len(bank)}", cure="name every row of the bank"
-        )
-    trial = _Trial.of(simulator, planner, start_step, seed, bank.steps)
-    _refuse_without_future(scenarios, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
-    trial.refuse_absent(scenarios, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0)
-    with raised() as errors, telling_out_of_memory(len(bank)):
-        episodes = trial.drive_all(bank, progress)
-    return trial.results(episodes, scenarios, np.asarray(bank.identity), errors)
-
-
-def evaluate_scenarios(
-    simulator: Simulator,
-    planner: Planner,
-    scenarios: Sequence[Scenario],
-    *,
-    start_step: int = CURRENT_STEP,
-    seed: int = 0,
-    batch: int | None = None,
-    sizes: Sizes | None = None,
-    progress: Progress | None = None,
-) -> Results:
-    """:func:`evaluate_in` for stored scenarios, however many: as many are loaded at a time as memory allows.
-
-    Args:
-        simulator: Task, traffic and start.
-        planner: The driver.
-        scenarios: What is driven; all of one capacity.
-        start_step: Step of the log at which to begin.
-        seed: Of all chance.
-        batch: How many are loaded at a time; no result depends on it.
-        sizes: Of the banks; those that all of ``scenarios`` use by default. Parts of a set that are given the sizes of
-            the whole are driven by the same program.
-        progress: Called with (done, total).
-
-    Raises:
-        UsageError: As :func:`evaluate_in`, or ``batch`` is none.
+        UsageError: Planner, task, start and scenarios do not fit together.
         DataError: A scenario has no logged future.
-        DrivaxError: As :func:`evaluate`.
+        DrivaxError: Memory does not suffice, or ego's motion is not finite.
     """
+    batch, sizes, progress = options.get("batch"), options.get("sizes"), options.get("progress")
+    start_step, seed = options.get("start_step", CURRENT_STEP), options.get("seed", 0)
     if batch is not None and batch < 1:
-        raise UsageError(f"a batch of {batch} scenarios", cure="use 1 or more")
-    names = scenario_names(scenarios)
-    trial = _Trial.of(simulator, planner, start_step, seed, STEPS)
-    _refuse_without_future(names, [Flag.NO_FUTURE in scenario.has for scenario in scenarios])
-    trial.refuse_absent(names, np.array([scenario.agent_valid[start_step, 0] for scenario in scenarios]))
-    numbers = identities([(row["dataset"], row["scenario_id"]) for row in names])
-    total, sizes = len(scenarios), sizes or Sizes.used(scenarios)
-    one = prepared(simulator.traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes)).nbytes
-    size = min(batch or scenarios_at_a_time(one, lanes(), free_memory(jax.devices()[0])), total)
-    parts: list[Episodes] = []
+        raise UsageError(f"batch of {batch} scenarios", cure="use 1 or more")
+    steps = scenarios.steps if isinstance(scenarios, ScenarioBank) else STEPS
+    simulator = Simulator(task or Task(), traffic or LogTraffic(), start or LogStart())
+    evaluation = _Evaluation.of(simulator, planner, start_step, seed, steps)
+    if isinstance(scenarios, ScenarioBank):
+        names, identity = _bank_names(scenarios, names or (), start_step), np.asarray(scenarios.identity)
+        size, banks = len(scenarios), iter([scenarios])
+    else:
+        names = _stored_names(scenarios, start_step)
+        identity = identities([(row["dataset"], row["scenario_id"]) for row in names])
+        sizes = sizes or Sizes.used(scenarios)
+        size = min(batch or _fitting(simulator.traffic, scenarios, sizes), len(scenarios))
+        banks = _banks(scenarios, identity, size, sizes)
+    episodes, done = [], 0
     with raised() as errors, telling_out_of_memory(size):
-        for first in range(0, total, size):
-            rows = slice(first, first + size)
-            bank = ScenarioBank.from_scenarios(scenarios[rows], trim=sizes)
-            bank = replace(bank, identity=jnp.asarray(numbers[rows]))
-            parts.append(trial.drive_all(bank, _on(progress, first, total)))
-    return trial.results(_joined(parts), names, numbers, errors)
+        for bank in banks:
+            for finished in evaluation.episodes(bank):
+                episodes.append(finished)
+                done += len(finished.crashed)
+                if progress is not None:
+                    progress(done, len(names))
+    return evaluation.table(_joined(episodes), names, identity, errors)
+
+
+def _bank_names(bank: ScenarioBank, names: Names, start_step: int) -> Names:
+    """Check the names of a bank, and that episodes can start there."""
+    if len(names) != len(bank):
+        raise UsageError(
+            f"{len(names)} scenario names for a bank of {len(bank)}", cure="name every scenario of the bank"
+        )
+    _check_future(names, np.asarray(bank.flags) & Flag.NO_FUTURE != 0)
+    _check_present(names, np.asarray(bank.agents[:, start_step, 0, AgentColumn.VALID]) > 0, start_step)
+    return names
+
+
+def _stored_names(scenarios: Sequence[Scenario], start_step: int) -> Names:
+    """Return the names of stored scenarios, and check that episodes can start there."""
+    names = scenario_names(scenarios)
+    _check_future(names, [Flag.NO_FUTURE in scenario.has for scenario in scenarios])
+    _check_present(names, [scenario.agent_valid[start_step, 0] for scenario in scenarios], start_step)
+    return names
+
+
+def _fitting(traffic: Traffic, scenarios: Sequence[Scenario], sizes: Sizes) -> int:
+    """How many scenarios fit in memory at a time."""
+    single = prepare_bank(traffic, ScenarioBank.from_scenarios(scenarios[:1], trim=sizes))
+    return scenarios_at_a_time(single.nbytes, lanes(), free_memory(jax.devices()[0]))
+
+
+def _banks(
+    scenarios: Sequence[Scenario], identity: UInt32[np.ndarray, " n"], size: int, sizes: Sizes
+) -> Iterator[ScenarioBank]:
+    """Banks of ``size`` scenarios, each with the identities that they have in the whole."""
+    for first in range(0, len(scenarios), size):
+        rows = slice(first, first + size)
+        bank = ScenarioBank.from_scenarios(scenarios[rows], trim=sizes)
+        yield replace(bank, identity=jnp.asarray(identity[rows]))
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """What is evaluated, and how.
-
-    Attributes:
-        simulator: With a task that is judged.
-        planner: The driver.
-        start_step: Step of the log at which episodes begin.
-        seed: Of all chance.
-        metrics: What is measured.
-    """
+class _Evaluation:
+    """What is evaluated, and how: the simulator has the task of :func:`~drivax.evaluation.rollout.judging`."""
 
     simulator: Simulator
     planner: Planner
@@ -181,8 +170,10 @@ class _Trial:
     metrics: Mapping[str, Metric]
 
     @classmethod
-    def of(cls, simulator: Simulator, planner: Planner, start_step: int, seed: int, steps: int) -> _Trial:
-        """Refuses what does not go together."""
+    def of(
+        cls, simulator: Simulator, planner: Planner, start_step: int, seed: int, steps: int
+    ) -> _Evaluation:
+        """Check that planner, task and start fit together."""
         task = simulator.task
         if not isinstance(task, Task):
             raise UsageError(f"{type(task).__name__} has no metrics", cure="use drivax.tasks.task.Task")
@@ -194,117 +185,110 @@ class _Trial:
             )
         if planner.replays and simulator.start != LogStart():
             raise UsageError(
-                f"planner {planner.name} replays the log and cannot begin elsewhere",
+                f"planner {planner.name} replays the log and cannot start elsewhere",
                 cure="use expert_actions",
             )
-        judged = judging(task)
-        metrics = metric_specs(judged.metrics)
+        task = judging(task)
+        metrics = metric_specs(task.metrics)
         if taken := sorted({*KEYS, *ADDED} & metrics.keys()):
             raise UsageError(f"there is another column {taken[0]!r}", cure="give your metric another name")
-        return cls(replace(simulator, task=judged), planner, start_step, seed, metrics)
+        return cls(replace(simulator, task=task), planner, start_step, seed, metrics)
 
-    def refuse_absent(self, names: Sequence[Mapping[str, str]], there: Any) -> None:
-        """Refuses logs that do not have ego where an episode is to begin: nobody could be judged in them."""
-        absent = [row["scenario_id"] for row, present in zip(names, there, strict=True) if not present]
-        if absent:
-            cure = "begin at another step"
-            if len(absent) <= _TOLD:
-                cure += f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
-            raise UsageError(
-                f"ego is not in the log at step {self.start_step} in {len(absent)} of {len(names)} scenarios",
-                record=absent[0],
-                cure=cure,
-            )
-
-    def drive_all(self, bank: ScenarioBank, progress: Progress | None = None) -> Episodes:
-        """The episodes of all scenarios of a bank, in its order."""
-        bank, width = prepared(self.simulator.traffic, bank), lanes()
-        parts: list[Episodes] = []
+    def episodes(self, bank: ScenarioBank) -> Iterator[Episodes]:
+        """Run all scenarios of a bank in its order, a batch at a time."""
+        bank, width = prepare_bank(self.simulator.traffic, bank), lanes()
+        index = jnp.arange(width, dtype=jnp.int32)
         for first in range(0, len(bank), width):
-            kept = min(width, len(bank) - first)
-            rows = np.pad(np.arange(first, first + kept), (0, width - kept), mode="edge")
-            some, keys = _side_by_side(bank, jnp.asarray(rows, jnp.int32), self.seed)
-            place = jnp.arange(width, dtype=jnp.int32)
-            found = drive(self.simulator, self.planner, some, place, keys, self.start_step)
-            parts.append(jax.tree.map(lambda leaf, kept=kept: np.asarray(leaf)[:kept], found))
-            if progress is not None:
-                progress(first + kept, len(bank))
-        return _joined(parts)
+            count = min(width, len(bank) - first)
+            rows = np.pad(np.arange(first, first + count), (0, width - count), mode="edge")
+            batch, keys = _batch(bank, jnp.asarray(rows, jnp.int32), self.seed)
+            episodes = drive(self.simulator, self.planner, batch, index, keys, self.start_step)
+            yield jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], episodes)
 
-    def results(
-        self,
-        episodes: Episodes,
-        names: Sequence[Mapping[str, str]],
-        numbers: Any,
-        errors: Mapping[tuple[int, int], str],
-    ) -> Results:
-        """The episodes as results.
-
-        Args:
-            episodes: What was driven.
-            names: The scenarios.
-            numbers: Their identities.
-            errors: What the planner raised, by identity and step.
-        """
-        self._refuse_nan(episodes, names)
-        found = episodes.metrics
-        actions = until_crash(np.asarray(episodes.actions), np.asarray(episodes.crashed), self.start_step)
+    def table(
+        self, episodes: Episodes, names: Names, identity: Any, errors: Mapping[tuple[int, int], str]
+    ) -> EpisodeTable:
+        """Tabulate episodes; ``errors`` are the planner's exceptions by identity and step."""
+        _check_finite(episodes, names)
+        n, planner, traffic = len(names), self.planner.name, self.simulator.traffic.name
+        values, crashed = episodes.metrics, np.asarray(episodes.crashed)
+        actions = until_crash(np.asarray(episodes.actions), crashed, self.start_step)
         metrics = {"action_jerk": action_jerk(actions)} | {
-            name: np.where(found[name].defined, found[name].value, np.nan) for name in self.metrics
+            name: np.where(values[name].defined, values[name].value, np.nan) for name in self.metrics
         }
-        crashes = tuple(
-            Crash(row, step, errors.get((int(numbers[row]), step), "action is not finite"))
-            for row, step in enumerate(episodes.crashed.tolist())
-            if step >= 0
+        columns = {key: tuple(row[key] for row in names) for key in ("dataset", "scenario_id", "segment")}
+        columns |= {"planner": (planner,) * n, "seed": (str(self.seed),) * n, "traffic": (traffic,) * n}
+        own = {
+            name: {"unit": metric.unit, "better": metric.better, "text": metric.definition}
+            for name, metric in self.metrics.items()
+            if name not in METRICS
+        }
+        return EpisodeTable(
+            folder=None,
+            name=planner,
+            info={"planner": planner, "traffic": traffic} | ({"own_metrics": own} if own else {}),
+            keys={name: columns[name] for name in KEYS},
+            metrics=fail_crashed(metrics, crashed >= 0),
+            crashes=tuple(
+                Crash(
+                    columns["dataset"][row],
+                    columns["scenario_id"][row],
+                    step,
+                    errors.get((int(identity[row]), step), "action is not finite"),
+                )
+                for row, step in enumerate(crashed.tolist())
+                if step >= 0
+            ),
+            in_memory=Trajectories(
+                ego=np.asarray(episodes.motion),
+                action=actions,
+                start=np.full(n, self.start_step, np.int64),
+                events={name: np.asarray(steps, np.int64) for name, steps in episodes.events.items()},
+                others=None if episodes.others is None else np.asarray(episodes.others),
+            ),
         )
-        return Results(
-            planner=self.planner.name,
-            traffic=self.simulator.traffic.name,
-            seed=self.seed,
-            scenarios=names,
-            metrics=with_crashes(metrics, episodes.crashed >= 0),
-            events={name: np.asarray(steps) for name, steps in episodes.events.items()},
-            motion=np.asarray(episodes.motion),
-            actions=actions,
-            others=None if episodes.others is None else np.asarray(episodes.others),
-            start=self.start_step,
-            offroad_steps=np.asarray(episodes.offroad_steps),
-            own={name: metric for name, metric in self.metrics.items() if name not in METRICS},
-            crashes=crashes,
-        )
-
-    def _refuse_nan(self, episodes: Episodes, names: Sequence[Mapping[str, str]]) -> None:
-        """The planner gave numbers and yet ego is nowhere: no episode, but a defect."""
-        broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
-        if broken.size:
-            raise DrivaxError(
-                f"ego's motion is not finite in {broken.size} scenarios",
-                record=names[int(broken[0])]["scenario_id"],
-                cure="check the action space and the traffic",
-            )
 
 
 @partial(jax.jit, static_argnames="seed")
-def _side_by_side(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[ScenarioBank, Array]:
+def _batch(bank: ScenarioBank, rows: Int[Array, " W"], seed: int) -> tuple[ScenarioBank, Array]:
     """These rows of a bank as a bank of their own, and their keys."""
-    some = bank.part(rows)
-    return some, episode_keys(some, jnp.arange(len(rows)), seed)
+    batch = bank.part(rows)
+    return batch, episode_keys(batch, jnp.arange(len(rows)), seed)
 
 
-def _joined(parts: Sequence[Episodes]) -> Episodes:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+def _joined(batches: Sequence[Episodes]) -> Episodes:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *batches)
 
 
-def _on(progress: Progress | None, first: int, total: int) -> Progress | None:
-    """Progress over a part of all, as progress over all."""
-    return None if progress is None else lambda done, _: progress(first + done, total)
-
-
-def _refuse_without_future(names: Sequence[Mapping[str, str]], without: Sequence[bool] | Any) -> None:
-    short = [row["scenario_id"] for row, cut in zip(names, without, strict=True) if cut]
+def _check_future(names: Names, no_future: Sequence[bool] | Any) -> None:
+    short = [row["scenario_id"] for row, missing in zip(names, no_future, strict=True) if missing]
     if short:
         raise DataError(
-            f"has no logged future (a short log or a test split), as {len(short)} of {len(names)} scenarios",
+            f"no logged future (a short log or a test split) in {len(short)} of {len(names)} scenarios",
             record=short[0],
             cure="leave them out with --filter flag!=NO_FUTURE",
+        )
+
+
+def _check_present(names: Names, present: Sequence[bool] | Any, start_step: int) -> None:
+    absent = [row["scenario_id"] for row, valid in zip(names, present, strict=True) if not valid]
+    if absent:
+        cure = "start at another step"
+        if len(absent) <= _NAMED:
+            cure += f", or leave them out: --filter 'scenario_id!={'|'.join(absent)}'"
+        raise UsageError(
+            f"ego is not in the log at step {start_step} in {len(absent)} of {len(names)} scenarios",
+            record=absent[0],
+            cure=cure,
+        )
+
+
+def _check_finite(episodes: Episodes, names: Names) -> None:
+    """Refuse motion that is not finite although all actions were: a defect of action space or traffic."""
+    broken = np.flatnonzero(~np.isfinite(episodes.motion).all(axis=(1, 2)))
+    if broken.size:
+        raise DrivaxError(
+            f"ego's motion is not finite in {broken.size} scenarios",
+            record=names[int(broken[0])]["scenario_id"],
+            cure="check the action space and the traffic",
         )

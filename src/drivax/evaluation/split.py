@@ -1,4 +1,4 @@
-"""Scenarios in two arms, one for each planner of a comparison: at random, or alike in the kinds of scenario."""
+"""Split scenarios into two arms, one for each planner of a comparison, at random or stratified."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ def assign(clusters: Sequence[str], strata: Sequence[str] | None, ratio: float, 
     of = np.zeros(count, np.int64)
     if strata is not None:
         of = stratum_of_clusters(_most_frequent(labels, strata), labels, LEAST)
-    rng, first, seen, given = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
+    rng, first, seen, assigned = np.random.default_rng(seed), np.zeros(count, bool), 0, 0
     for stratum in range(int(of.max()) + 1):
         inside = rng.permutation(np.flatnonzero(of == stratum))
         seen += inside.size
-        wanted = round(ratio * seen) - given
-        first[inside[:wanted]] = True
-        given += wanted
+        count_here = round(ratio * seen) - assigned
+        first[inside[:count_here]] = True
+        assigned += count_here
     if not first.any() or first.all():
         raise UsageError(
             f"{count} recordings at a ratio of {ratio} leave an arm empty",
@@ -92,5 +92,5 @@ def _most_frequent(labels: Int64[np.ndarray, " n"], strata: Sequence[str]) -> li
     votes: dict[int, Counter[str]] = {}
     for label, stratum in zip(labels, strata, strict=True):
         votes.setdefault(int(label), Counter())[stratum] += 1
-    winner = {label: min(found, key=lambda name: (-found[name], name)) for label, found in votes.items()}
+    winner = {label: min(counts, key=lambda name: (-counts[name], name)) for label, counts in votes.items()}
     return [winner[int(label)] for label in labels]

@@ -11,8 +11,15 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.results import ADDED, NOT_SUMMARISED, RATES, Results, interval_of
-from drivax.evaluation.stored import EpisodeTable, Pairs, ScenarioKey, mismatch
+from drivax.evaluation.episode_table import (
+    ADDED,
+    NOT_SUMMARISED,
+    RATES,
+    EpisodeTable,
+    ScenarioKey,
+    interval_of,
+)
+from drivax.evaluation.pairing import Pairs, mismatch
 from drivax.metrics.catalogue import METRICS
 from drivax.metrics.catalogue import headline as headline_metrics
 from drivax.scenario.select.tags import TAGS
@@ -121,16 +128,15 @@ def paired_difference(run: EpisodeTable, other: EpisodeTable, metric: str) -> In
     return paired_bootstrap(values, others, pairs.clusters, CONFIDENCE, seed=SEED)
 
 
-def paired_differences(results: Results, other: Results, metric: str) -> Interval:
+def paired_differences(results: EpisodeTable, other: EpisodeTable, metric: str) -> Interval:
     """Return :func:`paired_difference` of two evaluations in memory.
 
     Raises:
         UsageError: If their scenarios differ.
     """
-    tables = EpisodeTable.of(results), EpisodeTable.of(other)
-    if len({frozenset(table.scenarios) for table in tables}) > 1:
+    if set(results.scenarios) != set(other.scenarios):
         raise UsageError("the scenarios of the evaluations differ", cure="evaluate both on one set")
-    return paired_difference(*tables, metric)
+    return paired_difference(results, other, metric)
 
 
 @dataclass(frozen=True)
@@ -170,7 +176,7 @@ def planners_table(runs: Sequence[EpisodeTable], metrics: Sequence[str]) -> Tabl
     best = [_best(column, metric_label(name, runs)) for name, column in zip(metrics, columns, strict=True)]
     rows = []
     for place, run in enumerate(runs):
-        label = Cell(run.name, note=f"{run.episodes} episodes, {run.traffic} traffic")
+        label = Cell(run.name, note=f"{len(run)} episodes, {run.traffic} traffic")
         cells = [
             _cell(runs, name, column[place], {"run": run.name, "metric": name}, top)
             for name, column, top in zip(metrics, columns, best, strict=True)
@@ -319,7 +325,7 @@ def set_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
 
 
 def _trained_on(run: EpisodeTable) -> Sequence[Mapping[str, Any]]:
-    return run.about.get("trained_on") or ()
+    return run.info.get("trained_on") or ()
 
 
 def set_key(entry: Mapping[str, Any]) -> str:
@@ -334,12 +340,12 @@ def _set_name(entry: Mapping[str, Any]) -> str:
 
 def _planner_key(run: EpisodeTable) -> str:
     """Return the planner as the command named it, or else its own name."""
-    return str(run.settings.get("planner") or run.about.get("planner", run.name))
+    return str(run.settings.get("planner") or run.planner)
 
 
 def _planner_names(runs: Sequence[EpisodeTable]) -> dict[str, str]:
     """Return a name for each planner by its key: its own, or the shortest end of its path that is unique."""
-    own = {_planner_key(run): str(run.about.get("planner", run.name)) for run in runs}
+    own = {_planner_key(run): run.planner for run in runs}
     named = {}
     for key, name in own.items():
         paths = [Path(other).parts for other in own if other != key and own[other] == name]

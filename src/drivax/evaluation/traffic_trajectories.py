@@ -30,5 +30,5 @@ def unpacked(
     rows: Int16[np.ndarray[Any, Any], "*batch A 3"],
 ) -> Float32[np.ndarray[Any, Any], "*batch A 3"]:
     """Place (m) and heading (rad), NaN where absent."""
-    found = rows * np.array([_METRES, _METRES, _RADIANS], np.float32)
-    return np.where(rows == _ABSENT, np.nan, found).astype(np.float32)
+    poses = rows * np.array([_METRES, _METRES, _RADIANS], np.float32)
+    return np.where(rows == _ABSENT, np.nan, poses).astype(np.float32)

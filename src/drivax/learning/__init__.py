@@ -1,1 +1,5 @@
-"""One training loop; per algorithm a configuration and an update."""
+"""Training of policies: algorithms, their environment, the training loop, and trained policies."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

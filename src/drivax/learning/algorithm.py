@@ -1,37 +1,37 @@
-"""What an algorithm is to the training loop, so that one of the user's own takes its place beside PPO."""
+"""Protocols of algorithms: what the training loop needs of a built-in algorithm or of one of your own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array
 
 from drivax.errors import UsageError
-from drivax.learning.environment import Environment
+from drivax.learning.environment import Environment, Environments, Outcome, Rollout, SampledAction
 from drivax.planners.planner import Planner
 
-#: A further loss of a policy: from its parameters and a key to the loss, and what to log of it.
-Also = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
+#: An additional loss of a policy: from its parameters and a key to the loss, and values to log.
+AuxiliaryLoss = Callable[[Any, Array], tuple[Array, dict[str, Array]]]
 
 
 @runtime_checkable
 class LearnerState(Protocol):
-    """A pytree with all that a run needs to continue; a frozen ``scenario.record.record``, so that it has names.
+    """A pytree with all that a run needs to continue: a frozen ``scenario.record.record``, so that leaves have names.
 
-    A class attribute ``networks`` names the fields that a run which begins from another one takes over (only
-    ``parameters`` where there is none); one of them may be such a state itself.
+    A class attribute ``networks`` names the fields that fine-tuning takes over from another run (without it only
+    ``parameters``); a field may be such a state itself.
     """
 
     @property
     def parameters(self) -> Any:
-        """What the planner is made of; an evaluation restores nothing else."""
+        """Parameters of the planner; an evaluation restores nothing else."""
         ...
 
     @property
     def iteration(self) -> Array:
-        """Iterations done, an integer."""
+        """Number of finished iterations."""
         ...
 
 
@@ -39,30 +39,53 @@ class LearnerState(Protocol):
 class Learner(Protocol):
     """An algorithm in one environment. Holds configuration; everything computed is in the state.
 
-    One that learns from data alone and divides its batches among devices (``devices.divided``) has their size as
-    ``batch``.
+    A learner that divides its batches among devices (``program.divided``) has their size as attribute ``batch``.
     """
 
     def init(self, data: Any, key: Array) -> Any:
-        """The state (:class:`LearnerState`) before the first iteration. Pure."""
+        """Return the first state (:class:`LearnerState`). Pure."""
         ...
 
     def iterate(self, data: Any, state: Any) -> tuple[Any, dict[str, Array]]:
-        """The state after one iteration, and numbers to log by name.
+        """Return the state after one iteration, and values to log by name.
 
-        Pure; compiled with the state donated. Names are logged as they are, but for the sums that
-        ``collector.collect`` returns: passed on as ``rollout/<name>``, they are logged as means.
+        Pure; compiled with the state donated. Sums of ``environment.collect``, passed on as ``rollout/<name>``, are
+        logged as means; other names are logged as they are.
         """
         ...
 
     def planner(self, parameters: Any, name: str, samples: bool) -> Planner:
-        """The driver that these parameters make; it samples its actions, or acts by the mode."""
+        """Return the planner with these parameters; it samples its actions or takes the mode."""
+        ...
+
+
+@runtime_checkable
+class Agent(Learner, Protocol):
+    """A learner that interacts with its environment, in parts for a training loop of your own.
+
+    ``iterate`` is a rollout of :meth:`sample_action` followed by ``update``. Off-policy agents also have a ``buffer``:
+    add the rollout to ``state.replay`` with ``buffer.add``, then call ``update(data, state)``. On-policy agents take
+    the rollout: ``update(data, state, rollout)``.
+    """
+
+    environment: Any
+
+    def rollout_key(self, state: Any) -> Array:
+        """Return the random key of the next rollout."""
+        ...
+
+    def sample_action(self, state: Any, observation: Mapping[str, Array], key: Array) -> SampledAction:
+        """Sample exploratory actions for a batch of observations."""
+        ...
+
+    def transition(self, now: Environments, sampled: SampledAction, outcome: Outcome) -> Rollout:
+        """Return one row of a rollout, with what this agent learns from."""
         ...
 
 
 @runtime_checkable
 class AlgorithmConfig(Protocol):
-    """Settings of an algorithm; own ones are frozen dataclasses, named in YAML as ``kind: package.module:Name``."""
+    """Settings of an algorithm; your own are frozen dataclasses, named in YAML as ``kind: package.module:Name``."""
 
     @property
     def steps_per_iteration(self) -> int:
@@ -70,47 +93,47 @@ class AlgorithmConfig(Protocol):
         ...
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Learner:
-        """The learner; of the data only shapes may be looked at, ``iterations`` is the length of the whole run."""
+        """Return the learner of a run of ``iterations``; reads only shapes of the data."""
         ...
 
 
 @runtime_checkable
-class LearnsFromRecords(Protocol):
-    """Settings of an algorithm that learns from recorded steps: what its learner is given is prepared once."""
+class OfflineAlgorithm(Protocol):
+    """Settings of an algorithm that learns from logged steps, which are prepared once before training."""
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Any:
-        """The ``data`` of :meth:`Learner.iterate`, made of the environment's, with steps drawn by these weights."""
+        """Return the ``data`` of :meth:`Learner.iterate`: the environment's data, with steps drawn by weight."""
         ...
 
 
 @runtime_checkable
-class Judges(Protocol):
-    """A learner that has something to say of held-out data, beside how its policy drives there."""
+class HeldOutMetrics(Protocol):
+    """A learner that computes metrics on held-out data in addition to driving there."""
 
-    def judge(self, data: Any, state: Any) -> dict[str, float]:
-        """Numbers to log as ``validation/<name>``; ``data`` are :func:`training_data` of what is held out."""
+    def held_out_metrics(self, data: Any, state: Any) -> dict[str, float]:
+        """Return values to log as ``validation/<name>``; ``data`` is :func:`training_data` of the held-out set."""
         ...
 
 
 def training_data(
     config: AlgorithmConfig, environment: Environment, data: Any, weights: np.ndarray | None = None
 ) -> Any:
-    """What a learner's iterations are given: the environment's data, or what the algorithm makes of them.
+    """Return the data of a learner's iterations: the environment's, or the logged experience in them.
 
     Args:
         config: The algorithm.
         environment: What it learns in.
         data: The environment's data.
-        weights: ``[N, T]`` of every recorded step, at least 0; None: all alike.
+        weights: ``[N, T]`` of every logged step, at least 0; None: uniform.
 
     Raises:
-        UsageError: There are weights, but the algorithm learns from what it drives itself.
+        UsageError: There are weights, but the algorithm is not offline.
     """
-    if isinstance(config, LearnsFromRecords):
+    if isinstance(config, OfflineAlgorithm):
         return config.experience(environment, data, weights)
     if weights is not None:
         raise UsageError(
-            f"{type(config).__name__} learns from no recorded steps that weights could choose",
+            f"{type(config).__name__} does not learn from logged steps, so weights have no effect",
             cure="leave out the weights, or use bc, cql, iql or td3_bc",
         )
     return data

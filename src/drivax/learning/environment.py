@@ -1,13 +1,18 @@
-"""What an algorithm acts in: driving (``learning.driving``), or a control task whose known results judge the algorithm.
+"""The environment protocol, and rollouts of a batch of environments that reset themselves.
 
-An environment is configuration only; its data (for driving the scenario bank) is an argument of everything, and all
-functions but :meth:`Environment.observe` act on a batch.
+``learning.driving`` implements it for scenarios; a control task with known results can take its place. An environment
+is configuration only: its data (for driving the scenario bank) is an argument of every function, and all functions but
+:meth:`Environment.observe` act on a batch.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float
 
 from drivax.scenario.record import record
@@ -15,13 +20,13 @@ from drivax.scenario.record import record
 
 @record
 class Environments:
-    """A batch of environments between two collections.
+    """A batch of environments between two rollouts.
 
     Attributes:
-        state: Their states.
-        over: Whether each one's episode has ended; the next step begins a new one.
-        observation: What each one's policy sees now.
-        environment_axis: The axis that counts environments; several devices divide it among them.
+        state: State of each environment.
+        over: Whether the episode has ended; the next step resets the environment.
+        observation: Current observation of each environment.
+        environment_axis: The axis that counts environments, which several devices divide.
     """
 
     environment_axis: ClassVar[int] = 0
@@ -33,75 +38,168 @@ class Environments:
 
 @record
 class Outcome:
-    """What one step of a batch came to. Where an environment was over, all but ``looked`` means nothing.
+    """Result of one step of a batch. Where an environment was over, only ``cache`` is meaningful.
 
     Attributes:
-        reward: The rewards.
-        terminated: The episode ended for good: bootstrap zero.
-        truncated: It was cut off: bootstrap the value of the state that the step led to.
-        looked: :meth:`Environment.look` of the state that the step led to.
-        totals: Sums over the batch to log, ``"<name>"`` with ``"<name>/n"``, the number that it is a sum of, or
-            ``"reward/<name>"`` over steps; nothing of environments that were over is in them.
+        reward: Rewards.
+        terminated: Episode ended for good: bootstrap zero.
+        truncated: Episode was cut off: bootstrap the value of the state that the step led to.
+        cache: :meth:`Environment.cache` of the new state.
+        totals: Sums over the batch to log: ``"<name>"`` with its count ``"<name>/n"``, or ``"reward/<name>"`` over
+            steps. Environments that were over are left out.
     """
 
     reward: Float[Array, " B"]
     terminated: Bool[Array, " B"]
     truncated: Bool[Array, " B"]
-    looked: Any
+    cache: Any
     totals: dict[str, Array]
 
 
 @runtime_checkable
 class Environment(Protocol):
-    """Something to act in."""
+    """What an algorithm acts in."""
 
     @property
     def action_size(self) -> int:
-        """Numbers in an action; each lies in [-1, 1]."""
+        """Size of an action; each number lies in [-1, 1]."""
         ...
 
     @property
     def levels(self) -> tuple[tuple[float, ...], ...] | None:
-        """The values that each number of an action can have, ascending; None where any will do."""
+        """Ascending values that each number of an action can take; None if actions are continuous."""
         ...
 
     def shapes(self, data: Any) -> dict[str, tuple[int, ...]]:
-        """Shapes of one observation by group; of the data only shapes are looked at."""
+        """Shapes of one observation by group; reads only shapes of the data."""
         ...
 
     def start(self, data: Any, key: Array, count: int) -> Environments:
-        """So many environments, at staggered points of their episodes, so that their ends are staggered too."""
+        """Reset ``count`` environments to staggered steps, so that their episodes end at different times."""
         ...
 
     def stored(self, state: Any) -> Any:
-        """What replay stores of states: as little as an observation can be made of."""
+        """Return what the replay buffer stores of states: the least that an observation can be made of."""
         ...
 
     def observe(self, data: Any, stored: Any) -> dict[str, Array]:
-        """The observation of one stored state (not of a batch)."""
+        """Observe one stored state (not a batch)."""
         ...
 
     def observe_all(self, data: Any, stored: Any) -> dict[str, Array]:
-        """The observations of a batch of stored states."""
+        """Observe a batch of stored states."""
         ...
 
-    def look(self, data: Any, state: Any) -> Any:
-        """What steps look at beside states, and what the next one can use again: passed on, never stored."""
+    def cache(self, data: Any, state: Any) -> Any:
+        """Return what a step computes from states and the next step can reuse; never stored."""
         ...
 
     def step(
-        self, data: Any, now: Environments, looked: Any, action: Float[Array, "B D"], key: Array
+        self, data: Any, now: Environments, cache: Any, action: Float[Array, "B D"], key: Array
     ) -> tuple[Environments, Outcome]:
-        """One step of every environment.
+        """Step every environment, or reset it where its episode is over.
 
-        One that is over begins its next episode instead: it pays with a step, and in exchange nothing is measured or
-        observed twice, and every state that a policy sees, final ones included, is seen once.
-
-        Args:
-            data: The data.
-            now: The environments.
-            looked: :meth:`look` of their states.
-            action: What each does if its episode goes on.
-            key: For whatever is drawn.
+        A reset takes a step of its own, so every state that the policy sees, final states included, is observed once.
         """
         ...
+
+
+@record
+class Rollout:
+    """Experience ``[time, batch]``. ``alive`` is false for steps that only reset an environment; mask them out.
+
+    The row after row t holds what row t led to, final states included; the last row led to the environments' current
+    state. Of ``observation`` and ``state`` (what the replay buffer stores) one is kept, the other is None.
+    """
+
+    observation: dict[str, Array] | None
+    state: Any
+    raw_action: Float[Array, "*time batch D"]
+    extra: dict[str, Array]
+    reward: Float[Array, "*time batch"]
+    terminated: Bool[Array, "*time batch"]
+    truncated: Bool[Array, "*time batch"]
+    alive: Bool[Array, "*time batch"]
+
+
+class SampledAction(NamedTuple):
+    """What a policy samples from its distribution, the action in [-1, 1] that it stands for, and extras to store."""
+
+    raw_action: Array
+    action: Array
+    extra: dict[str, Array]
+
+
+#: From observations and a key to (raw action, action in [-1, 1], extras to store).
+Actor = Callable[[Mapping[str, Array], Array], tuple[Array, Array, dict[str, Array]]]
+#: Whether a rollout keeps observations, or states that observations can be made of again.
+Store = Literal["state", "observation"]
+
+
+def transition(
+    environment: Environment,
+    now: Environments,
+    sampled: tuple[Array, Array, dict[str, Array]],
+    outcome: Outcome,
+    keep: Store = "observation",
+) -> Rollout:
+    """Return one row of a rollout: the environments before the step, the sampled actions, and the outcome."""
+    raw_action, _, extra = sampled
+    return Rollout(
+        observation=now.observation if keep == "observation" else None,
+        state=environment.stored(now.state) if keep == "state" else None,
+        raw_action=raw_action,
+        extra=extra,
+        reward=jnp.where(now.over, 0.0, outcome.reward),
+        terminated=outcome.terminated,
+        truncated=outcome.truncated,
+        alive=~now.over,
+    )
+
+
+def collect(
+    environment: Environment,
+    data: Any,
+    environments: Environments,
+    actor: Actor,
+    key: Array,
+    steps: int,
+    keep: Store = "observation",
+) -> tuple[Environments, Rollout, dict[str, Array]]:
+    """Unroll ``steps`` steps in every environment.
+
+    Returns:
+        The environments afterwards, the rollout, and sums to log: ``Outcome.totals``, the ``episodes`` that ended, and
+        the ``steps`` that were alive.
+    """
+
+    def step(carry: tuple[Environments, Any, Array], _: None) -> tuple[Any, Any]:
+        now, cache, key = carry
+        key, act_key, step_key = jax.random.split(key, 3)
+        sampled = actor(now.observation, act_key)
+        after, outcome = environment.step(data, now, cache, sampled[1], step_key)
+        row = transition(environment, now, sampled, outcome, keep)
+        counts = {"episodes": after.over.sum(), "steps": row.alive.sum()}
+        totals = outcome.totals | {name: count.astype(jnp.float32) for name, count in counts.items()}
+        return (after, outcome.cache, key), (row, totals)
+
+    first = (environments, environment.cache(data, environments.state), key)
+    (environments, _, _), (rollout, totals) = jax.lax.scan(step, first, None, steps)
+    return environments, rollout, jax.tree.map(lambda leaf: leaf.sum(axis=0), totals)
+
+
+@custom_vmap
+def in_any(condition: Bool[Array, "*batch"]) -> Bool[Array, ""]:
+    """Whether a condition holds anywhere: in the batch, and under ``vmap`` in any learner.
+
+    ``jax.lax.cond`` on one condition per learner computes both branches; on this single condition it branches. Learners
+    that train side by side are in the same iteration, so phases of a run lose nothing by it.
+    """
+    return condition.any()
+
+
+@in_any.def_vmap
+def _in_any_learner(
+    axis_size: int, in_batched: Any, condition: Bool[Array, "*batch"]
+) -> tuple[Bool[Array, ""], bool]:
+    return in_any(condition.reshape(-1)), False

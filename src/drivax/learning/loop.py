@@ -1,11 +1,12 @@
-"""The training loop: iterate on the device, log, validate, checkpoint, stop, resume."""
+"""The training loop: iterate on the device, log, validate, write checkpoints, stop, resume."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,39 @@ import jax
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.learning.algorithm import Judges, LearnerState, training_data
+from drivax.learning.algorithm import Agent, HeldOutMetrics, Learner, LearnerState, training_data
 from drivax.learning.config import TrainConfig
+from drivax.learning.driving import Driving
 from drivax.learning.experience import WeightedSet
-from drivax.learning.first_state import first_state, inherited, with_step
-from drivax.learning.folders import create_folders, facts, resumed_folders
-from drivax.learning.policy_traffic import find_traffic
-from drivax.learning.program import Agents, Program
-from drivax.learning.training_log import Journal, Preempted, StopSignal
-from drivax.learning.validation import Validation, validate
+from drivax.learning.policies import find_traffic
+from drivax.learning.pretrained import Pretrained, first_state, pretrained_networks, with_step
+from drivax.learning.program import Program, Seeds
+from drivax.learning.training_log import Preempted, StopSignal, TrainingLog, Validation, validate
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.tracking.progress import Progress
-from drivax.tracking.run_folder import RunFolder, refuse_existing
+from drivax.tracking.run_folder import RunFolder, seed_folders
+
+
+def make_agent(config: TrainConfig, bank: ScenarioBank) -> Any:
+    """Return the :class:`Agent` that ``drivax train`` trains, in parts for a training loop of your own.
+
+    Args:
+        config: Task, algorithm, traffic and starts.
+        bank: Scenarios to train on, prepared for reactive traffic (``simulator.traffic.bank_data.prepare_bank``); only
+            shapes are read.
+
+    Raises:
+        UsageError: The algorithm does not interact with an environment (bc, cql, iql, td3_bc).
+    """
+    learner = _learner(config, config.environment(find_traffic(config.traffic)), bank)
+    if not isinstance(learner, Agent):
+        raise UsageError(
+            f"{type(config.algorithm).__name__} has no parts for a loop of your own",
+            cure="use ppo or sac, or drivax.train",
+        )
+    return learner
 
 
 def train(
@@ -38,191 +58,79 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     seeds: int = 1,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> RunFolder:
-    """Trains a policy and writes the run folder: config, metrics, checkpoints of the full state.
+    """Train a policy and write the run folder: configuration, metrics, checkpoints of the full state.
 
     Args:
-        config: What to train.
-        data: Scenarios to train on; all of them are held on the device. Offline algorithms draw their recorded steps
-            by weight where they are a :class:`WeightedSet`, otherwise all that can be learned from alike.
+        config: Settings of the training.
+        data: Scenarios to train on, all held on the device. Offline algorithms draw logged steps by weight from a
+            :class:`WeightedSet`, otherwise uniformly.
         out: Run folder.
-        validation: Scenarios that choose the best checkpoint.
-        resume: Continue the run in ``out`` from its newest checkpoint, bit for bit on one CPU device; with the
-            configuration and the seeds that it began with.
+        validation: Scenarios that rank checkpoints.
+        resume: Continue the run in ``out`` from its newest checkpoint, with its own configuration and seeds.
         overwrite: Replace an existing run folder.
-        seeds: How many agents to train in one program, with ``config.seed`` and the following ones; of several each
-            has a run folder of its own inside ``out``: ``seed-0``, ``seed-1``, ...
-        say: Called with a line about memory, one about networks of another run, and one when an agent stops early.
+        seeds: Number of seeds to train in one program, from ``config.seed`` on; several have a run folder each inside
+            ``out``: ``seed-0``, ``seed-1``, ...
+        log: Called with lines about memory, pretrained networks, and seeds that stop early.
 
     Raises:
-        UsageError: If ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on
-            other data or with other weights, weights do not fit the data or the algorithm, or it does not fit the
-            device's memory.
-        DataError: What it is to begin from is no training run, or its networks do not fit.
-        Preempted: If SIGTERM stopped it, after a checkpoint.
+        UsageError: ``out`` exists and neither ``resume`` nor ``overwrite`` is given, a resumed run was trained on other
+            data or with other weights, weights do not fit the data or the algorithm, or memory is too small.
+        DataError: The run to fine-tune is no training run, or its networks do not fit.
+        Preempted: SIGTERM stopped it, after a checkpoint.
     """
     data, weights = (data.scenarios, data.weights) if isinstance(data, WeightedSet) else (data, None)
     out = Path(out)
     folders: list[RunFolder] = []
     if resume:
-        config, folders = resumed_folders(data, validation, weights, out, seeds)
+        config, folders = _resumed_folders(data, validation, weights, out, seeds)
     else:
-        refuse_existing(out, overwrite, "training")
+        RunFolder.check(out, overwrite, "training")
         config = with_step(config)
-    _refuse(config, validation, seeds)
-    numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
-    environment = config.environment()
-    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    _check(config, validation, seeds)
+    environment, bank = _environment(config, data)
+    learner = _learner(config, environment, bank)
     held_out = None if validation is None else Validation.of(validation)
-    recorded = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
-    learner = config.algorithm.build(environment, bank, config.iterations)
+    held_out_data = None if held_out is None else training_data(config.algorithm, environment, held_out.bank)
+    numbers = tuple(config.seed + number for number in range(len(folders) or seeds))
     experience = training_data(config.algorithm, environment, bank, weights)
-    program = Program(Agents(learner, numbers), experience, config.devices)
-    _account(program, held_out, say)
+    program = Program(Seeds(learner, numbers), experience, config.devices)
+    memory = program.account(None if held_out is None else held_out.bank)
+    memory.check()
+    log(memory.text())
     # Before any folder is made: they may not fit.
-    networks = None if resume else inherited(config.begin_from, program, say)
-    folders = folders or create_folders(
-        config, data, out, numbers, overwrite, facts(config, validation, weights)
-    )
+    networks = None if resume else pretrained_networks(config.begin_from, program, log)
+    folders = folders or _create_folders(config, data, validation, weights, out, numbers, overwrite)
     with contextlib.ExitStack() as stack:
-        journals = [stack.enter_context(Journal(folder, config)) for folder in folders]
-        _learn(_Run(config, program, journals, held_out, recorded, networks, say))
+        rules = (config.checkpoint_rule, config.keep, config.patience)
+        logs = [stack.enter_context(TrainingLog(folder, *rules)) for folder in folders]
+        _learn(_Run(config, program, logs, held_out, held_out_data, networks, log))
     return RunFolder.open(out)
 
 
 def usable_steps(config: TrainConfig, data: ScenarioSet) -> np.ndarray:
-    """Which recorded steps, ``[N, T]``, a training by weight would learn from.
-
-    Weights have to be made for these: to have a mean of 1, say, or an effective size, over what is drawn.
+    """Return which logged steps ``[N, T]`` an offline training draws from, for weights to be normalised over.
 
     Raises:
-        UsageError: The algorithm learns from no recorded steps.
+        UsageError: The algorithm does not learn from logged steps.
     """
-    environment = config.environment()
-    bank = prepared(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+    environment, bank = _environment(config, data)
     experience = training_data(config.algorithm, environment, bank, np.ones((len(data), bank.steps)))
     return np.asarray(experience.usable)
 
 
-def _refuse(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:
-    """Refuses what cannot be meant, before the long work."""
-    if config.patience and validation is None:
-        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
-    if seeds < 1:
-        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+def hashes(validation: ScenarioSet | None, weights: np.ndarray | None) -> dict[str, str | None]:
+    """Return hashes of the validation set and of the weights, for ``run.json``."""
+    digest = None if weights is None else hashlib.sha256(np.asarray(weights, "<f8").tobytes()).hexdigest()
+    return {"validation": None if validation is None else validation.hash, "weights": digest}
 
 
-def _account(program: Program, held_out: Validation | None, say: Callable[[str], None]) -> None:
-    memory = program.account(None if held_out is None else held_out.bank)
-    memory.refuse_too_much()
-    say(memory.text())
+def mean_logs(raw: Mapping[str, Any]) -> dict[str, float]:
+    """Return the means to log, given the values of an iteration.
 
-
-@dataclass(frozen=True)
-class _Run:
-    config: TrainConfig
-    program: Program
-    journals: Sequence[Journal]
-    validation: Validation | None
-    held_out: Any
-    #: Of the run that it begins from; None: not looked for, since a resumed run rarely begins.
-    networks: Mapping[str, Any] | None
-    say: Callable[[str], None]
-
-    def steps(self, iteration: int) -> int:
-        """Environment steps of each agent after so many iterations."""
-        return iteration * self.config.algorithm.steps_per_iteration
-
-
-def _learn(run: _Run) -> None:
-    """All iterations that are left."""
-    config, program = run.config, run.program
-    begin, state = _begin(run)
-    with Progress("training", "steps", run.steps(config.iterations)) as progress, StopSignal() as stop:
-        progress.update(run.steps(begin))
-        for iteration in range(begin + 1, config.iterations + 1):
-            if all(journal.over for journal in run.journals):
-                break
-            began = time.perf_counter()
-            state, raw = program.step(state)
-            logs = jax.device_get(raw)
-            rate = config.algorithm.steps_per_iteration / (time.perf_counter() - began)
-            # Asked once, so that every agent has a checkpoint of the same iteration.
-            stops = stop.asked and iteration < config.iterations
-            rows = [
-                logged(program.agents.one(logs, number)) | {"steps_per_second": rate}
-                for number in range(len(run.journals))
-            ]
-            _record(run, iteration, state, rows, stops)
-            seen = [row["rollout/success"] for row in rows if "rollout/success" in row]
-            progress.update(run.steps(iteration), f"success {sum(seen) / len(seen):.2f}" if seen else "")
-            if stops:
-                raise Preempted(
-                    f"SIGTERM stopped the training after {run.steps(iteration):,} steps",
-                    cure="continue it with --resume",
-                )
-
-
-def _begin(run: _Run) -> tuple[int, Any]:
-    """Iterations done and the state after them: none, or where the newest checkpoint that all agents have is."""
-    program, journals = run.program, run.journals
-    learning = [set(journal.checkpoints.steps()) for journal in journals if not journal.over]
-    if not learning:
-        return run.config.iterations, None
-    step = max(set.intersection(*learning), default=None)
-    if step is None:
-        for journal in journals:
-            journal.begin(None)
-        networks = run.networks
-        if networks is None:
-            networks = inherited(run.config.begin_from, program, run.say)
-        return 0, first_state(program, networks)
-    template = program.agents.shapes_of_one(program.shapes)
-    states = []
-    for journal in journals:
-        # An agent that has stopped early stays where it was; its part of the program runs on for nobody.
-        at = journal.newest if journal.over else step
-        journal.begin(at)
-        states.append(journal.checkpoints.restore(template, at))
-    return step // run.config.algorithm.steps_per_iteration, program.state_of(states)
-
-
-def _record(
-    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], stops: bool
-) -> None:
-    """Writes what one iteration came to of every agent that still learns."""
-    config, agents, done = run.config, run.program.agents, run.steps(iteration)
-    last = iteration == config.iterations
-    due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
-    for number, journal in enumerate(run.journals):
-        if journal.over:
-            continue
-        row = rows[number]
-        if due and run.validation is not None:
-            # The other devices of a run have no part in driving.
-            parameters = jax.device_put(agents.one(state.parameters, number), run.program.devices[0])
-            planner = agents.learner.planner(parameters, "policy", samples=False)
-            row |= validate(planner, run.validation, config.task, find_traffic(config.traffic))
-            if isinstance(agents.learner, Judges):
-                one = jax.device_put(agents.one(state, number), run.program.devices[0])
-                judged = agents.learner.judge(run.held_out, one)
-                row |= {f"validation/{name}": value for name, value in judged.items()}
-        found = journal.write(done, row)
-        if last or due or stops or iteration % config.checkpoint_every == 0:
-            journal.save(done, agents.one(state, number), found)
-        if journal.over and not last:
-            run.say(
-                f"seed {agents.seeds[number]}: no better for {config.patience} validations, stopped at {done:,} steps"
-            )
-
-
-def logged(raw: Mapping[str, Any]) -> dict[str, float]:
-    """Means to log from the numbers of an iteration.
-
-    A name with ``<name>/n`` beside it is a sum over so many (episodes that define a metric, updates): its mean is
-    logged, and nothing where there were none. Sums of ``rollout/reward/*`` are over the steps. What else there is
-    is logged as it is.
+    A name with a count ``<name>/n`` is a sum: its mean is logged, and nothing if the count is 0. Sums of
+    ``rollout/reward/*`` are over steps. All else is logged as it is.
     """
     values = {name: float(value) for name, value in raw.items() if not name.endswith("/n")}
     steps = values.pop("rollout/steps", 0.0)
@@ -234,4 +142,173 @@ def logged(raw: Mapping[str, Any]) -> dict[str, float]:
             count = float(raw.get(f"{name}/n", 1.0))
         if count > 0:
             row[name] = value / count
+    return row
+
+
+def _check(config: TrainConfig, validation: ScenarioSet | None, seeds: int) -> None:
+    """Raise UsageError for impossible settings before any work is done."""
+    if config.patience and validation is None:
+        raise UsageError("patience needs scenarios to validate on", cure="pass --validation SET")
+    if seeds < 1:
+        raise UsageError(f"{seeds} seeds", cure="use 1 or more")
+
+
+def _learner(config: TrainConfig, environment: Driving, bank: ScenarioBank) -> Learner:
+    return config.algorithm.build(environment, bank, config.iterations)
+
+
+def _environment(config: TrainConfig, data: ScenarioSet) -> tuple[Driving, ScenarioBank]:
+    """Environment of a training, and its bank."""
+    environment = config.environment(find_traffic(config.traffic))
+    return environment, prepare_bank(environment.simulator.traffic, ScenarioBank.from_scenarios(data))
+
+
+def _create_folders(
+    config: TrainConfig,
+    data: ScenarioSet,
+    validation: ScenarioSet | None,
+    weights: np.ndarray | None,
+    out: Path,
+    seeds: tuple[int, ...],
+    overwrite: bool,
+) -> list[RunFolder]:
+    """Create the run folder of each seed: ``out``, or for several ``out/seed-<seed>``."""
+    notes: dict[str, Any] = hashes(validation, weights)
+    if config.begin_from is not None:
+        notes["networks_from"] = Pretrained.of(config.begin_from).notes()
+    if len(seeds) == 1:
+        return [RunFolder.create(out, config, [data], overwrite, kind="training", **notes)]
+    RunFolder.create(out, config, [data], overwrite, kind="seeds", seeds=len(seeds), **notes)
+    return [
+        RunFolder.create(out / f"seed-{seed}", replace(config, seed=seed), [data], kind="training", **notes)
+        for seed in seeds
+    ]
+
+
+def _resumed_folders(
+    data: ScenarioSet, validation: ScenarioSet | None, weights: np.ndarray | None, out: Path, seeds: int
+) -> tuple[TrainConfig, list[RunFolder]]:
+    """Return the configuration of a run, and the folder of each of its seeds.
+
+    Raises:
+        UsageError: Training scenarios, validation scenarios, weights or the number of seeds differ.
+    """
+    folder, now = RunFolder.open(out), hashes(validation, weights)
+    if folder.info.get("validation") != now["validation"]:
+        raise UsageError(
+            "was validated on other scenarios", file=out, cure="resume with the same --validation"
+        )
+    if folder.info.get("weights") != now["weights"]:
+        raise UsageError("was trained with other weights", file=out, cure="resume with the same weights")
+    if [entry.get("hash") for entry in folder.info.get("data", [])] != [data.hash]:
+        raise UsageError("was trained on other scenarios", file=out, cure="resume with the same --data")
+    folders = [RunFolder.open(path) for path in seed_folders(out)]
+    if seeds not in (1, len(folders)):
+        raise UsageError(f"holds {len(folders)} seeds, not {seeds}", file=out, cure="resume without --seeds")
+    return folder.config(TrainConfig), folders
+
+
+@dataclass(frozen=True)
+class _Run:
+    config: TrainConfig
+    program: Program
+    logs: Sequence[TrainingLog]
+    validation: Validation | None
+    held_out_data: Any
+    #: Pretrained networks; None: not read yet, since a resumed run rarely needs them.
+    networks: Mapping[str, Any] | None
+    log: Callable[[str], None]
+
+    def steps(self, iteration: int) -> int:
+        """Environment steps of each seed after an iteration."""
+        return iteration * self.config.algorithm.steps_per_iteration
+
+
+def _learn(run: _Run) -> None:
+    """Run the remaining iterations."""
+    config, program = run.config, run.program
+    done, state = _start(run)
+    with Progress("training", "steps", run.steps(config.iterations)) as progress, StopSignal() as stop:
+        progress.update(run.steps(done))
+        for iteration in range(done + 1, config.iterations + 1):
+            if all(log.stopped for log in run.logs):
+                break
+            started = time.perf_counter()
+            state, raw = program.step(state)
+            values = jax.device_get(raw)
+            rate = config.algorithm.steps_per_iteration / (time.perf_counter() - started)
+            # Read once, so that every seed has a checkpoint of the same iteration.
+            stops = stop.received and iteration < config.iterations
+            rows = [
+                mean_logs(program.seeds.member(values, number)) | {"steps_per_second": rate}
+                for number in range(len(run.logs))
+            ]
+            _record(run, iteration, state, rows, stops)
+            success = [row["rollout/success"] for row in rows if "rollout/success" in row]
+            text = f"success {sum(success) / len(success):.2f}" if success else ""
+            progress.update(run.steps(iteration), text)
+            if stops:
+                raise Preempted(
+                    f"SIGTERM stopped the training after {run.steps(iteration):,} steps",
+                    cure="continue it with --resume",
+                )
+
+
+def _start(run: _Run) -> tuple[int, Any]:
+    """Return the finished iterations and the state after them: of the newest checkpoint that all seeds have, or 0."""
+    program, logs = run.program, run.logs
+    steps = [set(log.checkpoints.steps()) for log in logs if not log.stopped]
+    if not steps:
+        return run.config.iterations, None
+    step = max(set.intersection(*steps), default=None)
+    if step is None:
+        for log in logs:
+            log.start(None)
+        networks = run.networks
+        if networks is None:
+            networks = pretrained_networks(run.config.begin_from, program, run.log)
+        return 0, first_state(program, networks)
+    template = program.seeds.member_shapes(program.shapes)
+    states = []
+    for log in logs:
+        # A seed that stopped early keeps its last checkpoint; the program computes it without writing anything.
+        last = log.newest if log.stopped else step
+        log.start(last)
+        states.append(log.checkpoints.restore(template, last))
+    return step // run.config.algorithm.steps_per_iteration, program.state_of(states)
+
+
+def _record(
+    run: _Run, iteration: int, state: LearnerState, rows: list[dict[str, float]], stops: bool
+) -> None:
+    """Log, validate and save one iteration of every seed that has not stopped."""
+    config, steps = run.config, run.steps(iteration)
+    last = iteration == config.iterations
+    due = last or (config.evaluate_every > 0 and iteration % config.evaluate_every == 0)
+    for number, log in enumerate(run.logs):
+        if log.stopped:
+            continue
+        row = rows[number]
+        if due and run.validation is not None:
+            row |= _validation(run, run.validation, state, number)
+        rank = log.write(steps, row)
+        if last or due or stops or iteration % config.checkpoint_every == 0:
+            log.save(steps, run.program.seeds.member(state, number), rank)
+        if log.stopped and not last:
+            run.log(
+                f"seed {run.program.seeds.seeds[number]}: no better for {config.patience} validations, "
+                f"stopped at {steps:,} steps"
+            )
+
+
+def _validation(run: _Run, validation: Validation, state: LearnerState, number: int) -> dict[str, float]:
+    """Validate one seed, on the first device."""
+    seeds, device = run.program.seeds, run.program.devices[0]
+    parameters = jax.device_put(seeds.member(state.parameters, number), device)
+    planner = seeds.learner.planner(parameters, "policy", samples=False)
+    row = validate(planner, validation, run.config.task, find_traffic(run.config.traffic))
+    if isinstance(seeds.learner, HeldOutMetrics):
+        member = jax.device_put(seeds.member(state, number), device)
+        metrics = seeds.learner.held_out_metrics(run.held_out_data, member)
+        row |= {f"validation/{name}": value for name, value in metrics.items()}
     return row

@@ -1,86 +1,88 @@
-"""Trained policies as planners: of a run, or packed into a folder of a few files, as those of the zoo are."""
+"""Trained policies as planners and as traffic: of a training run, of an exported folder, or of the zoo."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from drivax.errors import UsageError
-from drivax.learning.config import TrainConfig
+from drivax.learning.config import TrainConfig, split_traffic
 from drivax.planners.planner import Planner
+from drivax.planners.planner_traffic import PlannerTraffic, with_driver
 from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.simulator.traffic.catalogue import make_traffic
+from drivax.simulator.traffic.log import LogTraffic
+from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints, pack, unpack
 from drivax.tracking.run_folder import RunFolder, seed_folders, trained_on
 from drivax.tracking.zoo import policy_folder
 
-#: What a packed policy has in the place of checkpoints.
-PACKED = "policy.npz"
-#: What ``run.json`` says of a training that a packed policy passes on: nothing of the place where it ran.
+#: What an exported policy has instead of checkpoints.
+POLICY_FILE = "policy.npz"
+#: What ``run.json`` of an exported policy keeps of the training: no path of the machine.
 _PROVENANCE = ("command", "started", "versions", "git", "validation", "step")
-#: Parameters do not depend on what the others did or how episodes began, and what did may no longer be there.
-_APART = ("--traffic", "log", "--start.kind", "log_start")
+#: Parameters do not depend on traffic and starts, and the traffic of the training may no longer exist.
+_AS_LOGGED = ("--traffic", "log", "--start.kind", "log_start")
 
 
 def open_policy(run: str | Path) -> tuple[RunFolder, TrainConfig]:
-    """The folder of a trained policy, and its configuration with the others and the starts as logged.
+    """Open the folder of a trained policy and its configuration, with traffic and starts as logged.
 
     Args:
-        run: Run folder of ``drivax train``, folder of :func:`pack_policy`, or ``zoo:NAME``.
+        run: Run folder of ``drivax train``, folder of :func:`export_policy`, or ``zoo:NAME``.
 
     Raises:
-        UsageError: If the folder holds several agents, or the zoo has no such policy.
-        DataError: If the folder is no training run.
+        UsageError: The folder holds several seeds, or the zoo has no such policy.
+        DataError: The folder is no training run.
     """
     folder = RunFolder.open(policy_folder(run))
     if folder.info.get("kind") == "seeds":
         inside = seed_folders(folder.path)
-        raise UsageError(
-            f"holds {len(inside)} agents", file=folder.path, cure=f"name one of them, as {inside[0]}"
-        )
-    return folder, folder.config(TrainConfig, _APART)
+        raise UsageError(f"holds {len(inside)} seeds", file=folder.path, cure=f"name one, as {inside[0]}")
+    return folder, folder.config(TrainConfig, _AS_LOGGED)
 
 
 def load_policy(
     run: str | Path, bank: ScenarioBank, *, step: int | None = None, samples: bool = False
 ) -> tuple[Planner, Task]:
-    """A trained policy, and the task that it was trained for.
+    """Load a trained policy as a planner, and the task that it was trained for.
 
     Args:
-        run: Run folder of ``drivax train``, folder of :func:`pack_policy`, or ``zoo:NAME``.
-        bank: Any bank; only the shapes of its observations are looked at.
-        step: Which checkpoint, which the planner's name then tells; None: the best by validation score, or the newest
-            without one.
-        samples: Whether to act by a sample instead of the mode.
+        run: Run folder of ``drivax train``, folder of :func:`export_policy`, or ``zoo:NAME``.
+        bank: Any bank; only shapes of its observations are read.
+        step: Step of the checkpoint, shown in the planner's name; None: the best, or the newest without a validation.
+        samples: Whether to sample actions instead of taking the mode.
 
     Raises:
-        UsageError: As :func:`open_policy`, or a packed policy is asked for a step.
-        DataError: If the folder is no training run, or what it holds of the policy is missing or damaged.
+        UsageError: As :func:`open_policy`, or a step of an exported policy is requested.
+        DataError: The folder is no training run, or its parameters are missing or damaged.
     """
     folder, config = open_policy(run)
-    learner = config.algorithm.build(config.environment(), bank, config.iterations)
+    learner = config.algorithm.build(config.environment(LogTraffic()), bank, config.iterations)
     template = jax.eval_shape(lambda key: learner.init(bank, key).parameters, jax.random.key(0))
 
     def planner(parameters: Any) -> Planner:
-        return learner.planner(
-            parameters, folder.path.name if step is None else f"{folder.path.name}@{step}", samples
-        )
+        name = folder.path.name if step is None else f"{folder.path.name}@{step}"
+        return learner.planner(parameters, name, samples)
 
-    packed = folder.path / PACKED
-    if packed.is_file():
+    exported = folder.path / POLICY_FILE
+    if exported.is_file():
         if step is not None:
-            raise UsageError("is packed and has no steps", file=folder.path, cure=f"leave out @{step}")
-        return unpack(packed, jax.eval_shape(planner, template)), config.task
+            raise UsageError(
+                "is an exported policy without steps", file=folder.path, cure=f"leave out @{step}"
+            )
+        return unpack(exported, jax.eval_shape(planner, template)), config.task
     checkpoints = Checkpoints(folder.checkpoints)
     chosen = checkpoints.best() if step is None else step
     return planner(checkpoints.restore(template, chosen, part=".parameters")), config.task
 
 
-def pack_policy(
+def export_policy(
     run: str | Path,
     out: str | Path,
     bank: ScenarioBank,
@@ -88,16 +90,16 @@ def pack_policy(
     *,
     overwrite: bool = False,
 ) -> RunFolder:
-    """Writes the policy of a run without all that only learning needs, to be copied, shipped and loaded as the run is.
+    """Write the best policy of a run (the newest without a validation) to a folder that loads like the run.
 
-    The folder holds ``policy.npz`` (what drives), the configuration, and where the policy comes from: command,
-    versions, commit and data sets by hash; no path of the machine.
+    The folder holds the planner's parameters, the configuration, and the provenance (command, versions, commit and
+    hashes of data sets, but no path of the machine).
 
     Args:
-        run: Run folder of ``drivax train``; its best policy is packed, or the newest without a validation.
-        out: Folder to write; its name is the policy's.
-        bank: Any bank; only the shapes of its observations are looked at.
-        notes: More for ``run.json``, plain JSON values: what was measured.
+        run: Run folder of ``drivax train``.
+        out: Folder to write; its name is that of the policy.
+        bank: Any bank; only shapes of its observations are read.
+        notes: More entries for ``run.json``, plain JSON values.
         overwrite: Replace ``out`` if it is a run folder.
 
     Raises:
@@ -114,6 +116,69 @@ def pack_policy(
     if step is not None:
         about["step"] = step
     config = replace(folder.config(TrainConfig), begin_from=None)
-    packed = RunFolder.create(out, config, overwrite=overwrite).note(**about)
-    pack(packed.path / PACKED, planner)
-    return packed
+    exported = RunFolder.create(out, config, overwrite=overwrite).note(**about)
+    pack(exported.path / POLICY_FILE, planner)
+    return exported
+
+
+@dataclass(frozen=True)
+class PolicyTraffic(PlannerTraffic):
+    """Traffic in which the policy of a run drives the vehicles nearest to ego; made by :func:`policy_traffic`.
+
+    Attributes:
+        run: Folder of the policy.
+        samples: Whether the policy samples its actions instead of taking the mode.
+    """
+
+    run: str = ""
+    samples: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name in tables: ``driven_by_RUN``, with the traffic of the other agents unless it is the log."""
+        base = "" if self.base.name == "log" else f"+{self.base.name}"
+        return f"driven_by_{Path(self.run).name}{base}"
+
+    def prepare(self, bank: ScenarioBank) -> ScenarioBank:
+        """Return the bank with the policy, and with what ``base`` needs.
+
+        Raises:
+            DataError: The checkpoint is missing or damaged.
+        """
+        bank = super().prepare(bank)
+        return with_driver(bank, load_policy(self.run, bank, samples=self.samples)[0])
+
+
+def policy_traffic(
+    run: str | Path, *, count: int = 4, base: Traffic | None = None, samples: bool = False
+) -> PolicyTraffic:
+    """Return traffic in which the best policy of a training run drives up to ``count`` vehicles nearest to ego.
+
+    Args:
+        run: Run folder of ``drivax train``, folder of ``export_policy``, or ``zoo:NAME``.
+        count: Largest number of vehicles that it drives.
+        base: Traffic of all other agents; the log by default.
+        samples: Whether to sample actions instead of taking the mode.
+
+    Raises:
+        UsageError: The folder holds several seeds, or the zoo has no such policy.
+        DataError: The folder is no training run.
+    """
+    folder, config = open_policy(run)
+    return PolicyTraffic(config.task, count, base or LogTraffic(), run=str(folder.path), samples=samples)
+
+
+def find_traffic(name: str) -> Traffic:
+    """Return the traffic of a name in a command line or a configuration.
+
+    Args:
+        name: One of ``simulator.traffic.catalogue.TRAFFIC``; ``package.module:name``; or the folder of a trained
+            policy or ``zoo:NAME``, which drives the vehicles nearest to ego while all others follow the log, or the
+            traffic named after a plus sign: ``zoo:NAME+idm``.
+
+    Raises:
+        UsageError: There is no such traffic.
+        DataError: A folder is no training run.
+    """
+    run, base = split_traffic(name)
+    return make_traffic(base) if run is None else policy_traffic(run, base=make_traffic(base))

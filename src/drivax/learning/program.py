@@ -1,87 +1,117 @@
-"""One iteration of all agents as a compiled program, laid out over the devices, with an account of its memory."""
+"""One iteration of all seeds as a compiled program: its layout over devices, and the memory that it takes.
+
+Seeds are divided among devices where they can be, otherwise the environments or batches of each seed. Everything is one
+program on one mesh, and the compiler divides the work by where arrays lie, so results do not depend on the number of
+devices except for the order of sums.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+import math
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
+from drivax.errors import UsageError
+from drivax.evaluation.memory import memory_of
 from drivax.learning.algorithm import Learner
-from drivax.learning.devices import chosen_devices, everywhere, layout, mesh_of
-from drivax.learning.memory import MemoryAccount, account
+
+#: Enough threads that some thread never waits for another.
+_THREADS = 8
+_AXIS = "devices"
+
+_REST = "networks and optimiser"
+_CURES = {
+    "scenarios": "train on fewer scenarios",
+    "validation": "validate on fewer scenarios",
+    "replay": "lower algorithm.replay.capacity, or set algorithm.replay.store to state",
+    "environments": "lower algorithm.environments",
+    _REST: "choose a smaller network, or fewer --seeds",
+    "program": "lower algorithm.environments, unroll or batch, or raise algorithm.minibatches",
+}
+#: Fields of a learner's state that are listed separately.
+_FIELDS = ("replay", "environments")
+
+
+def widen_pool() -> None:
+    """Give XLA's CPU thread pool eight threads where cores are fewer, unless ``NPROC`` is set.
+
+    Call it before JAX starts, for training of several seeds only: with two threads such programs deadlock once both
+    wait for others in the pool (jaxlib 0.10.2). Other programs are slower with more threads than cores.
+    """
+    if (os.cpu_count() or 1) < _THREADS:
+        os.environ.setdefault("NPROC", str(_THREADS))
 
 
 @dataclass(frozen=True)
-class Agents:
-    """One learner with one seed or several; states of several are stacked along a leading axis.
-
-    Attributes:
-        learner: The learner.
-        seeds: The seed of each.
-    """
+class Seeds:
+    """One learner with one seed or several; states of several seeds are stacked along a leading axis."""
 
     learner: Learner
     seeds: tuple[int, ...]
 
     @property
-    def several(self) -> bool:
-        """Whether there is a leading axis."""
+    def stacked(self) -> bool:
+        """Whether states have a leading axis."""
         return len(self.seeds) > 1
 
     def init(self, data: Any) -> Any:
-        """The state before the first iteration."""
-        if not self.several:
+        """Return the first state."""
+        if not self.stacked:
             return self.learner.init(data, jax.random.key(self.seeds[0]))
         keys = jnp.stack([jax.random.key(seed) for seed in self.seeds])
         return jax.vmap(self.learner.init, (None, 0))(data, keys)
 
     def iterate(self, data: Any, state: Any) -> tuple[Any, dict[str, Array]]:
-        """The state after one iteration of all, and what each logs."""
-        if not self.several:
+        """Return the state after one iteration of all seeds, and what each logs."""
+        if not self.stacked:
             return self.learner.iterate(data, state)
         return jax.vmap(self.learner.iterate, (None, 0))(data, state)
 
-    def shapes_of_one(self, shapes: Any) -> Any:
-        """Shapes of the state of one agent, from those of the state of all."""
-        rank = int(self.several)
+    def member_shapes(self, shapes: Any) -> Any:
+        """Return shapes of the state of one seed, given those of all."""
+        rank = int(self.stacked)
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[rank:], leaf.dtype), shapes)
 
-    def one(self, tree: Any, number: int) -> Any:
-        """What belongs to one agent: of its state, a part of it, or what is logged."""
-        return jax.tree.map(lambda leaf: leaf[number], tree) if self.several else tree
+    def member(self, tree: Any, number: int) -> Any:
+        """Select what belongs to one seed: of the state, part of it, or what is logged."""
+        return jax.tree.map(lambda leaf: leaf[number], tree) if self.stacked else tree
 
-    def together(self, states: Sequence[Any]) -> Any:
-        """The state of all, from the state of each."""
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states) if self.several else states[0]
+    def stack(self, states: Sequence[Any]) -> Any:
+        """Return the state of all seeds, given that of each."""
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states) if self.stacked else states[0]
 
 
 class Program:
-    """What a run executes. Compiled at once, so that what does not fit is told before anything is made.
+    """What a run executes, compiled before any array of the state is allocated.
 
     Args:
-        agents: What learns.
-        data: What is trained on.
-        devices: How many devices to use; None: all, as far as there is something to divide.
+        seeds: The learner and its seeds.
+        data: What it is trained on.
+        devices: Number of devices; None: all that can be divided among.
 
     Raises:
-        UsageError: The devices are not there, or cannot be divided among.
+        UsageError: The devices are missing, or nothing can be divided among them.
     """
 
-    def __init__(self, agents: Agents, data: Any, devices: int | None = 1) -> None:
-        self.agents = agents
-        shapes = jax.eval_shape(agents.init, data)
-        batch = getattr(agents.learner, "batch", None)
-        self.devices = chosen_devices(devices, len(agents.seeds), shapes, batch)
-        self._mesh = mesh_of(self.devices)
+    def __init__(self, seeds: Seeds, data: Any, devices: int | None = 1) -> None:
+        self.seeds = seeds
+        shapes = jax.eval_shape(seeds.init, data)
+        batch = getattr(seeds.learner, "batch", None)
+        self.devices = choose_devices(devices, len(seeds.seeds), shapes, batch)
+        self._mesh = Mesh(np.array(self.devices), (_AXIS,))
         self._layout: Any = None
         if len(self.devices) > 1:
-            self._layout = layout(self._mesh, len(agents.seeds), shapes)
-            data = jax.device_put(data, everywhere(self._mesh))
+            self._layout = _layout(self._mesh, len(seeds.seeds), shapes)
+            data = jax.device_put(data, NamedSharding(self._mesh, PartitionSpec()))
             shapes = jax.tree.map(
                 lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place),
                 shapes,
@@ -90,28 +120,180 @@ class Program:
         self.data = data
         self.shapes = shapes
         outputs = None if self._layout is None else (self._layout, None)
-        iterate = jax.jit(agents.iterate, donate_argnums=1, out_shardings=outputs)
-        with self._divided():
+        iterate = jax.jit(seeds.iterate, donate_argnums=1, out_shardings=outputs)
+        # Learners divide their work among devices unless whole seeds are divided.
+        within_seeds = len(self.devices) > 1 and len(seeds.seeds) % len(self.devices)
+        with jax.set_mesh(self._mesh) if within_seeds else contextlib.nullcontext():
             self.compiled = iterate.lower(data, shapes).compile()
 
-    def _divided(self) -> contextlib.AbstractContextManager[Any]:
-        """Lets learners ask for a division of their work, unless whole agents are divided."""
-        by_environments = len(self.devices) > 1 and len(self.agents.seeds) % len(self.devices)
-        return jax.set_mesh(self._mesh) if by_environments else contextlib.nullcontext()
-
     def account(self, validation: Any = None) -> MemoryAccount:
-        """Memory on the fullest device; ``validation`` is held beside the data."""
+        """Return the memory of the fullest device, with ``validation`` held next to the data."""
         return account(self.data, validation, self.shapes, self.compiled, self.devices)
 
     def first_state(self) -> Any:
-        """The state before the first iteration."""
-        return jax.jit(self.agents.init, out_shardings=self._layout)(self.data)
+        """Return the first state of all seeds."""
+        return jax.jit(self.seeds.init, out_shardings=self._layout)(self.data)
 
     def state_of(self, states: Sequence[Any]) -> Any:
-        """The state of all agents, from that of each."""
-        state = self.agents.together(states)
+        """Return the state of all seeds, laid out over the devices, given that of each."""
+        state = self.seeds.stack(states)
         return state if self._layout is None else jax.device_put(state, self._layout)
 
     def step(self, state: Any) -> tuple[Any, Any]:
-        """The state after one iteration, and what is logged of each agent; the old state is used up."""
+        """Return the state after one iteration, and what each seed logs; the old state is donated."""
         return self.compiled(self.data, state)
+
+
+def choose_devices(requested: int | None, seeds: int, state: Any, batch: int | None = None) -> list[Any]:
+    """Return the devices of a run.
+
+    Args:
+        requested: Number of devices; None: all of this machine that can be divided among.
+        seeds: Number of seeds.
+        state: Their state, or its shapes.
+        batch: Batch size of an algorithm that learns from data alone.
+
+    Raises:
+        UsageError: There are fewer devices, or nothing can be divided among them.
+    """
+    available = jax.local_devices()
+    if requested is not None and not 1 <= requested <= len(available):
+        raise UsageError(
+            f"{requested} devices, but there are {len(available)}", cure=f"use 1 to {len(available)}"
+        )
+    count = len(available) if requested is None else requested
+    if count == 1 or seeds % count == 0:
+        return available[:count]
+    sizes = {leaf.shape[axis] for leaf, axis in _divisible(state, seeds) if axis is not None}
+    kind = "environments" if sizes else "steps per batch"
+    sizes |= set() if batch is None else {batch}
+    odd = [size for size in sizes if size % count]
+    if sizes and not odd:
+        return available[:count]
+    if requested is None:
+        return available[:1]
+    what = f"{odd[0]} {kind}" if odd else "an algorithm without environments or batches"
+    cure = f"use a multiple of {count} {kind} or seeds, or fewer devices"
+    raise UsageError(f"{what} cannot be divided among {count} devices", cure=cure)
+
+
+def divided(tree: Any, axis: int) -> Any:
+    """Ask the compiler to divide this axis where one seed's work is divided among devices; values do not change.
+
+    Otherwise it may compute a whole update on every device.
+    """
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.empty or mesh.size == 1 or any(leaf.shape[axis] % mesh.size for leaf in jax.tree.leaves(tree)):
+        return tree
+    return jax.lax.with_sharding_constraint(tree, PartitionSpec(*[None] * axis, _AXIS))
+
+
+def _layout(mesh: Mesh, seeds: int, state: Any) -> Any:
+    """Sharding of each array of a state: divided by seeds, by environments, or whole on every device."""
+    by_seeds = seeds > 1 and seeds % mesh.size == 0
+
+    def sharding(axis: int | None) -> NamedSharding:
+        if by_seeds:
+            axis = 0
+        return NamedSharding(mesh, PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, _AXIS))
+
+    shardings = [sharding(axis) for _, axis in _divisible(state, seeds)]
+    return jax.tree.unflatten(jax.tree.structure(state), shardings)
+
+
+def _divisible(state: Any, seeds: int) -> list[tuple[Any, int | None]]:
+    """Leaves of a state with the axis that counts environments, as ``environment_axis`` of their records says."""
+
+    def axis_of(node: Any) -> int | None:
+        return getattr(type(node), "environment_axis", None)
+
+    leaves: list[tuple[Any, int | None]] = []
+    for node in jax.tree.leaves(state, is_leaf=lambda node: axis_of(node) is not None):
+        axis = axis_of(node)
+        axis = None if axis is None else axis + (seeds > 1)
+        leaves += [
+            (leaf, axis if axis is not None and len(leaf.shape) > axis else None)
+            for leaf in jax.tree.leaves(node)
+        ]
+    return leaves
+
+
+@dataclass(frozen=True)
+class MemoryAccount:
+    """Bytes that a run takes on its fullest device.
+
+    Attributes:
+        sizes: Bytes by what takes them; ``program`` is what a compiled iteration needs in addition.
+        limit: Memory of the device; None if unknown.
+        device: Name of the device.
+    """
+
+    sizes: Mapping[str, int]
+    limit: int | None
+    device: str
+
+    @property
+    def total(self) -> int:
+        """Sum of all bytes."""
+        return sum(self.sizes.values())
+
+    def text(self) -> str:
+        """Return the account as one line."""
+        sizes = ", ".join(f"{name} {_readable(size)}" for name, size in self.sizes.items() if size)
+        of = "" if self.limit is None else f" of {_readable(self.limit)}"
+        return f"memory: {_readable(self.total)}{of} on {self.device}: {sizes}"
+
+    def check(self) -> None:
+        """Raise UsageError if the run does not fit; its cure concerns what takes the most."""
+        if self.limit is not None and self.total > self.limit:
+            largest = max(self.sizes, key=lambda name: self.sizes[name])
+            raise UsageError(f"training does not fit; {self.text()}", cure=_CURES[largest])
+
+
+def account(
+    data: Any, validation: Any, state: Any, compiled: jax.stages.Compiled, devices: Sequence[Any]
+) -> MemoryAccount:
+    """Return the memory of a run.
+
+    Args:
+        data: Training data, whole on every device.
+        validation: Validation data, on the first device.
+        state: State of the learners, or its shapes with their sharding.
+        compiled: One iteration.
+        devices: What it runs on.
+    """
+    sizes = {"scenarios": _bytes(data), "validation": _bytes(validation), "replay": 0, "environments": 0}
+    sizes[_REST] = 0
+    for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
+        names = [getattr(key, "name", "") for key in path]
+        sizes[next((name for name in names if name in _FIELDS), _REST)] += _leaf_bytes(leaf)
+    sizes["program"] = _program_bytes(compiled)
+    device = devices[0]
+    return MemoryAccount(sizes, memory_of(device, len(devices)), f"{device.platform}:{device.id}")
+
+
+def _bytes(tree: Any) -> int:
+    return sum(_leaf_bytes(leaf) for leaf in jax.tree.leaves(tree))
+
+
+def _leaf_bytes(leaf: Any) -> int:
+    """Bytes of an array, or of its shard on one device."""
+    sharding = getattr(leaf, "sharding", None)
+    shape = leaf.shape if sharding is None else sharding.shard_shape(leaf.shape)
+    return math.prod(shape) * leaf.dtype.itemsize
+
+
+def _program_bytes(compiled: jax.stages.Compiled) -> int:
+    """Bytes of temporary values, of results that replace no argument, and of the program itself."""
+    analysis = compiled.memory_analysis()
+    if analysis is None:
+        return 0
+    results = analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+    return analysis.temp_size_in_bytes + results + analysis.generated_code_size_in_bytes
+
+
+def _readable(size: int) -> str:
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= scale:
+            return f"{size / scale:.1f} {unit}" if size < 10 * scale else f"{size / scale:.0f} {unit}"
+    return f"{size} B"

@@ -1,72 +1,64 @@
-"""Replay: a ring of what environments went through, kept as states that are observed when they are sampled.
+"""Replay buffer: a ring of transitions, stored as states that are observed when they are sampled.
 
-A state in log traffic is a tenth of its observation, and what is stored is observed by the same function as what is
-driven (design, ideas 1 and 4). The price is that every sampled step is observed twice, before and after; ``store:
-observation`` keeps observations in bfloat16 instead.
+A state in log traffic is a tenth of its observation, and the same function observes stored and current states. The
+price is that every sampled step is observed twice, before and after; ``store: observation`` stores observations in
+bfloat16 instead.
 
-Rows are steps of all environments side by side. What row t led to is in the row behind it, the final state of an
-episode in the row that only begins the next one, so nothing is stored twice. The newest row has no row behind it yet
-and is not sampled; writing over the oldest row leaves none that leads to it.
+A row holds one step of all environments. What row t led to is in the next row, the final state of an episode in the
+row that resets it, so nothing is stored twice. The newest row has no next row yet and is not sampled.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
-from drivax.learning.collector import Rollout
-from drivax.learning.environment import Environment, Environments
+from drivax.learning.environment import Environment, Environments, Rollout, Store
 from drivax.scenario.record import record, static
-
-Store = Literal["state", "observation"]
 
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """What is kept for off-policy learning.
+    """Size and format of the replay buffer.
 
     Attributes:
-        capacity: Steps that are kept, over all environments; the oldest make room.
-        store: ``state``: as little as an observation can be made of; ``observation``: the observation in bfloat16,
-            which takes more memory and less time.
+        capacity: Steps over all environments; new steps replace the oldest.
+        store: ``state``: the least that an observation can be made of; ``observation``: observations in bfloat16, which
+            take more memory and less time.
     """
 
     capacity: int = 100_000
     store: Store = "state"
 
     def rows(self, environments: int) -> int:
-        """Rows of the ring.
-
-        Raises:
-            UsageError: There is no room for two: a step and what it led to.
-        """
+        """Return the number of rows; raises UsageError below two, a step and its successor."""
         rows = self.capacity // environments
         if rows < 2:
             raise UsageError(
-                f"a replay of {self.capacity} steps for {environments} environments",
-                cure=f"give it a capacity of at least {2 * environments}",
+                f"replay capacity of {self.capacity} steps is too small for {environments} environments",
+                cure=f"set replay.capacity to {2 * environments} or more",
             )
         return rows
 
 
 @record
 class Replay:
-    """The ring ``[row, environment]``.
+    """Contents of the buffer ``[row, environment]``.
 
     Attributes:
         stored: States, or observations in bfloat16.
-        action: What was done, in [-1, 1].
-        reward: What it earned.
-        terminated: The episode ended for good.
-        alive: Whether the row is a step; false where it only begins an episode, and where nothing was written yet.
-        next_row: Where the next row goes: the oldest, once the ring is full.
-        store: What is stored.
-        environment_axis: The axis that counts environments; several devices divide it among them.
+        action: Actions in [-1, 1].
+        reward: Rewards.
+        terminated: Episode ended for good.
+        alive: Whether the row is a step; false where it only resets an environment or nothing was written yet.
+        next_row: Row to write next: the oldest, once the ring is full.
+        store: What ``stored`` holds.
+        environment_axis: The axis that counts environments, which several devices divide.
     """
 
     environment_axis: ClassVar[int] = 1
@@ -80,106 +72,111 @@ class Replay:
     store: Store = static()
 
 
-#: Rows and environments of steps that were drawn.
-Places = tuple[Int[Array, "..."], Int[Array, "..."]]
+#: Rows and environments of drawn steps.
+ReplayIndex = tuple[Int[Array, "..."], Int[Array, "..."]]
 
 
 @record
 class Transitions:
-    """A batch of steps; ``following`` is the observation of what each led to, final states included."""
+    """A batch of steps; ``next_observation`` is what each led to, final states included."""
 
     observation: dict[str, Array]
     action: Float[Array, "*batch D"]
     reward: Float[Array, "*batch"]
     terminated: Bool[Array, "*batch"]
-    following: dict[str, Array]
+    next_observation: dict[str, Array]
 
 
-def init(config: ReplayConfig, environment: Environment, environments: Environments) -> Replay:
-    """An empty replay for these environments."""
-    count = environments.over.shape[0]
-    rows = config.rows(count)
-    like = (
-        _floats(environments.observation, jnp.bfloat16)
-        if config.store == "observation"
-        else environment.stored(environments.state)
-    )
+@dataclass(frozen=True)
+class ReplayBuffer:
+    """Pure functions over a :class:`Replay`, in the environment whose states it stores."""
 
-    def empty(*shape: int, dtype: Any = jnp.float32) -> Array:
-        return jnp.zeros((rows, count, *shape), dtype)
+    config: ReplayConfig
+    environment: Environment
 
-    return Replay(
-        stored=jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), like),
-        action=empty(environment.action_size),
-        reward=empty(),
-        terminated=empty(dtype=jnp.bool_),
-        alive=empty(dtype=jnp.bool_),
-        next_row=jnp.zeros((), jnp.int32),
-        store=config.store,
-    )
+    def init(self, environments: Environments) -> Replay:
+        """Return an empty buffer for these environments."""
+        count = environments.over.shape[0]
+        rows = self.config.rows(count)
+        like = (
+            _cast(environments.observation, jnp.bfloat16)
+            if self.config.store == "observation"
+            else self.environment.stored(environments.state)
+        )
+
+        def empty(*shape: int, dtype: Any = jnp.float32) -> Array:
+            return jnp.zeros((rows, count, *shape), dtype)
+
+        return Replay(
+            stored=jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), like),
+            action=empty(self.environment.action_size),
+            reward=empty(),
+            terminated=empty(dtype=jnp.bool_),
+            alive=empty(dtype=jnp.bool_),
+            next_row=jnp.zeros((), jnp.int32),
+            store=self.config.store,
+        )
+
+    def add(self, replay: Replay, rollout: Rollout) -> Replay:
+        """Write a rollout over the oldest rows.
+
+        The rollout continues the last one, keeps states or observations as ``store`` says, and its raw actions are
+        actions in [-1, 1]. Raises UsageError if it has more steps than the buffer has rows.
+        """
+        rows, steps = replay.reward.shape[0], rollout.reward.shape[0]
+        if steps > rows:
+            raise UsageError(
+                f"{steps} steps do not fit a replay buffer of {rows} rows", cure="raise replay.capacity"
+            )
+        new = {
+            "stored": rollout.state
+            if rollout.observation is None
+            else _cast(rollout.observation, jnp.bfloat16),
+            "action": rollout.raw_action,
+            "reward": rollout.reward,
+            "terminated": rollout.terminated,
+            "alive": rollout.alive,
+        }
+        old = {name: getattr(replay, name) for name in new}
+        index = (replay.next_row + jnp.arange(steps)) % rows
+        written = jax.tree.map(lambda ring, values: ring.at[index].set(values), old, new)
+        return replace(replay, **written, next_row=(replay.next_row + steps) % rows)
+
+    def draw(self, replay: Replay, key: Array, shape: tuple[int, ...]) -> ReplayIndex:
+        """Draw steps that have a successor, uniformly with replacement.
+
+        Call it once for all batches of an iteration, because it reads every row. Some step must have a successor.
+        """
+        rows, environments = replay.reward.shape
+        newest = (replay.next_row - 1) % rows
+        sampleable = replay.alive & (jnp.arange(rows) != newest)[:, None]
+        # The n-th sampleable step is where the running count first exceeds n.
+        running = jnp.cumsum(sampleable.reshape(-1), dtype=jnp.int32)
+        number = jax.random.randint(key, shape, 0, jnp.maximum(running[-1], 1))
+        position = jnp.searchsorted(running, number, side="right").astype(jnp.int32)
+        return position // environments, position % environments
+
+    def sample(self, data: Any, replay: Replay, index: ReplayIndex) -> Transitions:
+        """Return the steps at an index of :meth:`draw`, observed before and after."""
+        row, column = index
+
+        def observe(row: Array) -> dict[str, Array]:
+            kept = jax.tree.map(lambda leaf: leaf[row, column], replay.stored)
+            if replay.store == "state":
+                return self.environment.observe_all(data, kept)
+            return _cast(kept, jnp.float32)
+
+        return Transitions(
+            observation=observe(row),
+            action=replay.action[row, column],
+            reward=replay.reward[row, column],
+            terminated=replay.terminated[row, column],
+            next_observation=observe((row + 1) % replay.reward.shape[0]),
+        )
 
 
-def add(replay: Replay, rollout: Rollout) -> Replay:
-    """Writes a rollout of at most as many steps as there are rows over the oldest rows.
-
-    Args:
-        replay: The replay.
-        rollout: Experience that goes on where the last one stopped, with states or observations as the replay stores;
-            the actor's choices are its actions, in [-1, 1].
-    """
-    rows = replay.reward.shape[0]
-    steps = rollout.reward.shape[0]
-    if steps > rows:
-        raise UsageError(f"{steps} steps for a replay of {rows} rows", cure="give it a larger capacity")
-    new = {
-        "stored": rollout.state
-        if rollout.observation is None
-        else _floats(rollout.observation, jnp.bfloat16),
-        "action": rollout.choice,
-        "reward": rollout.reward,
-        "terminated": rollout.terminated,
-        "alive": rollout.alive,
-    }
-    old = {name: getattr(replay, name) for name in new}
-    at = (replay.next_row + jnp.arange(steps)) % rows
-    written = jax.tree.map(lambda ring, part: ring.at[at].set(part), old, new)
-    return replace(replay, **written, next_row=(replay.next_row + steps) % rows)
-
-
-def draw(replay: Replay, key: Array, shape: tuple[int, ...]) -> Places:
-    """Steps to learn from, with replacement: each that has a successor is as likely as any other.
-
-    One call for all batches of an iteration, because it looks at every row. There must be a step with a successor.
-    """
-    rows, environments = replay.reward.shape
-    newest = (replay.next_row - 1) % rows
-    counts = replay.alive & (jnp.arange(rows) != newest)[:, None]
-    # The n-th step that counts is where the running count first exceeds n.
-    running = jnp.cumsum(counts.reshape(-1), dtype=jnp.int32)
-    number = jax.random.randint(key, shape, 0, jnp.maximum(running[-1], 1))
-    place = jnp.searchsorted(running, number, side="right").astype(jnp.int32)
-    return place // environments, place % environments
-
-
-def sample(environment: Environment, data: Any, replay: Replay, places: Places) -> Transitions:
-    """The steps at these places (of :func:`draw`), observed before and after."""
-    row, column = places
-
-    def look(row: Array) -> dict[str, Array]:
-        kept = jax.tree.map(lambda leaf: leaf[row, column], replay.stored)
-        return environment.observe_all(data, kept) if replay.store == "state" else _floats(kept, jnp.float32)
-
-    return Transitions(
-        observation=look(row),
-        action=replay.action[row, column],
-        reward=replay.reward[row, column],
-        terminated=replay.terminated[row, column],
-        following=look((row + 1) % replay.reward.shape[0]),
-    )
-
-
-def _floats(observation: dict[str, Array], dtype: Any) -> dict[str, Array]:
-    """Its numbers in another precision; masks stay."""
+def _cast(observation: dict[str, Array], dtype: Any) -> dict[str, Array]:
+    """Cast floating-point arrays; masks keep their type."""
     return {
         name: value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
         for name, value in observation.items()

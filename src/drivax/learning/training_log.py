@@ -1,78 +1,163 @@
-"""What is written of one agent's run: rows of numbers, checkpoints, and the validations that they are compared by."""
+"""What is written of one seed's run: logged values, checkpoints, and the validations that rank them."""
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
+
+import numpy as np
 
 from drivax.errors import DrivaxError
-from drivax.learning.config import TrainConfig
-from drivax.learning.validation import rank
+from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.runner import evaluate
+from drivax.planners.planner import Planner
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.store import ScenarioSet
+from drivax.simulator.types import Traffic
+from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
 from drivax.tracking.sinks import MetricLog, read_rows
 
+#: ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then comfort. ``fitted_q``: the return
+#: that fitted-Q evaluation expects of the policy on held-out steps.
+Rule = Literal["score", "lexicographic", "fitted_q"]
 
-class Preempted(DrivaxError):
-    """The run was told to stop (SIGTERM), has written a checkpoint, and can be resumed."""
+_SCORES = ("vmax_score", "vmax_score_partial")
+_METRICS = (
+    "success", "accuracy", "accuracy_at_fault", "collision", "offroad", "red_light", "progress_ratio", "comfortable",
+)  # fmt: skip
+_ORDER = ("accuracy", "progress_ratio", "comfortable")
 
-    status = 128 + signal.SIGTERM
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out scenarios that rank checkpoints."""
+
+    bank: ScenarioBank
+    names: Sequence[Mapping[str, str]]
+
+    @classmethod
+    def of(cls, data: ScenarioSet) -> Validation:
+        """Load a scenario set."""
+        scenarios = list(data)
+        return cls(ScenarioBank.from_scenarios(scenarios), scenario_names(scenarios))
 
 
-class StopSignal:
-    """Notices SIGTERM instead of dying of it, while it is entered; a second one kills as usual.
+def validate(planner: Planner, validation: Validation, task: Task, traffic: Traffic) -> dict[str, float]:
+    """Evaluate a planner in closed loop on held-out scenarios.
 
-    Batch systems send it some seconds before they take a machine away. Outside of the main thread, where Python has no
-    signals, nothing is noticed.
+    Returns:
+        ``validation/<metric>``: means over the scenarios that define it.
+
+    Raises:
+        DrivaxError: Actions are not finite, because learning has diverged.
     """
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._former: Any = None
-
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._former = signal.signal(signal.SIGTERM, self._notice)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._former is not None:
-            signal.signal(signal.SIGTERM, self._former)
-
-    def _notice(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    results = evaluate(planner, validation.bank, validation.names, task=task, traffic=traffic)
+    if results.crashes:
+        raise DrivaxError(
+            f"actions of the policy are not finite in {len(results.crashes)} of {len(results)} episodes",
+            cure="lower the learning rate, or resume from an earlier checkpoint",
+        )
+    # Full scores where there are any; partial scores are never mixed with them.
+    score = next(name for name in _SCORES if np.isfinite(results.metrics[name]).any())
+    row = {}
+    for name in (score, *_METRICS):
+        values = results.metrics[name]
+        if np.isfinite(values).any():
+            row[f"validation/{name}"] = float(np.nanmean(values))
+    return row
 
 
-def patience_is_up(ranks: Sequence[tuple[float, ...]], patience: int) -> bool:
-    """Whether the last ``patience`` validations were no better than the best before them; never, if it is 0."""
+def rank(rule: Rule, row: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """Return what a checkpoint is ranked by (higher is better), given its row of ``metrics.jsonl``.
+
+    The lexicographic rule compares ``accuracy`` (share of episodes without a failure), then progress, then comfort.
+    Undefined values rank last. None if the row has no validation.
+    """
+    values = {
+        name.removeprefix("validation/"): value
+        for name, value in row.items()
+        if name.startswith("validation/")
+    }
+    if not values:
+        return None
+    if rule == "fitted_q":
+        return (_or_last(values["fitted_q"], -math.inf),)
+    if rule == "score":
+        return (float(next(values[name] for name in _SCORES if name in values)),)
+    return tuple(_or_last(values.get(name)) for name in _ORDER)
+
+
+def _or_last(value: float | None, last: float = -1.0) -> float:
+    return last if value is None or math.isnan(value) else float(value)
+
+
+def patience_exceeded(ranks: Sequence[tuple[float, ...]], patience: int) -> bool:
+    """Whether the last ``patience`` validations did not improve on the best before them; never if it is 0."""
     if not patience or len(ranks) <= patience:
         return False
     return max(ranks[-patience:]) <= max(ranks[:-patience])
 
 
-class Journal:
-    """The run folder of one agent while it learns.
+class Preempted(DrivaxError):
+    """SIGTERM stopped the run after a checkpoint; it can be resumed."""
 
-    Args:
-        folder: The folder.
-        config: What is trained.
+    status = 128 + signal.SIGTERM
+
+
+class StopSignal:
+    """Context that notes SIGTERM instead of ending the process; a second SIGTERM ends it.
+
+    Batch systems send it some seconds before they take a machine away. Outside of the main thread, where Python has no
+    signals, it notes nothing.
     """
 
-    def __init__(self, folder: RunFolder, config: TrainConfig) -> None:
+    def __init__(self) -> None:
+        self.received = False
+        self._previous: Any = None
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = signal.signal(signal.SIGTERM, self._receive)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._previous is not None:
+            signal.signal(signal.SIGTERM, self._previous)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.received = True
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+class TrainingLog:
+    """The run folder of one seed during training: metrics, checkpoints, and the ranks of its validations.
+
+    Args:
+        folder: The run folder.
+        rule: How checkpoints are ranked.
+        keep: Number of newest checkpoints to keep in addition to the best.
+        patience: Validations without improvement after which the seed stops; 0: never.
+    """
+
+    def __init__(self, folder: RunFolder, rule: Rule, keep: int, patience: int) -> None:
         self.folder = folder
-        self.config = config
-        self.checkpoints = Checkpoints(folder.checkpoints, config.keep)
+        self.checkpoints = Checkpoints(folder.checkpoints, keep)
+        self._rule: Rule = rule
+        self._patience = patience
         self._ranks: list[tuple[float, ...]] = []
         self._log: MetricLog | None = None
         newest = self.newest
         if newest is not None and folder.metrics.is_file():
-            self._remember(newest)
+            self._read_ranks(newest)
 
     @property
     def newest(self) -> int | None:
@@ -80,36 +165,36 @@ class Journal:
         return max(self.checkpoints.steps(), default=None)
 
     @property
-    def over(self) -> bool:
-        """Whether the agent's patience is up: nothing more is written of it."""
-        return patience_is_up(self._ranks, self.config.patience)
+    def stopped(self) -> bool:
+        """Whether patience is exceeded: nothing more is written."""
+        return patience_exceeded(self._ranks, self._patience)
 
-    def begin(self, step: int | None) -> None:
-        """Opens the log: afresh, or after a step of the run so far, of which what is later is dropped."""
+    def start(self, step: int | None) -> None:
+        """Open the log: a new one, or after a step of the run so far, dropping what is later."""
         if step is not None:
             self.checkpoints.drop_after(step)
-            self._remember(step)
+            self._read_ranks(step)
         self._log = MetricLog(self.folder.path, resume_step=step)
 
-    def _remember(self, step: int) -> None:
-        """The validations up to a step."""
+    def _read_ranks(self, step: int) -> None:
+        """Read the ranks of the validations up to a step."""
         rows = [row for row in read_rows(self.folder.metrics) if row["step"] <= step]
-        ranks = [rank(self.config.checkpoint_rule, row) for row in rows]
-        self._ranks = [found for found in ranks if found is not None]
+        ranks = [rank(self._rule, row) for row in rows]
+        self._ranks = [values for values in ranks if values is not None]
 
     def write(self, step: int, row: Mapping[str, float]) -> tuple[float, ...] | None:
-        """Logs the numbers of one iteration; returns what a checkpoint of it is compared by."""
+        """Log the values of one iteration and return the rank of its checkpoint."""
         if self._log is None:
-            raise RuntimeError("begin first")
+            raise RuntimeError("call start first")
         self._log.write(step, row)
-        found = rank(self.config.checkpoint_rule, row)
-        if found is not None:
-            self._ranks.append(found)
-        return found
+        values = rank(self._rule, row)
+        if values is not None:
+            self._ranks.append(values)
+        return values
 
-    def save(self, step: int, state: Any, found: tuple[float, ...] | None) -> None:
-        """Stores a checkpoint."""
-        self.checkpoints.save(step, state, found)
+    def save(self, step: int, state: Any, rank: tuple[float, ...] | None) -> None:
+        """Store a checkpoint."""
+        self.checkpoints.save(step, state, rank)
 
     def __enter__(self) -> Self:
         return self

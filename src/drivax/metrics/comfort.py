@@ -1,6 +1,6 @@
 """Comfort by nuPlan's limits and Savitzky-Golay windows, one step at a time.
 
-A window of 15 samples is centred 7 steps back, so a running simulation judges step t - 7 at step t and the last eight
+A window of 15 samples is centred 7 steps back, so a simulation evaluates step t - 7 at step t and the last eight
 steps when the episode ends; the edge is SciPy's ``interp`` mode. The result equals ``scipy.signal.savgol_filter`` over
 the whole episode (tests).
 """
@@ -19,7 +19,7 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 
-#: Samples of a comfort window, and how many trailing steps are judged at once when an episode ends.
+#: Samples of a comfort window, and how many trailing steps are evaluated at once when an episode ends.
 WINDOW, TAIL = 15, 8
 #: nuPlan's closed-loop limits: m/s2, m/s2, m/s3, m/s3, rad/s, rad/s2.
 LONGITUDINAL_MPS2 = (-4.05, 2.40)
@@ -43,7 +43,7 @@ def savgol_tail_matrix(window: int, order: int, derivative: int) -> np.ndarray[A
 
 @cache
 def savgol_matrix(samples: int, window: int, order: int, derivative: int) -> np.ndarray[Any, Any]:
-    """The Savitzky-Golay filter of so many samples as a matrix ``[samples, samples]``.
+    """The Savitzky-Golay filter of a number of samples as a matrix ``[samples, samples]``.
 
     Least-squares polynomial of ``order`` over ``window`` samples, differentiated ``derivative`` times per sample
     (Savitzky and Golay 1964). Rows near an end are read off the polynomial of the first or last window. As in SciPy,
@@ -76,9 +76,9 @@ class ComfortSteps:
 
 
 def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
-    """Judges every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
+    """Evaluate every step of a trip (x, y, heading, speed; at least 16 rows) from row 8 on, for plots and tables.
 
-    An episode judges the same, step by step; nothing before row 8 can be judged as a centred window asks for.
+    An episode evaluates the same, step by step; nothing before row 8 can be evaluated as a centred window asks for.
     """
     rows = WINDOW + 1
     windows = jnp.arange(len(motion) - rows + 1)[:, None] + jnp.arange(rows)
@@ -87,7 +87,7 @@ def check_trip_comfort(motion: Float[Array, "time 4"]) -> ComfortSteps:
 
 
 def check_comfort(history: Float[Array, "16 4"]) -> ComfortSteps:
-    """Judges the last eight steps of a motion history (x, y, heading, speed) against the limits.
+    """Evaluate the last eight steps of a motion history (x, y, heading, speed) against the limits.
 
     Row 0, seven steps back, is final; the later rows are what SciPy's edge mode would say if the history ended now.
     """

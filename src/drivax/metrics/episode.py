@@ -84,7 +84,7 @@ def episode_add(episode: Episode, found: Situation, start: Int[Array, ""], final
         episode: Accumulators so far.
         found: What the step led to.
         start: Step at which the episode began.
-        final: The episode ends here, so the comfort of its last steps is judged too.
+        final: The episode ends here, so the comfort of its last steps is evaluated too.
     """
     selection, seen = episode.selection, _Seen(Moment(found, start, final))
     added, number = seen.sums(selection.step_values(*_ADDED))
@@ -163,8 +163,8 @@ def episode_metrics(bank: ScenarioBank, state: SimState) -> dict[str, Value]:
 
 def _has(bank: ScenarioBank, state: SimState, needs: Flag) -> Bool[Array, ""]:
     """Whether the scenario has what a metric needs. The route is ego's; other slots have none."""
-    wanted = jnp.uint32(int(needs))
-    held = (bank.flags[state.context.index] & wanted) == wanted
+    desired = jnp.uint32(int(needs))
+    held = (bank.flags[state.context.index] & desired) == desired
     return held & ((Flag.ROUTE not in needs) | (state.context.slot == 0))
 
 

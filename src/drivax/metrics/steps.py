@@ -28,7 +28,7 @@ class Moment:
     Attributes:
         found: The situation.
         start: Step at which the episode began.
-        final: Whether the episode ends here, so that the comfort of its last steps is judged too.
+        final: Whether the episode ends here, so that the comfort of its last steps is evaluated too.
     """
 
     situation: Situation
@@ -42,7 +42,7 @@ class Moment:
 
     @cached_property
     def comfort(self) -> tuple[ComfortSteps, Bool[Array, " 8"]]:
-        """The last eight steps, and which of them are judged now: the oldest, and all at the end."""
+        """The last eight steps, and which of them are evaluated now: the oldest, and all at the end."""
         step = self.situation.context.step - (TAIL - 1) + jnp.arange(TAIL)
         counts = (step > self.start) & (self.final | (jnp.arange(TAIL) == 0))
         return check_comfort(self.situation.context.history), counts
@@ -130,7 +130,7 @@ STEP_VALUES: dict[str, StepValue] = {value.name: value for value in _ALL}
 def step_metrics(situation: Situation, values: Sequence[StepValue] | None = None) -> dict[str, Value]:
     """Step values of one situation, for tables and plots.
 
-    Comfort needs the seven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` judges a whole trip.
+    Comfort needs the seven steps that follow; :func:`drivax.metrics.comfort.check_trip_comfort` evaluates a whole trip.
 
     Args:
         situation: Its facts must hold what the values read (a task with ``metrics: full`` holds all).

@@ -1,1 +1,5 @@
-"""Drivers with one interface: expert, constant velocity, IDM, a network."""
+"""Planners with one interface: expert, rule-based, network, and functions of the user."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

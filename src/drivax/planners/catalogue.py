@@ -9,7 +9,6 @@ from drivax.errors import UsageError
 from drivax.planners.idm import IdmPlanner
 from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
-from drivax.planners.search import SearchPlanner
 from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
 from drivax.plugins import check_arguments, find_named, is_dotted
 
@@ -20,7 +19,6 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     "random": RandomActions,
     "idm": IdmPlanner,
     "pdm": PdmPlanner,
-    "search": SearchPlanner,
 }
 
 

@@ -61,13 +61,13 @@ class FunctionPlanner(Memoryless):
             return jnp.asarray(self.function(situation, observation), jnp.float32), carry
         # How traffic keeps its books is no concern of a driver.
         seen = replace(situation, context=replace(situation.context, traffic=()))
-        who, size = bank.identity[state.context.index], state.context.action.shape
+        identity, size = bank.identity[state.context.index], state.context.action.shape
 
-        def answer(who: Any, *seen: Any) -> Any:
-            return _answers(self.function, np.asarray(who), jax.tree.map(np.asarray, seen), size)
+        def answer(identity: Any, *seen: Any) -> Any:
+            return _answers(self.function, np.asarray(identity), jax.tree.map(np.asarray, seen), size)
 
         result = jax.ShapeDtypeStruct(size, jnp.float32)
-        action = jax.pure_callback(answer, result, who, seen, observation, vmap_method="broadcast_all")
+        action = jax.pure_callback(answer, result, identity, seen, observation, vmap_method="broadcast_all")
         return action, carry
 
 
@@ -95,7 +95,7 @@ def python_planner(function: Drive) -> FunctionPlanner:
 def raised() -> Iterator[dict[tuple[int, int], str]]:
     """Gathers what Python functions raise while they drive, by the scenario's identity and the step of the log.
 
-    Where nobody gathers them, errors end the program that drives.
+    Outside of it, errors end the program that drives.
     """
     _listeners.append({})
     try:
@@ -104,10 +104,10 @@ def raised() -> Iterator[dict[tuple[int, int], str]]:
         _listeners.pop()
 
 
-def _answers(function: Drive, who: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
+def _answers(function: Drive, identity: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
     """The function's action for each scenario of a batch of any shape."""
-    actions, steps = np.full((*who.shape, *size), np.nan, np.float32), seen[0].context.step
-    for at in np.ndindex(who.shape):
+    actions, steps = np.full((*identity.shape, *size), np.nan, np.float32), seen[0].context.step
+    for at in np.ndindex(identity.shape):
         try:
             action = np.asarray(function(*jax.tree.map(lambda leaf, at=at: leaf[at], seen)), np.float32)
             if action.shape != size:
@@ -116,11 +116,11 @@ def _answers(function: Drive, who: Any, seen: tuple[Any, ...], size: tuple[int, 
         except Exception as error:
             if not _listeners:
                 raise
-            _listeners[-1][int(who[at]), int(steps[at])] = _told(error)
+            _listeners[-1][int(identity[at]), int(steps[at])] = _message(error)
     return actions
 
 
-def _told(error: Exception) -> str:
+def _message(error: Exception) -> str:
     """One line: what it is, and in which line of the function."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     theirs = [place for place in traceback.extract_tb(error.__traceback__) if place.filename != __file__]

@@ -1,39 +1,37 @@
-"""The one interface of drivers. A planner is a frozen record; what it computed earlier travels in its carry."""
+"""The interface of planners: frozen records whose memory travels in their carry."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float
 
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.types import SimState, Situation
+from drivax.tasks.actions import ActionSpace
 
 
 @runtime_checkable
 class Planner(Protocol):
     """A driver, unbatched and pure.
 
-    Register implementations as pytrees (weights are leaves, settings static): an evaluation passes the planner as an
+    Register implementations as pytrees (weights are leaves, settings are static): evaluation passes the planner as an
     argument of its compiled program. What ``act`` does not read is not computed.
-
-    Attributes:
-        name: As printed in tables.
-        replays: The logged motion is replayed exactly instead of driving the action through the dynamics.
     """
 
     @property
     def name(self) -> str:
-        """As printed in tables."""
+        """Name in tables."""
         ...
 
     @property
     def replays(self) -> bool:
-        """Whether the log's motion is replayed exactly."""
+        """Whether the logged motion is replayed exactly instead of driving the action through the dynamics."""
         ...
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
-        """The carry at the start of an episode."""
+        """Return the carry at the start of an episode."""
         ...
 
     def act(
@@ -45,13 +43,37 @@ class Planner(Protocol):
         observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
-        """An action of the task's action space, and the carry for the next step."""
+        """Return an action of the task's action space, which the simulator clips, and the carry of the next step."""
         ...
 
 
 class Memoryless:
-    """Mixed into planners that carry nothing from step to step."""
+    """Base of planners that carry nothing from step to step."""
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> tuple[()]:
-        """Nothing to carry."""
+        """Return an empty carry."""
         return ()
+
+
+class RuleBased(Memoryless, ABC):
+    """Base of planners that compute acceleration and curvature from the situation; records add ``actions``."""
+
+    actions: ActionSpace
+
+    @abstractmethod
+    def controls(self, bank: ScenarioBank, situation: Situation) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return acceleration (m/s2) and curvature (1/m)."""
+
+    def act(
+        self,
+        carry: Any,
+        bank: ScenarioBank,
+        state: SimState,
+        situation: Situation,
+        observation: Any,
+        key: Array,
+    ) -> tuple[Float[Array, " D"], Any]:
+        """Return the action of the controls."""
+        context = situation.context
+        length_m = bank.length_m(context.index, context.slot)
+        return self.actions.action(context.history[-1], *self.controls(bank, situation), length_m), carry

@@ -1,4 +1,4 @@
-"""Traffic in which a planner drives some of the others: a trained policy against which another one is judged."""
+"""Traffic in which a planner drives some of the others: a trained policy against which another one is evaluated."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drivax.simulator.contact import Contact
 from drivax.simulator.lights import remember_lights
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.situation import measure
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traffic
 from drivax.tasks.task import Task
@@ -29,12 +29,23 @@ _TRAVELS_M = 2.0
 
 
 @record
+class TrafficPolicy(TrafficData):
+    """The planner that drives agents other than ego."""
+
+    planner: Planner
+
+    def part(self, rows: Int[Array, " n"]) -> TrafficPolicy:
+        """Return the planner: all scenarios share it."""
+        return self
+
+
+@record
 class Driven:
     """State of the K agents that the planner drives.
 
     Attributes:
-        begin: Step at which the episode began; until then everyone moved as logged.
-        contexts: A context each; slots beyond the moving agents are nobody's.
+        begin: Step at which the episode began; until then all agents moved as logged.
+        contexts: A context each; slots beyond the moving agents are empty.
         base: State of the traffic around them.
     """
 
@@ -45,10 +56,10 @@ class Driven:
 
 @dataclass(frozen=True)
 class PlannerTraffic:
-    """The vehicles nearest to ego are driven by ``bank.driver``, everyone else behaves as in ``base``.
+    """The vehicles nearest to ego are driven by the planner of :func:`with_driver`, all others move by ``base``.
 
     Driven are vehicles that the log has when the episode begins and that travel more than 2 m in the rest of it. They
-    see ego, each other and everyone else, drive by the task's dynamics to the end of the episode, and have no route, as
+    see all agents, drive by the task's dynamics to the end of the episode, and have no route, as
     agents other than ego have none: a policy that is to drive them well is trained to follow lanes.
 
     Attributes:
@@ -70,22 +81,21 @@ class PlannerTraffic:
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """The bank with what ``base`` needs."""
-        return prepared(self.base, bank)
+        return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Driven:
-        """Everyone where the log has them at ``step``.
+        """All agents where the log has them at ``step``.
 
         Raises:
             UsageError: The bank has no driver.
         """
-        if bank.driver is None:
-            raise UsageError("the bank has no driver", cure="use planners.driven.with_driver first")
+        data_of(bank, TrafficPolicy, "use planners.planner_traffic.with_driver")
         simulator, slots = Simulator(self.task), self._slots(bank, index, step)
         contexts = jax.vmap(lambda slot: simulator.context(bank, index, step, slot))(slots)
         return Driven(jnp.asarray(step, jnp.int32), contexts, self.base.start(bank, index, step))
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Driven:
-        """One step of 0.1 s: everyone looks at the present frame, then all move."""
+        """One step of 0.1 s: every agent looks at the present frame, then all move."""
         now = context.traffic
 
         def frames(back: int) -> Frame:
@@ -102,7 +112,9 @@ class PlannerTraffic:
             key = jax.random.fold_in(jax.random.key(self.seed), bank.identity[one.index])
             key = jax.random.fold_in(key, one.step)
             seen = self.task.observe(bank, found.context, frames, frame)
-            asked, _ = bank.driver.act((), bank, state, found, seen, jax.random.fold_in(key, one.slot))
+            asked, _ = data_of(bank, TrafficPolicy).planner.act(
+                (), bank, state, found, seen, jax.random.fold_in(key, one.slot)
+            )
             motion, length = one.history[-1], bank.length_m(one.index, one.slot)
             action = self.task.actuated(motion, asked, one.action)
             motion = self.task.motion(motion, action, length)
@@ -123,7 +135,7 @@ class PlannerTraffic:
         return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
 
     def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:
-        """Slots of the vehicles that are driven, the nearest to ego first, filled up with nobody's."""
+        """Slots of the vehicles that are driven, the nearest to ego first, padded with empty slots."""
         rows = bank.agents[index]
         here = rows[step]
         moved = ((rows[..., AgentColumn.XY] - here[:, AgentColumn.XY]) ** 2).sum(axis=-1)
@@ -152,4 +164,4 @@ def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:
         raise UsageError(
             f"planner {driver.name!r} cannot drive others", cure="use a trained policy, or one without memory"
         )
-    return replace(bank, driver=driver)
+    return with_data(bank, TrafficPolicy(driver))

@@ -44,7 +44,7 @@ def _table(
 
 
 def _row(metric: MetricComparison) -> tuple[Cell, ...]:
-    label = comparison_label(metric)
+    label = _label(metric)
     effects = ", ".join(f"{name} {value:.3f}" for name, value in metric.effects.items() if value is not None)
     value = metric.effects.get("d_z", metric.effects.get("d"))
     a, b, difference = (
@@ -55,7 +55,7 @@ def _row(metric: MetricComparison) -> tuple[Cell, ...]:
         Cell(label.heading, title=label.title or metric.metric), _short(a), _short(b), _short(difference),
         Cell("", html=_picture(metric, label)),
         Cell(MISSING if value is None else f"{value:+.2f}".replace("-", "−"), title=effects),
-        Cell(p_value(metric.p_adjusted), note=_test_name(metric)), Cell(f"{metric.difference.n:,}"),
+        Cell(_p_text(metric.p_adjusted), note=_test_name(metric)), Cell(f"{metric.difference.n:,}"),
         Cell(metric.winner or MISSING),
     )  # fmt: skip
 
@@ -82,7 +82,7 @@ def _picture(metric: MetricComparison, label: MetricLabel) -> str:
     )
 
 
-def comparison_label(metric: MetricComparison) -> MetricLabel:
+def _label(metric: MetricComparison) -> MetricLabel:
     """Return how a metric is shown; the user's own metrics under their names, with their units."""
     known = metric_label(metric.metric)
     if known.explanation or not metric.unit:
@@ -92,7 +92,7 @@ def comparison_label(metric: MetricComparison) -> MetricLabel:
     return MetricLabel(text, metric.better, "share" if plain else metric.unit, "")
 
 
-def p_value(p: float | None) -> str:
+def _p_text(p: float | None) -> str:
     """Return a p-value with three digits, or that it is below 0.001."""
     return MISSING if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
 
@@ -142,9 +142,9 @@ def reasons(comparison: Comparison) -> list[str]:
         )
     if decision.because == "seeds":
         sentences.append("Seeds differ so much that more scenarios do not help: more seeds are needed.")
-    if decision.because == "alike":
+    if decision.because == "equal":
         same = "the same for A and B in each" if comparison.plan.split == "paired" else "the same in all"
-        sentences = [f"{comparison_label(primary).text} is {same} of {primary.difference.n:,} scenarios."]
+        sentences = [f"{_label(primary).text} is {same} of {primary.difference.n:,} scenarios."]
     sentences += _power_sentences(comparison)
     if decision.caveats:
         names = ", ".join(metric_label(name).text for name in decision.caveats)
@@ -155,10 +155,10 @@ def reasons(comparison: Comparison) -> list[str]:
 
 def _test_sentence(comparison: Comparison) -> str:
     """Return the result of the test of the primary metric."""
-    metric, label = comparison.primary, comparison_label(comparison.primary)
+    metric, label = comparison.primary, _label(comparison.primary)
     if metric.difference.mean is None or metric.evidence.p is None:
         return f"{label.text} cannot be tested: that takes two recordings at least."
-    p = p_value(metric.evidence.p)
+    p = _p_text(metric.evidence.p)
     test = f"{bounds(metric.difference, label.unit, signed=True)}, p {p if p[0] == '<' else '= ' + p}"
     size = number(abs(metric.difference.mean), label.unit) + suffix(label.unit, signed=True)
     more = "higher" if metric.difference.mean > 0 else "lower"
@@ -173,7 +173,7 @@ def _power_sentences(comparison: Comparison) -> list[str]:
     sensitivity, needed = comparison.sensitivity, comparison.decision.needed
     if sensitivity is None:
         return []
-    unit = comparison_label(comparison.primary).unit
+    unit = _label(comparison.primary).unit
     sentences = []
     if sensitivity.detectable is not None:
         least = number(sensitivity.detectable, unit) + suffix(unit, signed=True)
@@ -193,8 +193,8 @@ def notes(comparison: Comparison) -> list[str]:
     for metric in (comparison.primary, *comparison.secondary):
         if metric.undefined_a or metric.undefined_b:
             counts = f"undefined for A in {metric.undefined_a:,}, for B in {metric.undefined_b:,} scenarios"
-            lines.append(f"{comparison_label(metric).text}: {counts}")
-    unit = comparison_label(comparison.primary).unit
+            lines.append(f"{_label(metric).text}: {counts}")
+    unit = _label(comparison.primary).unit
     for arm, name, seeds in zip("AB", comparison.names, comparison.seeds, strict=True):
         if seeds is not None:
             means = ", ".join(number(mean, unit) for mean in seeds.means)

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from drivax.errors import DataError
-from drivax.evaluation.stored import EpisodeTable, ScenarioKey, comparable, open_driven_set
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.traffic_trajectories import unpacked
 from drivax.report.charts.motion import COMMANDED
 from drivax.report.pictures.drawing import Rollout
@@ -85,7 +86,7 @@ def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]
         known = 1.0 if np.isnan(score) else score
         return rank[outcome(run, row)], known, -completed[scenarios[row]], scenarios[row][1], row
 
-    return sorted(range(run.episodes), key=key)
+    return sorted(range(len(run)), key=key)
 
 
 def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
@@ -128,11 +129,10 @@ def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
 
 
 def _first_rows(run: Evaluation) -> dict[ScenarioKey, int]:
-    """Return the first episode of each scenario with a stored trajectory."""
+    """Return the first episode of each scenario."""
     rows: dict[ScenarioKey, int] = {}
-    for row, (key, dataset) in enumerate(zip(run.occurrences, run.keys["dataset"], strict=True)):
-        if key in run.trajectories.rows:
-            rows.setdefault((dataset, key[0]), row)
+    for row, key in enumerate(run.scenarios):
+        rows.setdefault(key, row)
     return rows
 
 
@@ -153,7 +153,7 @@ class EvaluatedSet:
     """
 
     def __init__(self, run: Evaluation, data: Path | None = None) -> None:
-        self.scenarios: ScenarioSet = open_driven_set(run, data)
+        self.scenarios: ScenarioSet = run.open_set(data)
         self._rows = {
             (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
         }
@@ -187,21 +187,21 @@ def rollouts_of(runs: Sequence[Evaluation], group: EpisodeGroup, scenario: Scena
 
 def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
     stored = run.trajectories
-    place = stored.rows[run.occurrences[row]]
-    steps, start = int(scenario.steps), int(stored.start[place])
+    steps, start = int(scenario.steps), int(stored.start[row])
     ego = np.full((steps, 4), np.nan)
     ego[:start] = logged_motion(scenario)[:start]
-    motion = stored.ego[place, : steps - start]
+    motion = stored.ego[row, : steps - start]
     ego[start : start + len(motion)] = motion
-    events = {name: int(at[place]) for name, at in stored.events.items()}
-    events["crashed"] = run.crashes.get(run.scenarios[row], (-1, ""))[0]
+    events = {name: int(at[row]) for name, at in stored.events.items()}
+    crash = run.crash_by_scenario.get(run.scenarios[row])
+    events["crashed"] = -1 if crash is None else crash.step
     action = np.full((steps, COMMANDED), np.nan)
-    commands = stored.action[place, : steps - start, :COMMANDED]
+    commands = stored.action[row, : steps - start, :COMMANDED]
     action[start : start + len(commands), : commands.shape[1]] = commands
     others = None
     if stored.others is not None:
         others = np.full((steps, *stored.others.shape[2:]), np.nan, np.float32)
-        others[start : start + len(motion)] = unpacked(stored.others[place, : steps - start])
+        others[start : start + len(motion)] = unpacked(stored.others[row, : steps - start])
     return Rollout(run.name, ego, start, events, outcome(run, row), action, others)
 
 

@@ -82,18 +82,18 @@ def audit_table(inspection: Inspection) -> Table | None:
 def finding_text(values: Sequence[Any]) -> str:
     """Return booleans as a count, numbers as mean, median and largest, words as counts."""
     if all(isinstance(value, bool) for value in values):
-        return share(sum(values), len(values))
+        return _share(sum(values), len(values))
     if all(isinstance(value, str) for value in values):
         return _counted({word: values.count(word) for word in sorted(set(values))}, len(values))
-    return spread(np.array(values, np.float64))
+    return _spread(np.array(values, np.float64))
 
 
-def share(count: int, of: int) -> str:
+def _share(count: int, of: int) -> str:
     """Return a count with its share."""
     return f"{count:,} of {of:,} ({100 * count / of:.3g} %)" if of else MISSING
 
 
-def spread(values: Float[np.ndarray[Any, Any], " n"]) -> str:
+def _spread(values: Float[np.ndarray[Any, Any], " n"]) -> str:
     """Return mean, median and largest value."""
     if not len(values):
         return MISSING

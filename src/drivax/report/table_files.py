@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.results import ADDED
-from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.episode_table import ADDED, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import (
     STRATA,
     collisions_table,

@@ -18,9 +18,9 @@ from drivax.simulator.types import AgentContext, Frame
 #: Look-ahead along the route and its spacing, m.
 _STEP_M, _POINTS = 2.0, 46
 _FALLBACK_LIMIT_MPS = 13.4
-#: Free space kept beside the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
+#: Free space kept next to the car, m; lateral acceleration in curves, m/s2; braking towards them, m/s2.
 _SIDE_M, _CURVE_MPS2, _CURVE_BRAKING_MPS2 = 0.3, 2.5, 2.0
-#: Things further beside the route than this, and ego's half width, are not looked at, m.
+#: Things further along the route than this, and ego's half width, are not looked at, m.
 _NEAR_M = 0.4
 #: A yellow light is a red one for a car that can stop with this deceleration, m/s2.
 _YELLOW_BRAKING_MPS2 = 3.0
@@ -36,16 +36,16 @@ class Ahead:
         gap: To the nearest thing in the way, bumper to bumper, or a little less than to a light that asks to stop, m;
             10 km where there is neither.
         leader: Speed of that thing along the route, m/s; 0 for a light.
-        wanted: The limit here, or what the curves ahead allow; 13.4 where no limit is known, 0 at the route's end, m/s.
+        desired: The limit here, or what the curves ahead allow; 13.4 where none is known, 0 at the route's end, m/s.
     """
 
     gap: Float[Array, ""]
     leader: Float[Array, ""]
-    wanted: Float[Array, ""]
+    desired: Float[Array, ""]
 
     def acceleration(self, speed: Float[Array, ""], parameters: IdmParameters) -> Float[Array, ""]:
         """What the IDM does with it at a speed, m/s2."""
-        return idm_acceleration(speed, self.wanted, self.gap, self.leader, parameters)
+        return idm_acceleration(speed, self.desired, self.gap, self.leader, parameters)
 
 
 def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: float) -> Ahead:
@@ -54,7 +54,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     Args:
         bank: The scenarios.
         context: The context.
-        frame: Everyone now.
+        frame: All agents now.
         min_gap_m: What the driver keeps from a thing, so that it stands 1 m before a stop line.
     """
     me = frame.box[context.slot]
@@ -80,7 +80,7 @@ def ahead(bank: ScenarioBank, context: AgentContext, frame: Frame, min_gap_m: fl
     return Ahead(
         gap=jnp.where(jnp.isfinite(gap), gap, FREE_M),
         leader=jnp.where(stop < gaps[nearest], 0.0, speed[nearest]),
-        wanted=jnp.where(there[1], desired_speed(path, there, offsets), 0.0),
+        desired=jnp.where(there[1], desired_speed(path, there, offsets), 0.0),
     )
 
 

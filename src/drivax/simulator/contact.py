@@ -13,7 +13,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.simulator.types import Frame
 
 TTC_HORIZON_S = 5.0
-#: Gaps are told up to here, m.
+#: Gaps are given up to here, m.
 FARTHEST_GAP_M = 50.0
 #: Below this speed a car stands (semantics, ``at_fault_collision`` and ``ttc``).
 STOPPED_MPS = 0.05
@@ -22,9 +22,9 @@ REAR_AXLE = 1.461 / 5.176
 
 
 class Contact(enum.IntEnum):
-    """What there is between the judged agent and another.
+    """What there is between the evaluated agent and another.
 
-    ``IGNORED`` overlapped when it appeared and counts for nothing until it parts; ``HIT`` touches without the judged
+    ``IGNORED`` overlapped when it appeared and counts for nothing until it parts; ``HIT`` touches without the evaluated
     agent's fault, ``AT_FAULT`` with it; ``PARTED`` is apart again, its fault decided once and for all; ``GONE``, of
     these three, is absent.
     """
@@ -39,11 +39,11 @@ class Contact(enum.IntEnum):
 
 
 class CollisionType(enum.IntEnum):
-    """Kind of the first collision, seen from the judged agent.
+    """Kind of the first collision, seen from the evaluated agent.
 
     The first that fits, in this order: ``VULNERABLE``: a pedestrian or cyclist; ``STOPPED_OBJECT``: the agent's front
-    hits somebody who stands; ``HEAD_ON``: headings differ by more than 135 deg, unless it touches from behind;
-    ``REAR_END``: the front hits somebody whose heading differs by less than 45 deg; ``REAR_ENDED``: hit from behind;
+    hits another agent that stands; ``HEAD_ON``: headings differ by more than 135 deg, unless it touches from behind;
+    ``REAR_END``: the front hits an agent whose heading differs by less than 45 deg; ``REAR_ENDED``: hit from behind;
     ``SIDE_SWIPE``: everything else, crossing traffic included.
     """
 
@@ -77,7 +77,7 @@ def next_contacts(
         before: Codes of the step before.
         touching: Who overlaps now.
         valid: Who is there now.
-        fault: For those whose first contact is now: whether it is the judged agent's fault.
+        fault: For those whose first contact is now: whether it is the evaluated agent's fault.
     """
     c = Contact
     appears = (before == c.IGNORED) | (before == c.ABSENT) | (before == c.GONE)
@@ -109,8 +109,8 @@ def classify_contacts(
     front: yes; sideways: yes when the agent leaves its lane or the road.
 
     Args:
-        frame: Everyone now.
-        slot: The judged agent.
+        frame: All agents now.
+        slot: The evaluated agent.
         fresh: Slots whose contact began at this step.
         speed: The larger speed of the agent before and after the step.
         others_speed: The same for every slot.
@@ -158,7 +158,7 @@ def time_to_collision(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, 
     """Seconds to the first overlap at constant velocities and fixed headings, at most 5 (semantics, ``ttc``).
 
     Agents that lie entirely behind the rear axle are followers and never count; nor does one that has run into the
-    agent without its fault, which ``left_out`` names. Of the rest, whoever overlaps within
+    agent without its fault, which ``left_out`` names. Of the rest, agents that overlap within
     the horizon is ahead or comes into the lane that the agent sweeps; no cone narrows the view.
     """
     me = frame.box[slot]
@@ -174,7 +174,7 @@ def nearest_gap(frame: Frame, slot: Int[Array, ""], left_out: Bool[Array, " S"])
     """Distance between the agent's box and the nearest other on its level, m, at most 50; 0 where they overlap.
 
     Args:
-        frame: Everyone now.
+        frame: All agents now.
         slot: The agent.
         left_out: Who does not count: those that overlapped it when they appeared, until they part.
     """

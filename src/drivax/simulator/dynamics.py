@@ -37,9 +37,9 @@ def bicycle(
     x, y, heading, speed = motion[0], motion[1], motion[2], motion[3]
     limit = GRIP_MPS2 / jnp.maximum(speed * speed, 1e-3)
     curvature = jnp.clip(curvature, -limit, limit)
-    wanted = speed + acceleration * DT_S
-    stops = wanted < 0.0
-    after = jnp.where(stops, 0.0, wanted)
+    unclipped = speed + acceleration * DT_S
+    stops = unclipped < 0.0
+    after = jnp.where(stops, 0.0, unclipped)
     braking = jnp.where(stops, -acceleration, 1.0)
     distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + after) / 2.0 * DT_S)
     turn = curvature * distance

@@ -46,6 +46,6 @@ def idm_acceleration(
     wanted_gap = p.min_gap_m + xp.maximum(dynamic, xp.zeros_like(dynamic))
     free = (speed / xp.maximum(desired_speed, xp.full_like(desired_speed, 0.1))) ** p.exponent
     interaction = (wanted_gap / xp.maximum(gap, xp.full_like(gap, 0.1))) ** 2
-    wanted = p.acceleration_mps2 * (1.0 - free - interaction)
-    low = xp.full_like(wanted, -1.0) * p.max_braking_mps2
-    return xp.maximum(wanted, low)
+    desired = p.acceleration_mps2 * (1.0 - free - interaction)
+    low = xp.full_like(desired, -1.0) * p.max_braking_mps2
+    return xp.maximum(desired, low)

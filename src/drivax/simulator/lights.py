@@ -11,9 +11,9 @@ from drivax.scenario.bank.scenario_bank import NEVER_M, ScenarioBank
 from drivax.scenario.schema import LightState
 from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext, LightMemory
 
-#: A stop before a right turn on red: slower than this, this near, within so many steps.
+#: A stop before a right turn on red: slower than this, this near, within this many steps.
 _PAUSE_MPS, _PAUSE_M, PAUSE_STEPS = 0.5, 3.0, 30
-#: Off the route, which of the lights it crossed an agent obeyed is judged by its heading so many steps later.
+#: Off the route, which of the lights it crossed an agent obeyed is evaluated by its heading this many steps later.
 JUDGED_AFTER = 20
 
 
@@ -67,7 +67,7 @@ def check_lights(
 
     begins = crossed & ~on_route
     age = jnp.where(begins, jnp.where(is_red, 1, -1), memory.crossed + jnp.sign(memory.crossed))
-    # What is still open when the log ends is judged then.
+    # What is still open when the log ends is evaluated then.
     due = (jnp.abs(age) > JUDGED_AFTER) | ((age != 0) & (context.step >= last))
     fit = jnp.where(due, line[LightRow.EXIT_COS] * me[2] + line[LightRow.EXIT_SIN] * me[3], -2.0)
     ran |= ((age > 0) & due & (fit >= fit.max() - 1e-6)).any()

@@ -3,7 +3,7 @@
 A potential is positive wherever the metric of the same name holds, zero beyond a margin, and in between
 ``max(0, 1 - d / margin)^2`` of a distance d that grows away from the fault. Its gradient is continuous, but for places
 that are equally far from two edges of the road. The metrics themselves stay
-what they are; a trajectory that was optimised with potentials is judged by them.
+what they are; a trajectory that was optimised with potentials is evaluated by them.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def collision_potential(frame: Frame, slot: Int[Array, ""], margin_m: float = 0.
     """Potential of every other agent of a frame for the agent in ``slot``.
 
     Args:
-        frame: Everyone.
-        slot: The agent whose pose is looked at; gradients flow to everybody's.
+        frame: All agents.
+        slot: The agent whose pose is evaluated; gradients flow to all agents.
         margin_m: Separation at which the potential ends; at least 0.3, more for boxes longer than 20 m.
 
     Returns:
@@ -87,7 +87,7 @@ def offroad_potential(
 
     Returns:
         Positive where a corner is off the road, zero where every corner is further than the margin from being so and
-        where nothing is mapped. Further than 3 m beyond every edge it is constant: nobody knows the way back.
+        where nothing is mapped. Further than 3 m beyond every edge it is constant: no direction is known.
 
     Raises:
         UsageError: A wider margin.
@@ -108,7 +108,7 @@ def fault_potential(
     Args:
         bank: The scenarios.
         context: The context.
-        frame: Everyone in it (``Simulator.frame``).
+        frame: All agents in it (``Simulator.frame``).
         margin_m: As above.
     """
     ground = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2

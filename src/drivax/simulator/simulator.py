@@ -54,8 +54,8 @@ class Simulator:
     def _begin(self, bank: ScenarioBank, context: AgentContext, cast: AgentContext) -> SimState:
         """The state in which an episode begins at a context."""
         now = self.frame(bank, context, cast, 0)
-        # Overlaps at the start are ignored until they part, as if everyone had just appeared; so nobody's fault is
-        # judged, for which alone a frame before this one would be needed.
+        # Overlaps at the start are ignored until they part, as if all agents had just appeared; so no fault is
+        # evaluated, for which alone a frame before this one would be needed.
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
         lights = remember_lights(bank, context)
         found, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
@@ -93,13 +93,13 @@ class Simulator:
         return Beginning(context, remember_lights(bank, context))
 
     def frame(self, bank: ScenarioBank, context: AgentContext, cast: AgentContext, back: int) -> Frame:
-        """Everyone ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
+        """All agents ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
         return frame_of(
             bank, context.index, context.step, self.traffic.agents(bank, context, back), cast, back
         )
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
-        """Everyone now, around one driven agent."""
+        """All agents now, around one driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
     def step(
@@ -134,8 +134,8 @@ class Simulator:
             states: The stack of their states. One whose slot is beyond the moving agents fills up the stack: it is on
                 no road, and is never rewarded nor over; its facts mean nothing.
             actions: An action each.
-            over: ``[K]`` whose episode has ended at an earlier step: they drive on as they are told, and are neither
-                rewarded nor judged any more. Nobody's by default, which is right for tasks that drive to the end.
+            over: ``[K]`` whose episode has ended at an earlier step: they drive on by their actions, and are neither
+                rewarded nor evaluated any more. None by default, which is right for tasks that drive to the end.
         """
         first = jax.tree.map(lambda leaf: leaf[0], states.context)
         seen = self.frame(bank, first, states.context, 0)
@@ -162,7 +162,7 @@ class Simulator:
         Args:
             bank: The scenarios.
             state: The state.
-            cast: Scenes of all driven agents of the scenario, stacked; the agent alone by default.
+            cast: Contexts of all driven agents of the scenario, stacked; the agent alone by default.
         """
         cast = alone(state.context) if cast is None else cast
         around = surroundings(bank, state.context, self.frame(bank, state.context, cast, 0))
@@ -231,7 +231,7 @@ class Simulator:
     def _move(
         self, bank: ScenarioBank, context: AgentContext, seen: Frame, action: Array, motion: Array | None
     ) -> AgentContext:
-        """Everyone moves one step on from a frame; nothing is measured yet."""
+        """All agents move one step on from a frame; nothing is measured yet."""
         traffic = self.traffic.advance(bank, context, seen)
         return self._drive_on(bank, context, action, motion, traffic)
 
@@ -259,7 +259,7 @@ class Simulator:
         seen: Frame,
         action: Array,
     ) -> tuple[SimState, Transition]:
-        """Measures an agent after everyone has moved on from a frame, and turns the step into a transition."""
+        """Measures an agent after all agents have moved on from a frame, and turns the step into a transition."""
         now = self.frame(bank, moved, cast, 0)
         found, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand

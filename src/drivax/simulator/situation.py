@@ -1,4 +1,4 @@
-"""Measure once: from a context and everyone's frame to the facts that metrics, rewards and planners share."""
+"""Measure once: from a context and the frame to the facts that metrics, rewards and planners share."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
 
 
 def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Surroundings:
-    """Everyone now, the lanes around the driven agent, and where it is on its route."""
+    """All agents now, the lanes around the driven agent, and where it is on its route."""
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
     lanes = around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
@@ -147,7 +147,7 @@ def _touch(
     context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
     reads: frozenset[str],
 ) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
-    """New contact codes, whether a contact that begins now is the agent's fault, its type, and time to collision.
+    """New contact codes, whether a contact that starts now is the agent's fault, its type, and time to collision.
 
     What ``reads`` does not ask for is zero, and codes stay as they are where it asks for nothing here.
     """
@@ -188,7 +188,7 @@ def _requested(
     if reads & _PASSAGES:
         ground, me = _ground(bank, context, frame), frame.box[context.slot]
         if strand is None:
-            # Whoever is changing lanes as the episode begins has come from where it was 1.5 s ago.
+            # An agent that is changing lanes as the episode begins has come from where it was 1.5 s ago.
             x, y, psi = context.history[0, : MOTION_HEADING + 1]
             heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
             strand = lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
@@ -198,14 +198,14 @@ def _requested(
 
 
 def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
-    """The facts that are wanted; None in place of the others."""
-    # The next passage is judged from the strand of this one.
-    wanted = reads | ({"strand"} if reads & _PASSAGES else frozenset())
+    """The facts that are requested; None in place of the others."""
+    # The next passage is evaluated from the strand of this one.
+    desired = reads | ({"strand"} if reads & _PASSAGES else frozenset())
 
     def keep(path: tuple[Any, ...], fact: Array) -> Array | None:
-        return fact if path[0].name in wanted else None
+        return fact if path[0].name in desired else None
 
-    return facts if wanted >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
+    return facts if desired >= FACTS | ON_REQUEST else jax.tree_util.tree_map_with_path(keep, facts)
 
 
 def _off_the_road(
@@ -221,9 +221,7 @@ def _speed(frame: Frame) -> Float[Array, " S"]:
     return norm(frame.velocity)
 
 
-def _rates(
-    history: Float[Array, "16 4"],
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _rates(history: Float[Array, "16 4"]) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)

@@ -13,21 +13,21 @@ from jaxtyping import Array, Bool
 AT_ONCE = 8
 
 
-def map_where(wanted: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
-    """``jax.vmap(function)`` where ``wanted``, zeros elsewhere; the cost follows how many are wanted.
+def map_where(requested: Bool[Array, " B"], function: Callable[..., Any], *arguments: Any) -> Any:
+    """``jax.vmap(function)`` where ``requested``, zeros elsewhere; the cost follows how many are requested.
 
     They are computed 8 at a time, as often as it takes, in a loop that cannot be differentiated in reverse.
 
     Args:
-        wanted: Which rows of the batch are needed.
+        requested: Which rows of the batch are needed.
         function: Of one row each of the arguments; gives a pytree of arrays.
         arguments: Pytrees of arrays ``[B, ...]``.
     """
-    count, every = wanted.shape[0], jax.vmap(function)
+    count, every = requested.shape[0], jax.vmap(function)
     few = min(AT_ONCE, count)
     one = jax.eval_shape(function, *jax.tree.map(lambda leaf: leaf[0], arguments))
     nothing = jax.tree.map(lambda leaf: jnp.zeros((count, *leaf.shape), leaf.dtype), one)
-    # The first wanted row ranks highest; top_k of floats is the cheapest way to find a few of them.
+    # The first requested row ranks highest; top_k of floats is the cheapest way to find a few of them.
     rank = jnp.arange(count, 0, -1).astype(jnp.float32)
 
     def more(carry: tuple[Array, Any]) -> Array:
@@ -41,4 +41,4 @@ def map_where(wanted: Bool[Array, " B"], function: Callable[..., Any], *argument
         found = jax.tree.map(lambda all_, row: all_.at[place].set(row, mode="drop"), found, rows)
         return left.at[place].set(False, mode="drop"), found
 
-    return jax.lax.while_loop(more, some, (wanted, nothing))[1]
+    return jax.lax.while_loop(more, some, (requested, nothing))[1]

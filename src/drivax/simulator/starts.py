@@ -106,7 +106,7 @@ class NoisyStart:
         """
         if key is None:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
-        # Only steps at which the log has the agent can be driven anew.
+        # Only steps at which the log has the agent can be driven again.
         back = jnp.arange(1, self.steps + 1)
         known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0) & (
             back <= step

@@ -16,7 +16,7 @@ from drivax.simulator.types import SimState
 def slots_of(
     bank: ScenarioBank, index: Any, mask: Bool[Array, " A"], count: int, step: Any = CURRENT_STEP
 ) -> Int[Array, " K"]:
-    """Slots of the agents of a mask that the log has at ``step``, filled up with A, which is nobody's slot.
+    """Slots of the agents of a mask that the log has at ``step``, filled up with A, an empty slot.
 
     Args:
         bank: The scenarios.

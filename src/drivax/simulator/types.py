@@ -19,7 +19,7 @@ MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
 
 @record
 class AgentContext:
-    """All that an observation depends on beside the bank; what a replay stores.
+    """All that an observation depends on in addition to the bank; what a replay buffer stores.
 
     Attributes:
         index: Row of the bank.
@@ -44,7 +44,7 @@ class AgentContext:
 
 @record
 class Frame:
-    """Everyone at one step: in each of the S slots a moving or a parked agent, or nobody; and the L lights.
+    """All agents at one step: in each of the S slots a moving or a parked agent, or none; and the L lights.
 
     Attributes:
         box: x, y, cos, sin, length, width.
@@ -140,7 +140,7 @@ class LightMemory:
 
     Attributes:
         pause: Steps since the agent last stood before the line; saturates.
-        crossed: Steps since it crossed the line off its route, until that is judged: positive where the light was red,
+        crossed: Steps since it crossed the line off its route, until evaluation: positive where the light was red,
             negative where not, 0 for none.
     """
 
@@ -201,7 +201,7 @@ class Transition:
 
 @runtime_checkable
 class Traffic(Protocol):
-    """How everyone who is not driven moves; ``name`` is what tables call it.
+    """How agents that are not driven moves; ``name`` is what tables call it.
 
     A model that needs something precomputed also has ``prepare(bank) -> bank``, which evaluation calls.
     """
@@ -216,7 +216,7 @@ class Traffic(Protocol):
         ...
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Any:
-        """Traffic state one step later, given everyone's present frame."""
+        """Traffic state one step later, given the present frame."""
         ...
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:

@@ -1,1 +1,5 @@
-"""Intervals, tests, clusters and effect sizes; knows numbers, not driving."""
+"""Statistics of episodes in clusters: intervals, significance tests, effect sizes, seeds and rankings."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

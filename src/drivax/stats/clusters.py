@@ -1,7 +1,7 @@
-"""Values of episodes that come in clusters: windows of one recording are not independent of each other.
+"""Values of episodes in clusters: windows of one recording are not independent of each other.
 
-A cluster is a recording (``segment``); whole clusters are resampled, flipped or assigned, never parts of them. Clusters
-may lie in strata (kinds of scenario), within which they are resampled or assigned.
+A cluster is a recording (``segment``); whole clusters are resampled, flipped or assigned. Clusters may lie in strata
+(kinds of scenario), within which they are resampled or assigned.
 """
 
 from __future__ import annotations
@@ -16,29 +16,26 @@ from drivax.errors import UsageError
 
 Values = Float64[np.ndarray, " n"]
 Labels = Int64[np.ndarray, " n"]
-#: Of each cluster: a sum, or the number of its stratum.
+#: A sum per cluster.
 Totals = Float64[np.ndarray, " cluster"]
+#: The stratum of each cluster.
 Strata = Int64[np.ndarray, " cluster"]
 
 
 def recordings(datasets: Iterable[str], segments: Iterable[str], scenarios: Iterable[str]) -> list[str]:
-    """The cluster of each scenario: its recording, or itself where no recording (``segment``) is known."""
+    """Return the cluster of each scenario: its recording, or itself where no recording (``segment``) is known."""
     rows = zip(datasets, segments, scenarios, strict=True)
     return [f"{dataset}/{segment or scenario}" for dataset, segment, scenario in rows]
 
 
 def recordings_of(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The recording of each scenario of a set, by the entries of its manifest."""
+    """Return the recording of each scenario of a set, from the entries of its manifest."""
     names = ("dataset", "segment", "scenario_id")
     return recordings(*([str(entry[name]) for entry in entries] for name in names))
 
 
 def numbers(values: Any) -> Values:
-    """Values as float64 with NaN where undefined.
-
-    Raises:
-        UsageError: If they are no list, or one is infinite.
-    """
+    """Return values as float64 with NaN where undefined; refuse infinite ones."""
     x = np.asarray(values, dtype=np.float64)
     if x.ndim != 1 or np.isinf(x).any():
         raise UsageError(
@@ -48,36 +45,28 @@ def numbers(values: Any) -> Values:
 
 
 def differences(a: Any, b: Any) -> Values:
-    """``a - b`` pair by pair, NaN where either is undefined.
-
-    Raises:
-        UsageError: If they are not equally many.
-    """
+    """Return ``a - b`` pair by pair, NaN where either is undefined."""
     first, second = numbers(a), numbers(b)
     if first.shape != second.shape:
         raise UsageError(
-            f"pairs need equally many values, not {first.size} and {second.size}",
+            f"pairs need two lists of one length, not {first.size} and {second.size}",
             cure="pair by scenario first",
         )
     return first - second
 
 
 def defined(values: Any, clusters: Any = None) -> tuple[Values, Labels]:
-    """The defined values and the dense number of the cluster of each; without clusters each is its own.
-
-    Raises:
-        UsageError: If lengths disagree, or a value is infinite.
-    """
+    """Return the defined values and their dense cluster labels; without clusters each value is its own."""
     x = numbers(values)
     labels, keep = dense(clusters, x.size, "cluster"), ~np.isnan(x)
     return x[keep], dense(labels[keep], int(keep.sum()), "cluster")
 
 
 def dense(labels: Any, count: int, kind: str) -> Labels:
-    """Labels as numbers from 0 on; None gives each of ``count`` values its own.
+    """Return labels as numbers from 0 on; None gives each of ``count`` values its own.
 
     Raises:
-        UsageError: If there are not ``count`` of them.
+        UsageError: There are not ``count`` labels; the message calls them ``kind``.
     """
     if labels is None:
         return np.arange(count, dtype=np.int64)
@@ -89,17 +78,17 @@ def dense(labels: Any, count: int, kind: str) -> Labels:
 
 
 def totals(x: Values, labels: Labels) -> tuple[Totals, Totals]:
-    """Sum and number of the values of each cluster."""
+    """Return sum and number of the values of each cluster."""
     return np.bincount(labels, weights=x), np.bincount(labels).astype(np.float64)
 
 
 def design_effect(x: Values, labels: Labels) -> float:
-    """How much larger the variance of a mean is than for independent values; between 1 and ``n``.
+    """Return the variance of a mean relative to that of independent values, between 1 and ``n``.
 
     ``deff = V / (s^2 / n)`` with ``V = C / (C - 1) * sum((S_c - m n_c)^2) / n^2``, the variance of the ratio of cluster
     totals (Kish, Survey Sampling, 1965, section 8.2; Cochran, Sampling Techniques, 1977, section 6.3), and ``s^2`` the
-    mean squared deviation, for shares ``p (1 - p)``. Where all values agree, or there is one cluster, nothing can be
-    said about ``V``, and clusters count as single values: ``n / C``.
+    mean squared deviation, for shares ``p (1 - p)``. Where all values agree, or there is one cluster, ``V`` cannot be
+    estimated, and clusters count as single values: ``n / C``.
     """
     sums, counts = totals(x, labels)
     n, clusters, mean = x.size, sums.size, float(x.mean())
@@ -113,15 +102,15 @@ def design_effect(x: Values, labels: Labels) -> float:
 
 
 def stratum_of_clusters(strata: Any, labels: Labels, least: int = 2) -> Strata:
-    """The stratum of each cluster; small strata are pooled (Cochran 1977, section 5A.12, "collapsed strata").
+    """Return the stratum of each cluster; small strata are pooled (Cochran 1977, section 5A.12, "collapsed strata").
 
     Args:
         strata: Labels of strata, one per value; all values of a cluster have the same.
-        labels: Dense number of the cluster of each value.
-        least: Strata with fewer clusters are taken together; if these are still fewer, they join the smallest other.
+        labels: Dense cluster label of each value.
+        least: Strata with fewer clusters are pooled; a pool that is still smaller joins the smallest other stratum.
 
     Raises:
-        UsageError: If a cluster lies in two strata.
+        UsageError: A cluster lies in two strata.
     """
     own = dense(strata, labels.size, "stratum")
     _, first = np.unique(labels, return_index=True)

@@ -1,4 +1,4 @@
-"""How large is a difference, and how many scenarios does it take to see one: effect sizes and power."""
+"""Effect sizes, power, and the number of scenarios that it takes to detect a difference."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy import special
 from drivax.errors import UsageError
 from drivax.stats.clusters import differences, numbers
 
-#: A deviation that is smaller than this, relative to the values, is rounding and none.
+#: Deviations below this, relative to the values, are rounding.
 ROUNDING = 1e-9
-#: No comparison needs more scenarios than this; a smaller effect is none.
+#: The largest number of scenarios that is considered.
 _MOST = 10**12
 
 
@@ -36,26 +36,20 @@ def cohens_d_paired(a: Any, b: Any) -> PairedEffect:
 
     Cohen, Statistical Power Analysis, 1988, section 2.3.5 (``d_z``); Cumming, Understanding the New Statistics, 2012,
     chapter 11 (``d_av``). Standard deviations have ``n - 1``; pairs with an undefined value are left out.
-
-    Raises:
-        UsageError: If lengths disagree, or a value is infinite.
     """
     x = differences(a, b)
     keep = ~np.isnan(x)
     if keep.sum() < 2:
         return PairedEffect(None, None)
-    apart, first, second = x[keep], numbers(a)[keep], numbers(b)[keep]
+    paired, first, second = x[keep], numbers(a)[keep], numbers(b)[keep]
     within = math.sqrt((first.var(ddof=1) + second.var(ddof=1)) / 2)
-    return PairedEffect(_over(apart.mean(), apart.std(ddof=1)), _over(apart.mean(), within))
+    return PairedEffect(_over(paired.mean(), paired.std(ddof=1)), _over(paired.mean(), within))
 
 
 def cohens_d(a: Any, b: Any) -> float | None:
     """Cohen's d of two independent samples, ``(m_a - m_b) / s`` with the pooled standard deviation (Cohen 1988, 2.5).
 
     None where nothing varies, or a sample has fewer than two defined values.
-
-    Raises:
-        UsageError: If a value is infinite.
     """
     first, second = (values[~np.isnan(values)] for values in (numbers(a), numbers(b)))
     if min(first.size, second.size) < 2:
@@ -66,7 +60,7 @@ def cohens_d(a: Any, b: Any) -> float | None:
 def pooled_deviation(a: Any, b: Any) -> float:
     """``sqrt(((n_a - 1) s_a^2 + (n_b - 1) s_b^2) / (n_a + n_b - 2))`` of defined values."""
     first, second = numbers(a), numbers(b)
-    squares = sum(float(np.square(one - one.mean()).sum()) for one in (first, second))
+    squares = sum(float(np.square(sample - sample.mean()).sum()) for sample in (first, second))
     return math.sqrt(squares / (first.size + second.size - 2))
 
 
@@ -75,9 +69,9 @@ def _over(difference: Any, deviation: Any) -> float | None:
 
 
 def power(effect: float, n: float, confidence: float = 0.95, share: float | None = None) -> float:
-    """Probability that a two-sided t-test finds an effect of this size.
+    """Probability that a two-sided t-test detects an effect of this size.
 
-    ``P(|T| > t)`` with ``T`` noncentral t: of pairs ``n - 1`` degrees of freedom and noncentrality ``d sqrt(n)``, of
+    ``P(|T| > t)`` with ``T`` noncentral t: for pairs ``n - 1`` degrees of freedom and noncentrality ``d sqrt(n)``, for
     two arms ``n - 2`` and ``d sqrt(n w (1 - w))`` (Cohen 1988, section 2.3; Johnson, Kotz and Balakrishnan, Continuous
     Univariate Distributions 2, 1995, chapter 31).
 
@@ -86,12 +80,11 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
         n: Pairs, or scenarios of both arms; may be fractional (an effective sample size).
         confidence: 1 - level of the test.
         share: ``w``, the share of the first arm; None for pairs.
-
-    Raises:
-        UsageError: If a number is impossible.
     """
     if not (0 < confidence < 1 and (share is None or 0 < share < 1) and n > 0):
-        raise UsageError("no such power", cure="confidence and share lie between 0 and 1, n above 0")
+        raise UsageError(
+            "confidence, share or n out of range", cure="confidence and share lie between 0 and 1, n above 0"
+        )
     freedom = n - (1 if share is None else 2)
     if freedom <= 0:
         return 0.0
@@ -104,52 +97,37 @@ def power(effect: float, n: float, confidence: float = 0.95, share: float | None
 
 
 def scenarios_needed(
-    effect: float, wanted: float = 0.8, confidence: float = 0.95, share: float | None = None
+    effect: float, target: float = 0.8, confidence: float = 0.95, share: float | None = None
 ) -> int:
-    """The least number of independent scenarios with which an effect is found with power ``wanted``.
+    """Return the least number of independent scenarios with which an effect is detected with power ``target``.
 
-    Args:
-        effect: ``d_z`` of pairs, or Cohen's d of two arms.
-        wanted: The power.
-        confidence: 1 - level of the test.
-        share: The share of the first arm; None for pairs.
-
-    Returns:
-        Pairs, or scenarios of both arms together. Clusters take ``deff`` times as many.
-
-    Raises:
-        UsageError: If a number is impossible, or the effect is zero.
+    Counts pairs, or scenarios of both arms together; clusters take ``deff`` times as many. Arguments as for
+    :func:`power`.
     """
-    if effect == 0 or not 0 < wanted < 1:
+    if effect == 0 or not 0 < target < 1:
         raise UsageError(
-            "no number of scenarios shows that", cure="give an effect, and a power between 0 and 1"
+            f"no number of scenarios detects an effect of {effect} with power {target}",
+            cure="give an effect, and a power between 0 and 1",
         )
     low, high = 1, 2
-    while not power(effect, high, confidence, share) >= wanted and high < _MOST:
+    while not power(effect, high, confidence, share) >= target and high < _MOST:
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if power(effect, middle, confidence, share) >= wanted else (middle, high)
+        low, high = (low, middle) if power(effect, middle, confidence, share) >= target else (middle, high)
     return high
 
 
 def detectable(
-    n: float, wanted: float = 0.8, confidence: float = 0.95, share: float | None = None
+    n: float, target: float = 0.8, confidence: float = 0.95, share: float | None = None
 ) -> float | None:
-    """The smallest effect that is found with power ``wanted``; None where ``n`` is too small for any.
-
-    Args:
-        n: Pairs, or scenarios of both arms; may be fractional.
-        wanted: The power.
-        confidence: 1 - level of the test.
-        share: The share of the first arm; None for pairs.
-    """
+    """Return the smallest effect that is detected with power ``target``; None where ``n`` is too small for any."""
     low, high = 0.0, 1.0
-    while power(high, n, confidence, share) < wanted:
+    while power(high, n, confidence, share) < target:
         if high > 1e6:
             return None
         high *= 2
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (low, middle) if power(middle, n, confidence, share) >= wanted else (middle, high)
+        low, high = (low, middle) if power(middle, n, confidence, share) >= target else (middle, high)
     return high

@@ -1,4 +1,4 @@
-"""How well scores rank what is to be found above everything else."""
+"""Ranking quality of scores: AUC, precision at the base rate, and rank correlation."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Labels = Bool[np.ndarray[Any, Any], " n"]
 
 
 def roc_auc(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Chance that what is to be found scores above what is not; a tie counts half (Hanley and McNeil, 1982).
+    """Probability that a positive scores above a negative; a tie counts half (Hanley and McNeil, 1982).
 
     Args:
-        scores: Of everything.
-        labels: What is to be found.
-        weights: How much each counts; all alike by default.
+        scores: Scores.
+        labels: True for positives.
+        weights: Weight of each; equally by default.
 
     Raises:
-        UsageError: There is nothing to be found, or nothing else.
+        UsageError: There are no positives, or no negatives.
     """
     _check(labels)
     return _auc(*_masses(_places(scores), labels, np.ones(len(scores)) if weights is None else weights))
@@ -37,7 +37,7 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
     over both kinds.
 
     Raises:
-        UsageError: There are fewer than two of a kind.
+        UsageError: There are fewer than two positives or negatives.
     """
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) < 2:
@@ -52,12 +52,12 @@ def auc_interval(scores: Numbers, labels: Labels, confidence: float = 0.95) -> t
 
 
 def precision_at_base_rate(scores: Numbers, labels: Labels, weights: Numbers | None = None) -> float:
-    """Share of what is to be found among the highest scores, if as many are taken as there are to be found.
+    """Share of positives among the highest scores, of which as many are taken as there are positives.
 
     1 for a perfect ranking, the base rate itself for one by chance. Of equal scores at the edge a share is taken.
 
     Raises:
-        UsageError: There is nothing to be found, or nothing else.
+        UsageError: There are no positives, or no negatives.
     """
     _check(labels)
     return _precision(*_masses(_places(scores), labels, np.ones(len(scores)) if weights is None else weights))
@@ -73,33 +73,33 @@ def bootstrap_intervals(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Intervals of :func:`roc_auc` and :func:`precision_at_base_rate`, by percentiles of a cluster bootstrap.
 
-    Whole clusters are drawn with replacement (Davison and Hinkley, Bootstrap Methods, 1997, 3.8): those in which there
-    is something to be found and those in which there is nothing apart, so that the base rate stays.
+    Whole clusters are drawn with replacement (Davison and Hinkley, Bootstrap Methods, 1997, 3.8): those with
+    a positive and those without are drawn separately, so that the base rate stays.
 
     Args:
-        scores: Of everything.
-        labels: What is to be found.
-        weights: How much each counts.
+        scores: Scores.
+        labels: True for positives.
+        weights: Weight of each.
         clusters: What belongs together: the scenario of a step.
         resamples: How often.
         confidence: Of both intervals.
 
     Raises:
-        UsageError: There is nothing to be found, or nothing else.
+        UsageError: There are no positives, or no negatives.
     """
     _check(labels)
     place, rng = _places(scores), np.random.default_rng(0)
     number, cluster = np.unique(clusters, return_inverse=True)
     holds = np.bincount(cluster, labels, len(number)) > 0
     kinds = [np.flatnonzero(holds), np.flatnonzero(~holds)]
-    found = []
+    samples = []
     for _ in range(resamples):
         drawn = np.concatenate([rng.choice(kind, len(kind)) for kind in kinds if len(kind)])
         times = np.bincount(drawn, minlength=len(number))[cluster]
         masses = _masses(place, labels, weights * times)
-        found.append((_auc(*masses), _precision(*masses)))
+        samples.append((_auc(*masses), _precision(*masses)))
     tail = (1.0 - confidence) / 2
-    low, high = np.quantile(found, (tail, 1.0 - tail), axis=0)
+    low, high = np.quantile(samples, (tail, 1.0 - tail), axis=0)
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
@@ -111,33 +111,33 @@ def _places(scores: Numbers) -> Int[np.ndarray[Any, Any], " n"]:
 def _masses(
     place: Int[np.ndarray[Any, Any], " n"], labels: Labels, weights: Numbers
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Weight of what is to be found, and of the rest, by score."""
+    """Return the weight of positives and of negatives, by score."""
     count = int(place.max()) + 1
     return np.bincount(place, weights * labels, count), np.bincount(place, weights * ~labels, count)
 
 
-def _auc(found: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
-    below = np.cumsum(other) - other
-    return float(np.sum(found * (below + other / 2)) / (found.sum() * other.sum()))
+def _auc(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
+    below = np.cumsum(negative) - negative
+    return float(np.sum(positive * (below + negative / 2)) / (positive.sum() * negative.sum()))
 
 
-def _precision(found: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
-    found, every = found[::-1], (found + other)[::-1]
-    wanted = found.sum()
-    left = wanted - (np.cumsum(every) - every)
-    taken = np.clip(np.divide(left, every, out=np.zeros_like(every), where=every > 0), 0.0, 1.0)
-    return float(np.sum(found * taken) / wanted)
+def _precision(positive: np.ndarray[Any, Any], negative: np.ndarray[Any, Any]) -> float:
+    positive, total = positive[::-1], (positive + negative)[::-1]
+    count = positive.sum()
+    left = count - (np.cumsum(total) - total)
+    taken = np.clip(np.divide(left, total, out=np.zeros_like(total), where=total > 0), 0.0, 1.0)
+    return float(np.sum(positive * taken) / count)
 
 
-def rank_correlation(one: Numbers, other: Numbers) -> float:
-    """The correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN where one of them is constant."""
+def rank_correlation(first: Numbers, second: Numbers) -> float:
+    """The correlation of mid-ranks (Spearman, Am. J. Psychol. 15, 1904); NaN where one is constant."""
     with np.errstate(invalid="ignore"):
-        return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
+        return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
 
 
 def correlation_interval(
-    one: Numbers,
-    other: Numbers,
+    first: Numbers,
+    second: Numbers,
     clusters: Sequence[Any] | np.ndarray[Any, Any],
     resamples: int = 200,
     confidence: float = 0.95,
@@ -148,25 +148,27 @@ def correlation_interval(
     where nearly all scores are the same.
 
     Args:
-        one: Some scores.
-        other: Others of the same.
+        first: Some scores.
+        second: Others of the same.
         clusters: What belongs together: the recording of a scenario, the scenario of a step.
         resamples: How often.
         confidence: Of the interval.
     """
     number = np.unique(np.asarray(clusters), return_inverse=True)[1]
     parts = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
-    rng, found = np.random.default_rng(0), []
+    rng, samples = np.random.default_rng(0), []
     for _ in range(resamples):
         rows = np.concatenate([parts[place] for place in rng.integers(len(parts), size=len(parts))])
-        found.append(rank_correlation(one[rows], other[rows]))
-    if len(parts) < 2 or np.isnan(found).any():
+        samples.append(rank_correlation(first[rows], second[rows]))
+    if len(parts) < 2 or np.isnan(samples).any():
         return -1.0, 1.0
     tail = (1.0 - confidence) / 2
-    low, high = np.quantile(found, (tail, 1.0 - tail))
+    low, high = np.quantile(samples, (tail, 1.0 - tail))
     return float(low), float(high)
 
 
 def _check(labels: Labels) -> None:
     if labels.all() or not labels.any():
-        raise UsageError("there is nothing to find, or nothing else", cure="use a set that has both")
+        raise UsageError(
+            "labels are all true or all false", cure="use a set that has positives and negatives"
+        )

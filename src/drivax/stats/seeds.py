@@ -1,6 +1,6 @@
-"""Differences between agents that were trained several times: seeds and scenarios are both drawn by chance.
+"""Differences between policies trained with several seeds: seeds and scenarios are crossed random effects.
 
-A difference that other seeds, or other scenarios, would not show again is none: the variances of both are added.
+The variances of seeds and scenarios are added, so that an interval covers other seeds and other scenarios.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from drivax.stats.clusters import dense
 from drivax.stats.effects import ROUNDING
 from drivax.stats.intervals import Interval, effective_size, wilson
 
-#: Values of the agents of one kind, one column per scenario.
+#: Values of one policy, a row per training seed, a column per scenario.
 Values = Float64[np.ndarray, "agent scenario"]
-#: Those of another kind, of whom there may be more or fewer.
+#: Values of another policy, with more or fewer seeds.
 Others = Float64[np.ndarray, "other_agent other_scenario"]
 Weights = Float64[np.ndarray, " scenario"]
-#: What is wanted of a comparison that has not been made yet.
+#: Defaults of a planned comparison.
 _CONFIDENCE, _POWER = 0.95, 0.80
 #: The largest number that is considered, and how many up to there.
 _MOST, _TRIED = 10**6, 400
@@ -32,7 +32,7 @@ _MOST, _TRIED = 10**6, 400
 
 @dataclass(frozen=True)
 class Crossed:
-    """A mean difference of two kinds of agents, several agents of each, all of which drove the same scenarios.
+    """A mean difference of two policies with several seeds each, all evaluated on the same scenarios.
 
     The squared standard error adds what the choice of seeds and the choice of scenarios contribute, and takes away once
     what is in both: ``se^2 = s_a^2 / K_a + s_b^2 / K_b + v - e_a - e_b``. These are the variances of the means of
@@ -85,13 +85,13 @@ class Crossed:
         return self.difference - half, self.difference + half
 
     def detectable(self, power: float = _POWER, confidence: float = _CONFIDENCE) -> float:
-        """The smallest difference that so many seeds and scenarios find with a probability of ``power``."""
+        """Return the smallest difference that is detected with probability ``power``."""
         return self.error * (
             _quantile(self.freedom, (1.0 + confidence) / 2.0) + _quantile(self.freedom, power)
         )
 
     def power(self, difference: float, confidence: float = _CONFIDENCE) -> float:
-        """Probability to find a difference of this size with so many seeds and scenarios."""
+        """Probability to detect a difference of this size."""
         if self.error == 0.0:
             return float(difference != 0.0)
         reach = abs(difference) / self.error - _quantile(self.freedom, (1.0 + confidence) / 2.0)
@@ -106,7 +106,7 @@ class Crossed:
         return self._least(self._with_clusters, self.clusters, power, confidence)
 
     def _with_seeds(self, number: int) -> Crossed:
-        """With so many seeds of each kind, as if they varied as these."""
+        """Extrapolate to ``number`` seeds of each policy with the same variance."""
         shares = [count / number for count in self.agents]
         seeds, both = (
             [x * share for x, share in zip(xs, shares, strict=True)] for xs in (self.seeds, self.both)
@@ -118,7 +118,7 @@ class Crossed:
         )  # fmt: skip
 
     def _with_clusters(self, number: int) -> Crossed:
-        """With so many clusters, as if they varied as these."""
+        """Extrapolate to ``number`` clusters with the same variance."""
         share = self.clusters / number
         both = [x * share for x in self.both]
         seeds = [max(x - own, 0.0) + own * share for x, own in zip(self.seeds, self.both, strict=True)]
@@ -130,7 +130,7 @@ class Crossed:
     def _least(
         self, at: Callable[[int], Crossed], present: int, power: float, confidence: float
     ) -> int | None:
-        def found(number: int) -> bool:
+        def detected(number: int) -> bool:
             return abs(self.difference) >= at(number).detectable(power, confidence)
 
         # More is not always better: the fewer degrees of freedom are left, the more the part that stays alone weighs.
@@ -139,13 +139,13 @@ class Crossed:
             .astype(int)
             .tolist()
         )
-        at_least = next((place for place, number in enumerate(numbers) if found(number)), None)
+        at_least = next((place for place, number in enumerate(numbers) if detected(number)), None)
         if self.difference == 0.0 or at_least is None:
             return None
         low, high = (numbers[at_least - 1] if at_least else present), numbers[at_least]
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (low, middle) if found(middle) else (middle, high)
+            low, high = (low, middle) if detected(middle) else (middle, high)
         return high
 
 
@@ -157,7 +157,7 @@ def crossed_mean(values: Values, clusters: Any = None, weights: Weights | None =
     Args:
         values: One row per agent, one column per scenario; scenarios that some agent leaves undefined are left out.
         clusters: Labels of the clusters of scenarios; None: every scenario is its own.
-        weights: How much each scenario counts; None: all alike.
+        weights: How much each scenario counts; None: equally.
 
     Raises:
         UsageError: There are fewer than two clusters of scenarios that all define.
@@ -170,7 +170,7 @@ def certain(values: Values) -> Others:
     return values if len(values) > 1 else np.repeat(values, 2, axis=0)
 
 
-def agents_interval(
+def seeds_interval(
     values: Values,
     clusters: Any = None,
     weights: Weights | None = None,
@@ -196,33 +196,33 @@ def agents_interval(
     labels = dense(clusters, values.shape[1], "cluster")
     if np.unique(labels[keep]).size < 2:
         return Interval(float(values[:, keep].mean()) if number else None, None, None, number)
-    found = crossed_mean(values, labels, weights)
-    low, high = found.interval(confidence)
+    effect = crossed_mean(values, labels, weights)
+    low, high = effect.interval(confidence)
     only = np.unique(values[:, keep])
     if share and only.size == 1 and only[0] in (0.0, 1.0):
         mass = np.bincount(labels[keep], weight[keep])
-        trials = found.clusters if weights is None else effective_size(mass)
+        trials = effect.clusters if weights is None else effective_size(mass)
         return replace(wilson(float(only[0]) * trials, trials, confidence), n=number)
     if share:
         low, high = max(low, 0.0), min(high, 1.0)
-    return Interval(found.difference, low, high, number)
+    return Interval(effect.difference, low, high, number)
 
 
 def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed:
     """The difference of the means of two kinds of agents.
 
     Args:
-        a: One row per agent, one column per scenario; scenarios that some agent leaves undefined are left out.
+        a: A row per seed, a column per scenario; scenarios that some seed leaves undefined are left out.
         b: The other kind's, in the same scenarios.
         clusters: Labels of the clusters of scenarios; None: every scenario is its own.
         weights: How much each scenario counts, as where some kinds were drawn more often than they occur; those of 0
-            are left out. None: all alike.
+            are left out. None: equally.
 
     Raises:
         UsageError: There are fewer than two agents of a kind, or clusters of scenarios that all define.
     """
     if a.shape[1] != b.shape[1]:
-        raise UsageError("agents drove different scenarios", cure="give one value per agent and scenario")
+        raise UsageError("seeds have different scenarios", cure="give one value per seed and scenario")
     labels = dense(clusters, a.shape[1], "cluster")
     weight, keep = _counted(a, b, weights)
     labels = np.unique(labels[keep], return_inverse=True)[1]
@@ -233,17 +233,19 @@ def crossed_difference(a: Values, b: Others, clusters: Any = None, weights: Weig
         )
     share, number = weight[keep] / weight[keep].sum(), int(labels.max()) + 1
     more = number / (number - 1)
-    kinds = [one[:, keep] for one in (a, b)]
+    kinds = [policy[:, keep] for policy in (a, b)]
     apart = kinds[0].mean(axis=0) - kinds[1].mean(axis=0)
     # What sums of equal numbers differ by is no difference.
-    apart = np.where(np.abs(apart) <= ROUNDING * max(float(np.abs(one).max()) for one in kinds), 0.0, apart)
+    apart = np.where(
+        np.abs(apart) <= ROUNDING * max(float(np.abs(policy).max()) for policy in kinds), 0.0, apart
+    )
     mean = float(apart @ share)
     scenarios = more * float(np.square(np.bincount(labels, share * (apart - mean), number)).sum())
     seeds, both = [], []
-    for one in kinds:
-        agents, count = one @ share, len(one)
+    for policy in kinds:
+        agents, count = policy @ share, len(policy)
         seeds.append(float(agents.var(ddof=1)) / count)
-        rest = (one - agents[:, None] - one.mean(axis=0) + agents.mean()) * share
+        rest = (policy - agents[:, None] - policy.mean(axis=0) + agents.mean()) * share
         totals = np.stack([np.bincount(labels, row, number) for row in rest])
         both.append(more * float(np.square(totals).sum()) / (count * (count - 1)))
     return Crossed(mean, (seeds[0], seeds[1]), scenarios, (len(a), len(b)), number, both=(both[0], both[1]))
@@ -264,8 +266,8 @@ def difference_interval(
     if np.unique(labels[keep]).size < 2:
         mean = float(a[:, keep].mean() - b[:, keep].mean()) if number else None
         return Interval(mean, None, None, number), None
-    found = crossed_difference(certain(a), certain(b), labels)
-    return Interval(found.difference, *found.interval(confidence), number), found
+    effect = crossed_difference(certain(a), certain(b), labels)
+    return Interval(effect.difference, *effect.interval(confidence), number), effect
 
 
 def log_ratio(a: Values, b: Others, clusters: Any = None, weights: Weights | None = None) -> Crossed | None:
@@ -283,7 +285,7 @@ def log_ratio(a: Values, b: Others, clusters: Any = None, weights: Weights | Non
     weight, keep = _counted(a, b, weights)
     if not keep.any():
         return None
-    means = [float(np.average(one[:, keep].mean(axis=0), weights=weight[keep])) for one in (a, b)]
+    means = [float(np.average(policy[:, keep].mean(axis=0), weights=weight[keep])) for policy in (a, b)]
     if min(means) <= 0.0:
         return None
     scaled = crossed_difference(a / means[0], b / means[1], clusters, weights)

@@ -1,7 +1,7 @@
-"""Could this difference be chance? Tests of two planners on the same scenarios, or on two arms of a split.
+"""Significance tests of two planners on the same scenarios, or on two arms of a split.
 
 Every test is two-sided and takes one value per scenario; ``None`` or NaN means undefined and leaves the scenario (or
-pair) out. Scenarios of one cluster (recording) are kept together. Seeds are explicit; results are repeatable.
+pair) out. Scenarios of one cluster (recording) stay together. Results are repeatable: seeds are explicit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from drivax.stats.intervals import RESAMPLES, check_draws
 
 #: Random numbers drawn at once: bounds the memory to about 16 MB.
 _CHUNK = 2_000_000
-#: Results of resamples this near to the found one, relative to its size, are ties.
+#: Resampled statistics this close to the observed one, relative to its size, are ties.
 _TIE = 1e-9
 
 
@@ -29,11 +29,10 @@ class Evidence:
     """The result of a test.
 
     Attributes:
-        name: Of the test.
-        p: Probability of a difference at least as large as the one found, if there were none; None where nothing is
-            defined.
-        units: How many things were exchanged: discordant pairs, or clusters whose values differ.
-        exact: Whether every possibility was counted, rather than a sample of them.
+        name: Name of the test.
+        p: Probability of a difference at least as large under the null hypothesis; None where nothing is defined.
+        units: Number of exchanged units: discordant pairs, or clusters whose values differ.
+        exact: Whether every permutation was counted, rather than a sample.
     """
 
     name: str
@@ -45,27 +44,24 @@ class Evidence:
 def mcnemar(a: Any, b: Any, *, mid: bool = True) -> Evidence:
     """McNemar's test of two rates in independent pairs, exact or mid-p.
 
-    If neither planner fails more often, the ``n`` pairs in which one fails and the other does not (discordant ones) are
-    tosses of a fair coin: ``p = 2 P(X <= k)``, at most 1, with ``X ~ Binomial(n, 1/2)`` and ``k`` the rarer of both
-    (McNemar, Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and keeps its level
-    nearly always (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
+    Under the null hypothesis the ``n`` pairs in which only one planner fails (discordant pairs) are tosses of a fair
+    coin: ``p = 2 P(X <= k)``, at most 1, with ``X ~ Binomial(n, 1/2)`` and ``k`` the rarer of both (McNemar,
+    Psychometrika 12, 1947). The mid-p value, ``p - P(X = k)``, is less conservative and keeps its level nearly always
+    (Fagerland, Lydersen and Laake, BMC Med. Res. Methodol. 13:91, 2013).
 
     Args:
         a: 0, 1 or undefined, one per scenario; scenarios are independent.
         b: The other planner's, in the same order.
         mid: Mid-p rather than exact.
-
-    Raises:
-        UsageError: If a value is neither 0 nor 1, or lengths disagree.
     """
     for values in (numbers(a), numbers(b)):
         if not np.isin(values[~np.isnan(values)], (0.0, 1.0)).all():
             raise UsageError("McNemar's test takes only 0 and 1", cure="use paired_permutation")
-    found = differences(a, b)
+    pairs = differences(a, b)
     name = "McNemar mid-p" if mid else "McNemar exact"
-    if np.isnan(found).all():
+    if np.isnan(pairs).all():
         return Evidence(name, None, 0, exact=True)
-    more, fewer = int((found > 0).sum()), int((found < 0).sum())
+    more, fewer = int((pairs > 0).sum()), int((pairs < 0).sum())
     n, k = more + fewer, min(more, fewer)
     at_most = float(special.bdtr(k, n, 0.5)) if n else 1.0
     here = at_most - float(special.bdtr(k - 1, n, 0.5)) if k else at_most
@@ -76,12 +72,12 @@ def mcnemar(a: Any, b: Any, *, mid: bool = True) -> Evidence:
 def paired_permutation(
     a: Any, b: Any, clusters: Any = None, resamples: int = RESAMPLES, *, seed: int
 ) -> Evidence:
-    """Permutation test of a mean paired difference: whole clusters change the names of the planners.
+    """Permutation test of a mean paired difference: the signs of whole clusters are flipped.
 
     If the planners are interchangeable, the difference of each cluster has either sign with equal probability
     (Fisher, The Design of Experiments, 1935, section 21; Good, Permutation, Parametric and Bootstrap Tests, 2005,
     section 3.2). All ``2^C`` sign patterns are counted where they are no more than ``resamples``, else random ones:
-    ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010). Of 0/1
+    ``p = (1 + #{|T*| >= |T|}) / (1 + resamples)`` (Phipson and Smyth, Stat. Appl. Genet. Mol. Biol. 9, 2010). For 0/1
     values in clusters of one this is McNemar's exact test.
 
     Args:
@@ -90,9 +86,6 @@ def paired_permutation(
         clusters: Labels of the clusters, one per scenario; None: every scenario is its own.
         resamples: Number of sign patterns.
         seed: Seed of the random numbers.
-
-    Raises:
-        UsageError: If lengths disagree, a value is infinite, or there are no resamples.
     """
     check_draws(0.95, resamples)
     x, labels = defined(differences(a, b), clusters)
@@ -116,21 +109,12 @@ def paired_permutation(
 def paired_bootstrap_test(
     a: Any, b: Any, clusters: Any = None, resamples: int = RESAMPLES, *, seed: int
 ) -> Evidence:
-    """Bootstrap test of a mean paired difference that does not ask for symmetry, resampling whole clusters.
+    """Bootstrap test of a mean paired difference without the assumption of symmetry, resampling whole clusters.
 
-    ``t = m / se`` is held against ``t* = (m* - m) / se*`` of resamples, ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)``
+    ``t = m / se`` is compared with ``t* = (m* - m) / se*`` of resamples, ``p = (1 + #{|t*| >= |t|}) / (1 + resamples)``
     (Efron and Tibshirani 1993, section 16.4; symmetric bootstrap-t: Hall, The Bootstrap and Edgeworth Expansion, 1992,
     section 3.6), with the standard error of a ratio of totals, ``se^2 = C / (C - 1) sum((S_c - m n_c)^2) / n^2``.
-
-    Args:
-        a: As for :func:`paired_permutation`, as the rest.
-        b: The other planner's, in the same order.
-        clusters: Labels of the clusters.
-        resamples: Number of resamples.
-        seed: Seed of the random numbers.
-
-    Raises:
-        UsageError: As :func:`paired_permutation`.
+    Arguments as for :func:`paired_permutation`.
     """
     check_draws(0.95, resamples)
     x, labels = defined(differences(a, b), clusters)
@@ -147,9 +131,9 @@ def paired_bootstrap_test(
     for count in _chunks(resamples, sums.size):
         times = rng.multinomial(sums.size, np.full(sums.size, 1.0 / sums.size), size=count)
         means, errors = _mean_and_error(times @ moments, sums.size)
-        # A resample that does not vary speaks for chance, unless it repeats the mean.
-        away = np.abs(means - mean)
-        beyond += int((away >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
+        # A resample without variance supports the null hypothesis, unless it repeats the mean.
+        deviations = np.abs(means - mean)
+        beyond += int((deviations >= (abs(mean) / error) * errors - _TIE * abs(mean)).sum())
     return Evidence("bootstrap", (1 + beyond) / (1 + resamples), sums.size, exact=False)
 
 
@@ -172,10 +156,10 @@ def split_permutation(
     *,
     seed: int,
 ) -> Evidence:
-    """Permutation test of the means of two arms: whole clusters are assigned anew, as many to each arm as there were.
+    """Permutation test of the means of two arms: whole clusters are reassigned, keeping their number in each arm.
 
-    If it made no difference who drove a scenario, every assignment would have been as good as the one that was drawn,
-    and the test is exact (Fisher 1935; Good 2005, section 3.3); strata keep their numbers in each arm.
+    Under the null hypothesis every assignment is as likely as the observed one, and the test is exact (Fisher 1935;
+    Good 2005, section 3.3); strata keep their numbers in each arm.
 
     Args:
         values: Numbers or undefined, one per scenario.
@@ -186,7 +170,7 @@ def split_permutation(
         seed: Seed of the random numbers.
 
     Raises:
-        UsageError: If lengths disagree, a cluster is in both arms or in two strata, or a value is infinite.
+        UsageError: A cluster is in both arms or in two strata.
     """
     check_draws(0.95, resamples)
     keep = ~np.isnan(numbers(values))
@@ -216,17 +200,17 @@ def split_permutation(
 def _between(
     mine: Bool[np.ndarray, "draw cluster"], sums: Totals, counts: Totals
 ) -> Float64[np.ndarray, " draw"]:
-    """Difference of the means of two arms."""
+    """Return the difference of the means of two arms."""
     weight = mine.astype(np.float64)
     total, number = weight @ sums, weight @ counts
     return total / number - (sums.sum() - total) / (counts.sum() - number)
 
 
 def holm(ps: Sequence[float | None]) -> list[float | None]:
-    """P-values that are adjusted for their number, so that a true zero among them is rarely called a difference.
+    """Holm's adjustment of p-values for multiple tests, valid under any dependence (Holm, Scand. J. Stat. 6, 1979).
 
-    Sorted upwards, ``p_(i)`` becomes the largest of ``(m - j) p_(j)``, ``j`` from 0 to ``i``, at most 1 (Holm, Scand.
-    J. Stat. 6, 1979). Valid whatever the dependence between the tests; None (nothing to test) counts in no ``m``.
+    In ascending order ``p_(i)`` becomes the largest of ``(m - j) p_(j)``, ``j`` from 0 to ``i``, at most 1. None
+    (nothing to test) does not count in ``m``.
     """
     order = sorted((p, place) for place, p in enumerate(ps) if p is not None)
     adjusted: list[float | None] = [None] * len(ps)
@@ -238,6 +222,6 @@ def holm(ps: Sequence[float | None]) -> list[float | None]:
 
 
 def _chunks(resamples: int, width: int) -> list[int]:
-    """Numbers of resamples that are made at once."""
+    """Split resamples into chunks of bounded memory."""
     rows = max(1, _CHUNK // max(1, width))
     return [min(rows, resamples - begin) for begin in range(0, resamples, rows)]

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
-from drivax.learning.policy_traffic import find_traffic
+from drivax.learning.policies import find_traffic
 from drivax.metrics.episode import episode_add, episode_metrics
 from drivax.metrics.selection import MetricNames
 from drivax.planners.idm import IdmPlanner
@@ -32,7 +32,7 @@ from drivax.simulator.contact import Contact, overlaps, time_to_collision
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
-from drivax.simulator.traffic.catalogue import prepared
+from drivax.simulator.traffic.bank_data import prepare_bank
 from drivax.simulator.traffic.log import alone
 from drivax.simulator.types import Frame, SimState
 from drivax.tasks.task import Task
@@ -43,7 +43,7 @@ from drivax.tracking.run_folder import versions
 METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
 #: Environments of which the compiler counts operations and bytes.
 _COUNTED = 16384
-#: Actions, observations and everyone now; and states, whose episodes are over, what was earned, and the former.
+#: Actions, observations and frame; and the carry: states, which episodes ended, rewards, and the former.
 _Driven = tuple[Array, Mapping[str, Array], Frame]
 _Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
 
@@ -152,7 +152,7 @@ class Program:
         steps: Environment steps of a run that count; those that only begin an episode do not.
         compile_seconds: From the traced function to the program.
         state_bytes: State of one environment.
-        temporary_bytes: What the program needs beside bank and states, per environment.
+        temporary_bytes: What the program needs in addition to bank and states, per environment.
     """
 
     run: Callable[[], Any]
@@ -203,7 +203,7 @@ def _simulator(bank: ScenarioBank, config: BenchConfig) -> tuple[Simulator, Scen
             cure="give a multiple",
         )
     traffic = find_traffic(config.traffic)
-    return Simulator(config.task, traffic), spread(prepared(traffic, bank))
+    return Simulator(config.task, traffic), spread(prepare_bank(traffic, bank))
 
 
 def spread(bank: ScenarioBank) -> ScenarioBank:
@@ -255,7 +255,7 @@ def _run(
         # As in training: metrics are computed when some episode of the batch ends.
         total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
         total += transition.reward
-        # Here, where everyone is at hand, and not at the beginning of the next round.
+        # Here, where all agents are at hand, and not at the beginning of the next round.
         return (states, done, total, _driven(simulator, config, bank, states)), (~over).sum()
 
     begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
@@ -264,7 +264,7 @@ def _run(
 
 
 def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Driven:
-    """The driver's actions, the task's observations and everyone now."""
+    """The driver's actions, the task's observations and all agents at the step."""
     driver = IdmPlanner(config.task.actions)
 
     def one(state: SimState) -> _Driven:

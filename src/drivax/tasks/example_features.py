@@ -121,7 +121,7 @@ def car_following(bank: ScenarioBank, context: AgentContext, frames: Frames) -> 
             jnp.stack(
                 [
                     leads.astype(jnp.float32),
-                    seen.wanted / SPEED_MPS,
+                    seen.desired / SPEED_MPS,
                     seen.acceleration(speed, _IDM) / _HARDEST_MPS2,
                 ]
             ),

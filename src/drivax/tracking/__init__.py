@@ -1,1 +1,5 @@
-"""Run folders, metric sinks and checkpoints."""
+"""Run folders, checkpoints, metric logs, progress and worker processes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

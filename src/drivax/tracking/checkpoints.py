@@ -1,8 +1,8 @@
 """Checkpoints: a whole training state on disk, restored bit for bit.
 
-Orbax stores the arrays; ``about.json`` beside them names every leaf with its dtype, shape and CRC-32, so that a state
-that does not fit, or a damaged file, is told by the name of the leaf. A checkpoint appears under its name only when
-it is complete. What is shipped is one plain file instead (:func:`pack`), which holds a policy and no training state.
+Orbax stores the arrays; ``about.json`` names every leaf with its dtype, shape and CRC-32, so that errors name the leaf
+that does not fit or is damaged. A checkpoint appears under its name only when it is complete. Exported policies are
+one plain file instead (:func:`pack`), without training state.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from drivax.files import write_text
 
 ABOUT = "about.json"
 #: Fields of training states that checkpoints of version 0.1.0 store under another name.
-_RENAMED_FIELDS = {"scene": "context"}
+_RENAMED_FIELDS = {"scene": "context", "scenes": "contexts"}
 _ARRAYS = "arrays"
 _CURE = "use the configuration that the checkpoint was trained with"
 _SCALARS: tuple[type, ...] = (bool, int, float)
@@ -53,8 +53,8 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """Steps of all complete checkpoints, ascending."""
-        found = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
-        return sorted(int(name) for name in found if name.isdecimal())
+        names = (path.name.removeprefix("step-") for path in self.folder.glob("step-*") if path.is_dir())
+        return sorted(int(name) for name in names if name.isdecimal())
 
     def best(self) -> int | None:
         """The step with the highest score (the later one of equals), None when no checkpoint has a score."""
@@ -147,15 +147,15 @@ class Checkpoints:
             step = steps[-1]
         stored = self.about(step)["leaves"]
         path = self._path(step)
-        wanted = {
+        requested = {
             part + jax.tree_util.keystr(key): leaf
             for part, template in templates.items()
             for key, leaf in jax.tree_util.tree_flatten_with_path(template)[0]
         }
         numbers = {leaf["name"]: n for n, leaf in enumerate(stored) if is_part(leaf["name"], templates)}
-        _compare(path, [stored[number] for number in numbers.values()], list(wanted.items()), cure)
+        _compare(path, [stored[number] for number in numbers.values()], list(requested.items()), cure)
         arrays = _load_arrays(path, stored)
-        values = iter([_rebuild(arrays[numbers[name]], leaf) for name, leaf in wanted.items()])
+        values = iter([_rebuild(arrays[numbers[name]], leaf) for name, leaf in requested.items()])
         return {part: jax.tree.map(lambda _: next(values), template) for part, template in templates.items()}
 
     def _path(self, step: int) -> Path:
@@ -214,14 +214,16 @@ def unpack(file: Path, template: State) -> State:
         DataError: It is damaged, or does not fit the template; names the first leaf.
     """
     try:
-        with zipfile.ZipFile(file) as found:
+        with zipfile.ZipFile(file) as archive:
             # Read to the end, which is when a zip compares its checksum.
-            members = {name.removesuffix(".npy"): io.BytesIO(found.read(name)) for name in found.namelist()}
+            members = {
+                name.removesuffix(".npy"): io.BytesIO(archive.read(name)) for name in archive.namelist()
+            }
         arrays = {name: np.load(member, allow_pickle=False) for name, member in members.items()}
     except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
         raise DataError(f"is damaged ({error})", file=file, cure="use another copy") from error
-    wanted, structure = jax.tree_util.tree_flatten_with_path(template)
-    named = [(jax.tree_util.keystr(key), leaf) for key, leaf in wanted]
+    requested, structure = jax.tree_util.tree_flatten_with_path(template)
+    named = [(jax.tree_util.keystr(key), leaf) for key, leaf in requested]
     stored = [
         {"name": name, "type": str(array.dtype), "shape": list(array.shape)} for name, array in arrays.items()
     ]
@@ -263,14 +265,14 @@ def _type_name(leaf: Any) -> str:
     return type(leaf).__name__ if type(leaf) in _SCALARS else str(leaf.dtype)
 
 
-def _compare(path: Path, stored: list[dict[str, Any]], wanted: list[tuple[str, Any]], cure: str) -> None:
+def _compare(path: Path, stored: list[dict[str, Any]], requested: list[tuple[str, Any]], cure: str) -> None:
     have = {leaf["name"]: (leaf["type"], tuple(leaf["shape"])) for leaf in stored}
-    need = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in wanted}
+    need = {name: (_type_name(leaf), tuple(np.shape(leaf))) for name, leaf in requested}
     for name in [*need, *have]:
         if name not in have:
             raise DataError(f"the checkpoint has no {name}", file=path, cure=cure)
         if name not in need:
-            raise DataError(f"the checkpoint holds {name}, which is not wanted", file=path, cure=cure)
+            raise DataError(f"the checkpoint holds {name}, which the template lacks", file=path, cure=cure)
         if have[name] != need[name]:
             is_, want = (f"{kind}{list(shape)}" for kind, shape in (have[name], need[name]))
             raise DataError(f"{name} is {is_} in the checkpoint, not {want}", file=path, cure=cure)
@@ -288,16 +290,16 @@ def _load_arrays(path: Path, leaves: list[dict[str, Any]]) -> list[np.ndarray[An
 
     empty = [np.zeros(tuple(leaf["stored"][1]), jnp.dtype(leaf["stored"][0])) for leaf in leaves]
     target = {f"{number:05d}": array for number, array in enumerate(empty) if array.size}
-    found: dict[str, Any] = {}
+    restored: dict[str, Any] = {}
     if target:
         try:
             with ocp.StandardCheckpointer() as checkpointer:
-                found = checkpointer.restore((path / _ARRAYS).resolve(), target)
+                restored = checkpointer.restore((path / _ARRAYS).resolve(), target)
         except Exception as error:
             raise DataError(
                 f"arrays cannot be read ({error})", file=path, cure="use another checkpoint"
             ) from error
-    arrays = [np.asarray(found.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
+    arrays = [np.asarray(restored.get(f"{number:05d}", array)) for number, array in enumerate(empty)]
     for array, leaf in zip(arrays, leaves, strict=True):
         if zlib.crc32(array.tobytes()) != leaf["crc"]:
             raise DataError(f"checksum mismatch in {leaf['name']}", file=path, cure="use another checkpoint")

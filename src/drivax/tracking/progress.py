@@ -20,7 +20,7 @@ class Progress:
     Args:
         what: What is going on ("converting").
         unit: What is counted ("scenarios").
-        total: How many there will be; None where nobody knows.
+        total: How many there will be; None where unknown.
         stream: Text file to write to; standard error by default, so that results on standard output stay clean.
         interval_s: Seconds between two lines where ``stream`` is no terminal.
         clock: Seconds; a test may pass its own.

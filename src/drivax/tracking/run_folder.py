@@ -7,6 +7,7 @@ reader needs to believe or repeat the run), and what the run produces: ``metrics
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
@@ -22,8 +23,9 @@ from typing import Any, TypeVar
 
 from drivax import settings
 from drivax.errors import DataError, UsageError
-from drivax.files import replace_folder, write_text
+from drivax.files import check_output, replace_folder, write_text
 from drivax.scenario.store import ScenarioSet
+from drivax.tracking.sinks import read_rows
 from drivax.tracking.zoo import is_policy, policy_folder
 
 CONFIG_FILE = "config.yaml"
@@ -36,12 +38,7 @@ Record = TypeVar("Record")
 
 @dataclass(frozen=True)
 class RunFolder:
-    """An existing run folder.
-
-    Attributes:
-        path: The folder.
-        info: Content of ``run.json``.
-    """
+    """A run folder and the content of its ``run.json``."""
 
     path: Path
     info: dict[str, Any]
@@ -53,60 +50,100 @@ class RunFolder:
         config: Any,
         data: Sequence[ScenarioSet] = (),
         overwrite: bool = False,
-        **notes: Any,
+        **info: Any,
     ) -> RunFolder:
-        """Make the folder and write ``config.yaml`` and ``run.json``; the folder appears with both in it.
+        """Make a folder with ``config.yaml`` and ``run.json``; it appears with both in it.
 
         Args:
             path: Folder to create.
             config: Configuration record (a dataclass).
-            data: The scenario sets that the run reads.
+            data: Scenario sets that the run reads.
             overwrite: Replace an existing run folder; other folders are never replaced.
-            notes: More facts for ``run.json``, plain JSON values.
+            info: Further entries of ``run.json``, plain JSON values.
 
         Raises:
-            UsageError: ``path`` exists.
+            UsageError: As :meth:`check`.
         """
         path = Path(path)
-        refuse_existing(path, overwrite, notes.get("kind"))
-        info = describe_run(data) | notes
+        cls.check(path, overwrite, info.get("kind"))
+        info = describe_run(data) | info
         with replace_folder(path) as partial:
             write_text(partial / CONFIG_FILE, settings.dump(config))
-            write_text(partial / RUN_FILE, json.dumps(info, indent=1) + "\n")
+            write_text(partial / RUN_FILE, _json(info))
         return cls(path, info)
+
+    @staticmethod
+    def check(path: Path, overwrite: bool, kind: str | None = None) -> None:
+        """Refuse an output folder, before any work is done.
+
+        Args:
+            path: The folder.
+            overwrite: Whether an existing run may be replaced.
+            kind: Kind of the new run; a training only replaces a training, and nothing else replaces one.
+
+        Raises:
+            UsageError: The folder exists and is no run folder, holds another kind, or ``overwrite`` is not given.
+        """
+        if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+            return
+        if not (path / RUN_FILE).is_file():
+            raise UsageError("output exists and is not a run folder", file=path, cure="choose another name")
+        present = _kind(path)
+        if kind is not None and present is not None and (present in _TRAININGS) != (kind in _TRAININGS):
+            raise UsageError(
+                f"output folder holds a run of kind {present}, not {kind}",
+                file=path,
+                cure="choose another name",
+            )
+        check_output(path, overwrite, folder=True)
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """Open a run folder.
+        """Open an existing run folder.
 
         Raises:
-            DataError: It is no run folder, or ``run.json`` is damaged.
+            DataError: The folder or its ``run.json`` is missing or damaged.
         """
-        path = Path(path)
-        for name in (CONFIG_FILE, RUN_FILE):
-            if not (path / name).is_file():
-                raise DataError(
-                    f"is no run folder (no {name})", file=path, cure="name a folder that a run wrote"
-                )
+        path, cure = Path(path), "give a folder written by drivax evaluate or drivax train"
+        if not path.is_dir():
+            raise DataError("run folder not found", file=path, cure=cure)
+        file = path / RUN_FILE
+        if not file.is_file():
+            raise DataError(f"not a run folder: no {RUN_FILE}", file=path, cure=cure)
         try:
-            info = json.loads((path / RUN_FILE).read_bytes())
+            info = json.loads(file.read_bytes())
         except ValueError as error:
-            raise DataError(f"is damaged ({error})", file=path / RUN_FILE, cure="run again") from error
+            raise DataError(f"not valid JSON ({error})", file=file, cure="run the command again") from error
+        if not isinstance(info, dict):
+            raise DataError("not a JSON object", file=file, cure="run the command again")
         return cls(path, info)
 
+    @property
+    def kind(self) -> str | None:
+        """Kind of the run: ``training``, ``seeds``, ``evaluation``, ``policy``, ..."""
+        return self.info.get("kind")
+
     def config(self, cls: type[Record], overrides: Sequence[str] = ()) -> Record:
-        """The run's configuration as a record, with settings replaced as on a command line.
+        """Return the run's configuration as a record, with overrides as on a command line.
 
         Raises:
+            DataError: ``config.yaml`` is missing.
             UsageError: ``config.yaml`` does not fit ``cls``.
         """
-        return settings.load(cls, self.path / CONFIG_FILE, overrides)
+        return settings.load(cls, existing(self.path / CONFIG_FILE, "run the command again"), overrides)
 
-    def note(self, **notes: Any) -> RunFolder:
-        """The run with more facts in ``run.json`` (an end time, a result)."""
-        info = self.info | notes
-        write_text(self.path / RUN_FILE, json.dumps(info, indent=1) + "\n")
-        return RunFolder(self.path, info)
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Content of ``config.yaml`` as plain values; empty without the file."""
+        file = self.path / CONFIG_FILE
+        values = settings.parse_yaml(file.read_text(encoding="utf-8"), file) if file.is_file() else {}
+        return values if isinstance(values, dict) else {}
+
+    def note(self, **info: Any) -> RunFolder:
+        """Add entries to ``run.json``, and return the folder with them."""
+        merged = self.info | info
+        write_text(self.path / RUN_FILE, _json(merged))
+        return RunFolder(self.path, merged)
 
     @property
     def checkpoints(self) -> Path:
@@ -118,18 +155,41 @@ class RunFolder:
         """File of the logged metrics."""
         return self.path / "metrics.jsonl"
 
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """Rows of ``metrics.jsonl``, without a last one that was cut off.
+
+        Raises:
+            DataError: The file is missing or damaged.
+        """
+        return list(read_rows(existing(self.metrics, "train again")))
+
+
+def existing(path: Path, cure: str) -> Path:
+    """Return the path of a file that has to exist.
+
+    Raises:
+        DataError: The file does not exist.
+    """
+    if not path.is_file():
+        raise DataError("file not found", file=path, cure=cure)
+    return path
+
+
+def _json(info: Mapping[str, Any]) -> str:
+    return json.dumps(info, indent=1) + "\n"
+
 
 def seed_folders(path: str | Path) -> list[Path]:
-    """The run folders that a path stands for: those that ``drivax train --seeds`` wrote inside it, or itself."""
+    """Return the run folders behind a path: one per seed for a run with ``--seeds``, otherwise the path itself."""
     path = Path(path)
     if _kind(path) != "seeds":
         return [path]
-    found = path.glob("seed-*/" + RUN_FILE)
-    return sorted((file.parent for file in found), key=lambda folder: int(folder.name.removeprefix("seed-")))
+    inside = (file.parent for file in path.glob("seed-*/" + RUN_FILE))
+    return sorted(inside, key=lambda folder: int(folder.name.removeprefix("seed-")))
 
 
 def _kind(path: Path) -> str | None:
-    """The kind of the run in a folder; None where none can be read: whoever opens it tells what is wrong."""
+    """Kind of the run in a folder; None where it cannot be read."""
     try:
         info = json.loads((path / RUN_FILE).read_bytes())
     except (OSError, ValueError):
@@ -138,22 +198,19 @@ def _kind(path: Path) -> str | None:
 
 
 def run_and_step(name: str) -> tuple[str, int | None]:
-    """What ``RUN@STEP`` names, or ``RUN``, which leaves the step open.
+    """Split ``RUN@STEP`` or ``RUN``, which leaves the step None.
 
     Raises:
-        UsageError: The step is no number.
+        UsageError: The step is not a number.
     """
     run, at, step = name.partition("@")
     if at and not step.isdecimal():
-        raise UsageError(f"{step!r} is no step of a checkpoint", cure="write RUN@STEP, as runs/a@100000")
+        raise UsageError(f"{step!r} is not a checkpoint step", cure="write RUN@STEP, as runs/a@100000")
     return run, int(step) if at else None
 
 
 def learned_from(planner: str) -> list[dict[str, Any]]:
-    """The data sets that a trained policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``) learned from; none of any other.
-
-    Those of the runs that its networks come from are among them.
-    """
+    """Training sets of a policy (``RUN``, ``RUN@STEP`` or ``zoo:NAME``), pretraining included; none for others."""
     folder = planner.partition("@")[0]
     path = policy_folder(folder) if is_policy(folder) else Path(folder)
     info = RunFolder.open(path).info if (path / RUN_FILE).is_file() else {}
@@ -161,7 +218,7 @@ def learned_from(planner: str) -> list[dict[str, Any]]:
 
 
 def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The data sets that a training's ``run.json`` names, its own first, each once."""
+    """Data sets that a training's ``run.json`` names, its own first, each once."""
     known: dict[str, dict[str, Any]] = {}
     for entry in (*info.get("data", ()), *info.get("networks_from", {}).get("data", ())):
         known.setdefault(entry["hash"], entry)
@@ -169,7 +226,7 @@ def trained_on(info: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
-    """Facts about this process, its program, its data and its machine, as plain JSON values."""
+    """Describe this process, its program, data and machine as plain JSON values."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -181,18 +238,16 @@ def describe_run(data: Sequence[ScenarioSet] = ()) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of python and of the packages that decide numbers."""
-    found = {"python": platform.python_version()}
+    """Versions of Python and of the packages that results depend on."""
+    installed = {"python": platform.python_version()}
     for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            installed[name] = metadata.version(name)
+    return installed
 
 
 def machine() -> dict[str, Any]:
-    """The machine; asks JAX for its devices, which starts the accelerator."""
+    """Describe the machine; asks JAX for its devices, which starts the accelerator."""
     import jax
 
     devices = jax.devices()
@@ -207,10 +262,7 @@ def machine() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Commit of the checkout that ``folder`` belongs to, and whether package or presets are others; None without one.
-
-    What lies beside them, as a run folder may, changes nothing of what runs.
-    """
+    """Commit of the checkout around ``folder``, and whether package or presets differ from it; None outside of one."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
@@ -225,27 +277,3 @@ def git_state(folder: Path) -> dict[str, Any] | None:
         return {"commit": git("rev-parse", "HEAD"), "changed": bool(changed)}
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def refuse_existing(path: Path, overwrite: bool, kind: str | None = None) -> None:
-    """Refuses a folder that a run may not be written to, before any work is done.
-
-    Args:
-        path: The folder.
-        overwrite: Whether a run may be replaced.
-        kind: What is to be written; a training is replaced by nothing but a training, and replaces nothing else.
-
-    Raises:
-        UsageError: It exists and is no run folder, or one of another kind, or ``overwrite`` is not given.
-    """
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
-    if not (path / RUN_FILE).is_file():
-        raise UsageError("exists and is no run folder", file=path, cure="choose another name")
-    there = _kind(path)
-    if kind is not None and there is not None and (there in _TRAININGS) != (kind in _TRAININGS):
-        raise UsageError(f"holds a run of kind {there}, not {kind}", file=path, cure="choose another name")
-    if not overwrite:
-        raise UsageError(
-            "exists already", file=path, cure="choose another name, --resume it or pass --overwrite"
-        )

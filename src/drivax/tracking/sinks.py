@@ -140,7 +140,7 @@ def _rows(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             if number == len(lines) - 1 and not line.endswith("\n"):
                 return
             raise DataError(
-                "is no row of metrics", file=file, record=number + 1, cure="delete the row"
+                "not a metrics row", file=file, record=number + 1, cure="delete the row"
             ) from error
         yield line if line.endswith("\n") else line + "\n", row
 

@@ -55,11 +55,7 @@ def one_core_each(
 
 
 def await_interrupt() -> None:
-    """For whoever finds a worker dead: Ctrl-C kills workers, too, and may reach them first.
-
-    Raises:
-        KeyboardInterrupt: That was it.
-    """
+    """Wait briefly after a worker died, so that a Ctrl-C that also killed it is raised here (KeyboardInterrupt)."""
     time.sleep(0.3)
 
 

@@ -1,1 +1,5 @@
-"""One module per algorithm: its configuration, state and update."""
+"""Built-in algorithms: PPO and SAC, behaviour cloning, warm starts, and offline reinforcement learning."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,38 +13,38 @@ import optax
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
-from drivax.learning.algorithms.offline import Improved, Offline, OfflineConfig, Trained, by_key
+from drivax.learning.algorithms.off_policy import Trained, squared_error, target_entropy
+from drivax.learning.algorithms.offline import Offline, OfflineConfig, PolicyBatch
 from drivax.learning.environment import Environment
 from drivax.learning.replay import Transitions
 from drivax.networks.distributions import Distribution
 from drivax.rl.offline import conservative_penalty, penalty_weight_loss, scaled_policy_loss
-from drivax.rl.temporal_difference import soft_policy_loss, td_target, temperature_loss
+from drivax.rl.online import td_target
 
-#: The multiplier stays below.
+#: Largest logarithm of the Lagrange multiplier.
 _LARGEST_WEIGHT = math.log(1e6)
 
 
 @dataclass(frozen=True)
 class CqlConfig(OfflineConfig):
-    """CQL(H), and with ``imitation`` above 0 the same with a term of behaviour cloning beside the policy's loss.
+    """CQL(H), with ``imitation`` above 0 also a behaviour cloning term in the policy's loss.
 
     Attributes:
-        penalty: Weight of the conservative penalty beside half the squared error; with a ``gap`` the first one.
-        gap: Penalty that a Lagrange multiplier in place of the weight aims at; None: the weight stays.
+        penalty: Weight of the conservative penalty relative to half the squared TD error; with a ``gap`` the first one.
+        gap: Target penalty of a Lagrange multiplier that replaces the weight; None: constant weight.
         penalty_rate: Learning rate of the multiplier.
         actions: Actions from each distribution that the penalty samples.
-        next_actions: Whether actions of the policy at the next state are among them, beside uniform ones and those of
-            the policy at the state.
-        backup_actions: Of so many actions of the policy at the next state the one of the highest value (of the smaller
-            critic) is backed up. One alone is in the mean worth less than what the expert does next, and that adds up
-            from step to step.
-        importance: Whether each is divided by its density; if not, the action of the data stands among them instead.
+        next_actions: Sample the penalty's actions from the policy at the next state, too, in addition to uniform ones
+            and those of the policy at the state.
+        backup_actions: Actions of the policy at the next state; the highest value (of the smaller critic) is backed up.
+            A single one has on average less value than the expert's next action, which accumulates over steps.
+        importance: Divide each by its density; otherwise the logged action is among the actions instead.
         penalty_temperature: Of the penalty's soft maximum.
-        imitation: Weight of the squared error of the policy's mode from the expert's action. If there is one, the
-            policy's loss is divided by the mean size of Q, so that the weight means the same whatever rewards are.
-        temperature: Of the policy's entropy, the first one.
-        temperature_rate: Its learning rate; 0: it stays.
-        target_entropy: Of the policy; by default minus the numbers in an action.
+        imitation: Weight of the squared error of the policy's mode from the expert's action. Above 0, the policy's loss
+            is divided by the mean absolute Q, so that the weight does not depend on the scale of rewards.
+        temperature: Initial temperature of the policy's entropy.
+        temperature_rate: Learning rate of the temperature; 0: constant.
+        target_entropy: Target entropy of the policy; by default minus the size of an action.
     """
 
     kind: Literal["cql"] = "cql"
@@ -63,99 +63,104 @@ class CqlConfig(OfflineConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.refuse_choices()
+        self.check_gradient()
         if (
             min(self.actions, self.backup_actions) < 1
             or min(self.temperature, self.penalty_temperature) <= 0.0
         ):
-            raise UsageError("actions or a temperature of CQL is too small", cure="use more than 0")
+            raise UsageError(
+                "actions, backup_actions or a temperature of CQL is too small", cure="use more than 0"
+            )
         if self.penalty < 0.0 or self.imitation < 0.0 or (self.gap is not None and self.penalty == 0.0):
             raise UsageError(
-                "a weight of CQL is negative, or nothing for a multiplier to begin with", cure="use more"
+                "penalty or imitation is negative, or penalty is 0 with a gap",
+                cure="use 0 or more, and with a gap more than 0",
             )
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Cql:
-        """CQL in an environment."""
+        """Return CQL in an environment."""
         return Cql(self, environment, data, iterations)
 
 
-class Cql(Offline):
+class Cql(Offline[CqlConfig]):
     """CQL in one environment."""
 
     def __init__(self, config: CqlConfig, environment: Environment, data: Any, iterations: int) -> None:
-        self.config = config
-        self.target_entropy = (
-            -float(environment.action_size) if config.target_entropy is None else config.target_entropy
-        )
         super().__init__(config, environment, data, iterations)
+        self.target_entropy = target_entropy(config, environment)
 
-    def numbers(self) -> dict[str, float]:
-        """Logarithms of the temperature, and of the multiplier if there is one."""
-        found = {"log_temperature": math.log(self.config.temperature)}
-        return found if self.config.gap is None else found | {"log_penalty": math.log(self.config.penalty)}
+    def scalars(self) -> dict[str, float]:
+        """Return logarithms of the temperature, and of the multiplier if there is one."""
+        scalars = {"log_temperature": math.log(self.config.temperature)}
+        return (
+            scalars if self.config.gap is None else scalars | {"log_penalty": math.log(self.config.penalty)}
+        )
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
-        """Adam for the numbers, too."""
+        """Return the optimisers of networks and scalars."""
         rates = {"log_temperature": self.config.temperature_rate, "log_penalty": self.config.penalty_rate}
-        return super().optimisers() | {name: optax.adam(rates[name]) for name in self.numbers()}
+        return super().optimisers() | {name: optax.adam(rates[name]) for name in self.scalars()}
 
     def loss(
-        self, trained: Trained, target: Mapping[str, Any], part: Transitions, improved: Improved, key: Array
+        self, trained: Trained, target: Any, batch: Transitions, policy_batch: PolicyBatch, key: Array
     ) -> tuple[Array, dict[str, Array]]:
-        """Squared errors, the penalty, the policy's loss, and those of temperature and multiplier."""
+        """Return the sum of TD errors, penalty, and the losses of policy, temperature and multiplier."""
         critic_key, policy_key = jax.random.split(key)
-        critic, critic_logs = self._critic_loss(trained, target, part, critic_key)
-        policy, policy_logs = self._policy_loss(trained, improved, policy_key)
+        critic, critic_logs = self._penalised_critic_loss(trained, target, batch, critic_key)
+        policy, policy_logs = self._policy_loss(trained, policy_batch, policy_key)
         return critic + policy, critic_logs | policy_logs
 
-    def _critic_loss(
-        self, trained: Trained, target: Mapping[str, Any], part: Transitions, key: Array
+    def _penalised_critic_loss(
+        self, trained: Trained, target: Any, batch: Transitions, key: Array
     ) -> tuple[Array, dict[str, Array]]:
         next_key, sample_key = jax.random.split(key)
-        policy = jax.lax.stop_gradient(trained["policy"])
-        following = self.distribution(policy, part.following)
-        then = following.action(by_key(following.sample, next_key, self.config.backup_actions))
+        parameters = jax.lax.stop_gradient(trained["policy"])
+        next_policy = self.distribution(parameters, batch.next_observation)
+        next_action = next_policy.action(_samples(next_policy, next_key, self.config.backup_actions))
         # As in the reference implementation the target has no entropy, though the policy's loss has.
-        value = jnp.max(jnp.min(self.q(target["critic"], part.following, then), axis=0), axis=0)
-        goal = td_target(part.reward, value, part.terminated, self.config.gamma)
-        now = self.distribution(policy, part.observation)
-        action, log_density = self._sampled(now, following, part.action, sample_key)
-        # All in one call: an observation is encoded, and its gradient taken, once.
-        found = self.q(trained["critic"], part.observation, jnp.concatenate([part.action[None], action]))
-        q, judged = found[:, 0], jnp.moveaxis(found[:, 1:], 1, 0)
-        error = 0.5 * jnp.mean((q - goal) ** 2)
-        densities = jnp.broadcast_to(log_density[:, None], judged.shape)
-        penalty = conservative_penalty(judged, densities, q, self.config.penalty_temperature)
-        weight, weight_loss = self._weight(trained, penalty)
+        next_q = self.q_values(target["critic"], batch.next_observation, next_action)
+        next_value = jnp.max(jnp.min(next_q, axis=0), axis=0)
+        td = td_target(batch.reward, next_value, batch.terminated, self.config.gamma)
+        policy = self.distribution(parameters, batch.observation)
+        action, log_density = self._penalty_actions(policy, next_policy, batch.action, sample_key)
+        # In one call, so that each observation is encoded, and its gradient taken, once.
+        actions = jnp.concatenate([batch.action[None], action])
+        q_values = self.q_values(trained["critic"], batch.observation, actions)
+        q, sampled_q = q_values[:, 0], jnp.moveaxis(q_values[:, 1:], 1, 0)
+        error = squared_error(q, td)
+        densities = jnp.broadcast_to(log_density[:, None], sampled_q.shape)
+        penalty = conservative_penalty(sampled_q, densities, q, self.config.penalty_temperature)
+        weight, weight_loss = self._penalty_weight(trained, penalty)
         return error + weight * jnp.mean(penalty) + weight_loss, {
             "critic": error,
             "penalty": jnp.mean(penalty),
             "penalty_weight": weight,
             "mean_q": jnp.mean(q),
-            "mean_q_uniform": jnp.mean(judged[: self.config.actions]),
+            "mean_q_uniform": jnp.mean(sampled_q[: self.config.actions]),
         }
 
-    def _sampled(
-        self, now: Distribution, following: Distribution, data: Float[Array, "B D"], key: Array
+    def _penalty_actions(
+        self, policy: Distribution, next_policy: Distribution, logged: Float[Array, "B D"], key: Array
     ) -> tuple[Float[Array, "K B D"], Float[Array, "K B"]]:
-        """Actions that the penalty looks at, and the log-density of each; zero where none is to be divided by."""
+        """Actions of the penalty and their log-densities, 0 without importance weights."""
         config = self.config
-        uniform_key, now_key, then_key = jax.random.split(key, 3)
-        shape = (config.actions, *data.shape)
+        uniform_key, policy_key, next_key = jax.random.split(key, 3)
+        shape = (config.actions, *logged.shape)
         uniform = jax.random.uniform(uniform_key, shape, minval=-1.0)
         actions = [uniform]
-        densities = [jnp.full(shape[:-1], -data.shape[-1] * math.log(2.0))]
-        for policy, own_key in ((now, now_key), (following, then_key))[: 2 if config.next_actions else 1]:
-            choice = by_key(policy.sample, own_key, config.actions)
-            actions.append(policy.action(choice))
-            densities.append(jax.vmap(policy.log_prob)(choice))
+        densities = [jnp.full(shape[:-1], -logged.shape[-1] * math.log(2.0))]
+        sources = ((policy, policy_key), (next_policy, next_key))
+        for distribution, sample_key in sources[: 2 if config.next_actions else 1]:
+            raw_actions = _samples(distribution, sample_key, config.actions)
+            actions.append(distribution.action(raw_actions))
+            densities.append(jax.vmap(distribution.log_prob)(raw_actions))
         if config.importance:
             return jnp.concatenate(actions), jnp.concatenate(densities)
-        found = jnp.concatenate([*actions, data[None]])
-        return found, jnp.zeros(found.shape[:-1])
+        stacked = jnp.concatenate([*actions, logged[None]])
+        return stacked, jnp.zeros(stacked.shape[:-1])
 
-    def _weight(self, trained: Trained, penalty: Array) -> tuple[Array, Array]:
-        """The penalty's weight, to which no gradient of the penalty flows, and the loss that moves it."""
+    def _penalty_weight(self, trained: Trained, penalty: Array) -> tuple[Array, Array]:
+        """The penalty's weight, without gradient, and the loss that moves it."""
         if self.config.gap is None:
             return jnp.asarray(self.config.penalty), jnp.zeros(())
         log_weight = jnp.minimum(trained["log_penalty"], _LARGEST_WEIGHT)
@@ -163,25 +168,22 @@ class Cql(Offline):
         return jax.lax.stop_gradient(jnp.exp(log_weight)), loss
 
     def _policy_loss(
-        self, trained: Trained, improved: Improved, key: Array
+        self, trained: Trained, policy_batch: PolicyBatch, key: Array
     ) -> tuple[Array, dict[str, Array]]:
-        observation, expert = improved
-        temperature = jnp.exp(trained["log_temperature"])
-        policy = self.distribution(trained["policy"], observation)
-        choice = policy.sample(key)
-        log_prob = policy.log_prob(choice)
-        judged = self.q(jax.lax.stop_gradient(trained["critic"]), observation, policy.action(choice))
-        loss = soft_policy_loss(judged, log_prob, temperature)
-        error = policy.mode() - expert
-        total = jnp.mean(loss)
+        observation, expert = policy_batch
+        actor = self.soft_actor(trained, observation, self.target_entropy, key)
+        error = actor.policy.mode() - expert
+        total = jnp.mean(actor.loss)
         if self.config.imitation:
-            lowest = jnp.min(judged, axis=0)
-            total = jnp.mean(scaled_policy_loss(loss, lowest)) + self.config.imitation * jnp.mean(error**2)
-        heat = jnp.mean(temperature_loss(trained["log_temperature"], log_prob, self.target_entropy))
-        return total + heat, {
+            scaled = jnp.mean(scaled_policy_loss(actor.loss, jnp.min(actor.q_values, axis=0)))
+            total = scaled + self.config.imitation * jnp.mean(error**2)
+        return total + actor.temperature_loss, actor.logs | {
             "policy": total,
-            "mean_q_policy": jnp.mean(judged),
-            "entropy": -jnp.mean(log_prob),
-            "temperature": temperature,
+            "mean_q_policy": jnp.mean(actor.q_values),
             "imitation_error": jnp.mean(jnp.abs(error)),
         }
+
+
+def _samples(distribution: Distribution, key: Array, count: int) -> Float[Array, "count ..."]:
+    """Draw ``count`` raw actions along a leading axis."""
+    return jax.vmap(distribution.sample)(jax.random.split(key, count))

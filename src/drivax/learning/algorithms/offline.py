@@ -1,11 +1,12 @@
-"""What offline algorithms have in common: recorded steps by weight, networks, updates, targets, and what is logged."""
+"""What offline algorithms share: logged steps by weight, normalisation, updates, and evaluation on held-out steps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,27 +16,119 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from drivax.errors import UsageError
-from drivax.learning.algorithms.fitted_q import FittedQ, FittedQConfig
+from drivax.learning.algorithms.off_policy import Carry, OffPolicy, Trained, squared_error
 from drivax.learning.algorithms.optimisers import check_falling, clipped_adam
-from drivax.learning.devices import divided
 from drivax.learning.environment import Environment
-from drivax.learning.experience import Experience, ExperienceConfig, moments, recorded, transitions
+from drivax.learning.experience import (
+    Experience,
+    ExperienceConfig,
+    Recorded,
+    draw,
+    expert_actions,
+    recorded,
+    transitions,
+)
+from drivax.learning.program import divided
 from drivax.learning.replay import Transitions
-from drivax.learning.sampler import draw
-from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
-from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
+from drivax.networks.actor_critic import Critic, NetworkConfig
+from drivax.networks.distributions import REPARAMETRISED, Actions
 from drivax.networks.normalised import (
     NormalisedConfig,
     Statistics,
     feature_statistics,
     set_statistics,
 )
-from drivax.planners.network_planner import NetworkPlanner
-from drivax.rl.temporal_difference import polyak
+from drivax.rl.online import polyak, td_target
 from drivax.scenario.record import record
 
-#: Held-out steps that the mean Q is taken over, and recorded ones that features are normalised by; how many at once.
-_JUDGED, _AT_ONCE = 2048, 256
+#: Held-out steps that the mean Q is taken over and steps that feature statistics are taken of; and at a time.
+_SAMPLES, _BATCH = 2048, 256
+
+
+@dataclass(frozen=True)
+class FittedQConfig:
+    """Settings of fitted-Q evaluation on held-out steps, at every validation.
+
+    Attributes:
+        updates: Updates of a critic that starts again at each validation; 0: no such evaluation.
+        batch: Steps per update.
+        rate: Learning rate of Adam, falling linearly to a tenth.
+        tau: Step of the target critic per update.
+        gradient_norm: Gradients are clipped to this global norm.
+    """
+
+    updates: int = 0
+    batch: int = 256
+    rate: float = 1e-3
+    tau: float = 0.01
+    gradient_norm: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.updates < 0 or self.batch < 1:
+            raise UsageError("fitted_q.updates or fitted_q.batch is too small", cure="use 0 updates for none")
+
+
+@dataclass(frozen=True)
+class FittedQ:
+    """Fitted-Q evaluation (Le et al. 2019, arXiv 1903.08738) of policies, from logged steps alone."""
+
+    config: FittedQConfig
+    network: NetworkConfig
+    environment: Recorded
+    gamma: float
+
+    def value(
+        self,
+        data: Experience,
+        act: Callable[[dict[str, Array]], Float[Array, "B D"]],
+        statistics: Statistics = MappingProxyType({}),
+    ) -> Float[Array, ""]:
+        """Return the estimated discounted return of a policy from where episodes begin.
+
+        The critic learns ``Q(s, a) = r + gamma (1 - terminated) Q'(s', pi(s'))`` from logged steps; the result is the
+        mean of ``Q(s, pi(s))`` over the first usable step of every scenario. Draws are the same in every call, so that
+        checkpoints differ by their policies alone.
+
+        Args:
+            data: The logged steps.
+            act: From a batch of observations to the policy's actions.
+            statistics: Statistics of features, if the network normalises them.
+        """
+        network_key, key = jax.random.split(jax.random.key(0))
+        actions = Actions(self.environment.action_size, self.environment.levels)
+        critic = Critic(self.network, self.environment.shapes(data.data), nnx.Rngs(network_key), actions)
+        set_statistics(critic, statistics)
+        graph, first = nnx.split(critic, nnx.Param)
+        config = self.config
+        optimiser = clipped_adam(config.rate, config.gradient_norm, updates=config.updates)
+
+        def q_values(parameters: Any, observation: dict[str, Array], action: Array) -> Array:
+            return nnx.merge(graph, parameters)(observation, action)
+
+        def update(carry: tuple[Any, Any, Any], key: Array) -> tuple[tuple[Any, Any, Any], None]:
+            parameters, target_parameters, state = carry
+            batch = transitions(self.environment, data, draw(data.critic, key, (config.batch,)))
+            next_action = act(batch.next_observation)
+            next_value = q_values(target_parameters, batch.next_observation, next_action)
+            target = td_target(batch.reward, next_value, batch.terminated, self.gamma)
+
+            def loss(parameters: Any) -> Array:
+                return squared_error(q_values(parameters, batch.observation, batch.action), target)
+
+            change, state = optimiser.update(jax.grad(loss)(parameters), state, parameters)
+            parameters: Any = optax.apply_updates(parameters, change)
+            return (parameters, polyak(target_parameters, parameters, config.tau), state), None
+
+        carry = (first, jax.tree.map(jnp.copy, first), optimiser.init(first))
+        (parameters, _, _), _ = jax.lax.scan(update, carry, jax.random.split(key, config.updates))
+        observation, weight = self._first_steps(data)
+        return jnp.sum(q_values(parameters, observation, act(observation)) * weight) / weight.sum()
+
+    def _first_steps(self, data: Experience) -> tuple[dict[str, Array], Float[Array, " N"]]:
+        """Observe the first usable step of every scenario; weight 0 where a scenario has none."""
+        usable = data.expert.usable
+        index = jnp.arange(len(usable)), jnp.argmax(usable, axis=1)
+        return self.environment.observe_recorded(data.data, index), usable.any(axis=1).astype(jnp.float32)
 
 
 @dataclass(frozen=True)
@@ -43,19 +136,18 @@ class OfflineConfig:
     """Settings of every offline algorithm.
 
     Attributes:
-        network: Of policy, critics and value; an encoder each.
-        records: Which recorded steps are learned from.
+        network: Policy, critics and value, with an encoder each.
+        records: Logged steps to learn from.
         batch: Steps per update.
         updates: Updates per iteration.
         gamma: Discount.
-        tau: How far targets move toward what they follow per update.
-        policy_rate, critic_rate: Learning rates of Adam; a value learns as fast as the critics.
-        last_rate: Both fall linearly to so many times themselves; 1: they stay.
-        falling: Share of the run over which they fall; then they stay, so that validations tell what was reached.
+        tau: Step of target networks per update.
+        policy_rate, critic_rate: Learning rates of Adam; a value network has that of the critics.
+        last_rate: Both fall linearly to ``last_rate`` times the first; 1: constant.
+        falling: Share of the run over which they fall; then they stay.
         gradient_norm: Gradients of each network are clipped to this global norm.
-        normalise: Whether every feature of an observation is shifted and scaled by its mean and deviation over recorded
-            steps, in front of every encoder.
-        fitted_q: How the policy is evaluated on held-out steps, for ``checkpoint_rule: fitted_q``.
+        normalise: Normalise every feature of an observation by its mean and standard deviation over logged steps.
+        fitted_q: Fitted-Q evaluation on held-out steps, for ``checkpoint_rule: fitted_q``.
     """
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -79,27 +171,23 @@ class OfflineConfig:
 
     @property
     def steps_per_iteration(self) -> int:
-        """Recorded steps of one iteration; each counts as a step."""
+        """Logged steps of one iteration; each counts as an environment step."""
         return self.batch * self.updates
 
     def experience(self, environment: Environment, data: Any, weights: np.ndarray | None) -> Experience:
-        """What is learned from; see :class:`ExperienceConfig`."""
+        """Return the experience to learn from; see :class:`ExperienceConfig`."""
         return self.records.of(environment, data, weights)
 
     @property
     def networks(self) -> NetworkConfig:
-        """The networks, with normalisation if there is to be any."""
+        """Configuration of the networks, with normalisation if configured."""
         network = self.network
         return (
             replace(network, encoder=NormalisedConfig(encoder=network.encoder)) if self.normalise else network
         )
 
-    def refuse_choices(self) -> None:
-        """Refuses a policy whose actions have no gradient.
-
-        Raises:
-            UsageError: The policy chooses among levels or parts.
-        """
+    def check_gradient(self) -> None:
+        """Raise UsageError for a policy without a gradient through its actions: of levels or mixtures."""
         if self.network.distribution not in REPARAMETRISED:
             raise UsageError(
                 f"{type(self).__name__} needs a policy with a gradient through its actions",
@@ -112,12 +200,12 @@ class OfflineState:
     """Everything that a run needs to continue.
 
     Attributes:
-        parameters: The policy's.
-        rest: What else is trained, by name.
-        target: What follows it slowly, by name.
+        parameters: Parameters of the policy.
+        rest: Everything else that is trained, by name.
+        target: Target networks, by name.
         optimiser: State of the optimiser.
-        key: Of all draws.
-        iteration: Iterations done.
+        key: Random key.
+        iteration: Finished iterations.
     """
 
     networks: ClassVar[tuple[str, ...]] = ("parameters", "rest", "target")
@@ -130,180 +218,121 @@ class OfflineState:
     iteration: Array
 
 
-#: Everything that gradients change, by name: networks, and single numbers.
-Trained = dict[str, Any]
-#: Where the policy is improved: observations, and what the expert did there.
-Improved = tuple[dict[str, Array], Float[Array, "B D"]]
+Config = TypeVar("Config", bound=OfflineConfig)
+#: Where the policy is improved: observations, and the expert's actions.
+PolicyBatch = tuple[dict[str, Array], Float[Array, "B D"]]
 
 
-class Offline:
-    """An offline algorithm in one environment: a subclass says what is trained and by which loss.
+class Offline(OffPolicy[Config]):
+    """An offline algorithm in one environment.
 
-    Holds configuration and the networks' graphs; everything computed is in the state.
+    Batches of :meth:`loss` are steps that values are learned from, where the policy is improved (the same steps unless
+    weights are for the policy alone), and a key.
     """
 
-    #: Names of what has a slowly following target.
-    follows: ClassVar[tuple[str, ...]] = ("critic",)
-
-    def __init__(self, config: OfflineConfig, environment: Environment, data: Any, iterations: int) -> None:
-        self.settings, self.environment, self.batch = config, environment, config.batch
+    def __init__(self, config: Config, environment: Environment, data: Any, iterations: int) -> None:
+        super().__init__(config, environment, data)
+        self.batch = config.batch
         self.updates = iterations * config.updates
-        self.spec = environment.shapes(data)
         self.optimiser = optax.partition(self.optimisers(), {name: name for name in self.optimisers()})
-        # Only the structures are wanted: no number is drawn.
-        made = nnx.eval_shape(lambda: self.networks(jax.random.key(0)))
-        self.graphs = {name: nnx.graphdef(network) for name, network in made.items()}
 
-    def networks(self, key: Array) -> dict[str, nnx.Module]:
-        """All networks, with fresh parameters."""
-        actions = Actions(self.environment.action_size, self.environment.levels)
-        policy_key, critic_key = jax.random.split(key)
-        network = self.settings.networks
-        return {
-            "policy": Policy(network, self.spec, nnx.Rngs(policy_key), actions),
-            "critic": TwinCritic(network, self.spec, nnx.Rngs(critic_key), actions),
-        }
+    @property
+    def network(self) -> NetworkConfig:
+        """Configuration of all networks."""
+        return self.config.networks
 
-    def numbers(self) -> dict[str, float]:
-        """Single numbers that are trained too, as they are at first."""
+    def scalars(self) -> dict[str, float]:
+        """Return initial values of scalars that are trained too."""
         return {}
 
     def optimisers(self) -> dict[Hashable, optax.GradientTransformation]:
-        """What moves each of them."""
-        return {
-            "policy": self.adam(self.settings.policy_rate),
-            "critic": self.adam(self.settings.critic_rate),
-        }
+        """Return the optimiser of each network and scalar."""
+        return {"policy": self.adam(self.config.policy_rate), "critic": self.adam(self.config.critic_rate)}
 
     def adam(self, rate: float, every: int = 1) -> optax.GradientTransformation:
-        """Adam of something that moves in every, or every so manieth, update."""
-        config = self.settings
-        falls = round(config.falling * self.updates) // every if config.last_rate != 1.0 else 0
-        return clipped_adam(rate, config.gradient_norm, updates=falls, last=config.last_rate)
-
-    def loss(
-        self, trained: Trained, target: Mapping[str, Any], part: Transitions, improved: Improved, key: Array
-    ) -> tuple[Array, dict[str, Array]]:
-        """The sum of all losses, each of which reaches its own parameters only, and what to log.
-
-        Args:
-            trained: What is trained.
-            target: What follows it slowly.
-            part: Steps that values are learned from.
-            improved: Where the policy is improved; of the same steps unless weights are for the policy alone.
-            key: Of whatever is drawn.
-        """
-        raise NotImplementedError
+        """Return Adam for a network that is updated in every n-th update."""
+        config = self.config
+        updates = round(config.falling * self.updates) // every if config.last_rate != 1.0 else 0
+        return clipped_adam(rate, config.gradient_norm, updates=updates, last=config.last_rate)
 
     def init(self, data: Any, key: Array) -> OfflineState:
-        """The state before the first iteration."""
+        """Return the first state."""
         network_key, key = jax.random.split(key)
         networks = self.networks(network_key)
-        # A policy that is loaded is given the shapes of its parameters only, without experience.
-        if self.settings.normalise and isinstance(data, Experience):
+        # Loading a policy needs shapes of its parameters only, and has no experience.
+        if self.config.normalise and isinstance(data, Experience):
             statistics = self._statistics(data)
             for network in networks.values():
                 set_statistics(network, statistics)
-        trained = {name: nnx.state(made, nnx.Param) for name, made in networks.items()}
-        trained |= {name: jnp.asarray(number, jnp.float32) for name, number in self.numbers().items()}
+        trained = {name: nnx.state(network, nnx.Param) for name, network in networks.items()}
+        trained |= {name: jnp.asarray(value, jnp.float32) for name, value in self.scalars().items()}
         return OfflineState(
             parameters=trained["policy"],
             rest=_rest(trained),
-            target={name: jax.tree.map(jnp.copy, trained[name]) for name in self.follows},
+            target={name: jax.tree.map(jnp.copy, trained[name]) for name in self.targets},
             optimiser=self.optimiser.init(trained),
             key=key,
             iteration=jnp.zeros((), jnp.int32),
         )
 
     def iterate(self, data: Experience, state: OfflineState) -> tuple[OfflineState, dict[str, Array]]:
-        """One iteration: so many updates, each on steps drawn anew. Pure; jit it with the state donated."""
+        """Take the updates of one iteration, each on newly drawn steps. Pure; jit it with the state donated."""
         update_key, key = jax.random.split(state.key)
-        trained = {"policy": state.parameters, **state.rest}
 
-        def update(now: tuple[Any, Any, Any], key: Array) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
-            trained, target, optimiser = now
+        def update(carry: Carry, key: Array) -> tuple[Carry, dict[str, Array]]:
             draw_key, loss_key = jax.random.split(key)
-            part, improved = self._drawn(data, draw_key)
-            slope = jax.value_and_grad(self.loss, has_aux=True)
-            (_, logs), gradient = slope(trained, target, part, improved, loss_key)
-            for name in ("policy", "critic"):
-                logs[f"{name}_gradient_norm"] = optax.tree.norm(gradient[name])
-            change, optimiser = self.optimiser.update(gradient, optimiser, trained)
-            trained: Any = optax.apply_updates(trained, change)
-            online = {name: trained[name] for name in self.follows}
-            return (trained, polyak(target, online, self.settings.tau), optimiser), logs
+            return self.update_networks(carry, *self._draw(data, draw_key), loss_key)
 
-        first = (trained, state.target, state.optimiser)
-        keys = jax.random.split(update_key, self.settings.updates)
+        first = ({"policy": state.parameters, **state.rest}, state.target, state.optimiser)
+        keys = jax.random.split(update_key, self.config.updates)
         (trained, target, optimiser), logs = jax.lax.scan(update, first, keys)
-        following = OfflineState(
-            trained["policy"], _rest(trained), target, optimiser, key, state.iteration + 1
-        )
-        return following, {f"loss/{name}": value.mean() for name, value in logs.items()} | data.sizes()
+        after = OfflineState(trained["policy"], _rest(trained), target, optimiser, key, state.iteration + 1)
+        return after, {f"loss/{name}": value.mean() for name, value in logs.items()} | data.sizes()
 
-    def _drawn(self, data: Experience, key: Array) -> tuple[Transitions, Improved]:
-        """Steps to learn values from, and where to improve the policy."""
-        environment, count = recorded(self.environment), (self.settings.batch,)
+    def _draw(self, data: Experience, key: Array) -> tuple[Transitions, PolicyBatch]:
+        """Draw steps to learn values from, and where to improve the policy."""
+        environment, count = recorded(self.environment), (self.config.batch,)
         critic_key, policy_key = jax.random.split(key)
-        part = divided(transitions(environment, data, draw(data.critic, critic_key, count)), axis=0)
+        batch = divided(transitions(environment, data, draw(data.critic, critic_key, count)), axis=0)
         if data.policy is None:
-            return part, (part.observation, part.action)
-        found = moments(environment, data, draw(data.policy, policy_key, count))
-        observation, action, _ = divided(found, axis=0)
-        return part, (observation, action)
+            return batch, (batch.observation, batch.action)
+        drawn = expert_actions(environment, data, draw(data.policy, policy_key, count))
+        observation, action, _ = divided(drawn, axis=0)
+        return batch, (observation, action)
 
     def _statistics(self, data: Experience) -> Statistics:
-        """Of recorded steps, all alike, whatever their weights; the same for every seed."""
-        index, step = draw(data.alike, jax.random.key(0), (_JUDGED // _AT_ONCE, _AT_ONCE))
+        """Statistics of features over uniformly drawn steps, the same for every seed."""
+        index = draw(data.uniform, jax.random.key(0), (_SAMPLES // _BATCH, _BATCH))
         observe = partial(recorded(self.environment).observe_recorded, data.data)
-        return feature_statistics(jax.lax.map(observe, (index, step)))
+        return feature_statistics(jax.lax.map(observe, index))
 
-    def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
-        """The policy with these parameters."""
-        return nnx.merge(self.graphs["policy"], parameters)(observation)
+    def held_out_metrics(self, data: Experience, state: OfflineState) -> dict[str, float]:
+        """Return ``mean_q``: the smaller critic's value of the policy's mode, always over the same held-out steps.
 
-    def q(
-        self, parameters: Any, observation: dict[str, Array], action: Float[Array, "*actions D"]
-    ) -> Float[Array, "2 *actions"]:
-        """Both critics with these parameters."""
-        return nnx.merge(self.graphs["critic"], parameters)(observation, action)
-
-    def judge(self, data: Experience, state: OfflineState) -> dict[str, float]:
-        """``mean_q``: of held-out steps, what the smaller critic expects of the policy's mode.
-
-        Always of the same steps. It compares neither algorithms nor checkpoints: overestimation raises it, too.
-        ``fitted_q``, where it is configured, is what a critic that knows the policy expects from the beginnings.
+        It compares neither algorithms nor checkpoints, because overestimation raises it, too. ``fitted_q``, if
+        configured, is the return that :class:`FittedQ` estimates.
         """
-        found = {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
-        if self.settings.fitted_q.updates:
-            found["fitted_q"] = float(self._fitted_q(data, state.parameters))
-        return found
+        metrics = {"mean_q": float(self._mean_q(data, state.parameters, state.rest["critic"]))}
+        if self.config.fitted_q.updates:
+            metrics["fitted_q"] = float(self._fitted_q(data, state.parameters))
+        return metrics
 
     @partial(jax.jit, static_argnums=0)
     def _mean_q(self, data: Experience, policy: Any, critic: Any) -> Float[Array, ""]:
-        places = draw(data.critic, jax.random.key(0), (_JUDGED,))
-        observation = recorded(self.environment).observe_recorded(data.data, places)
+        index = draw(data.critic, jax.random.key(0), (_SAMPLES,))
+        observation = recorded(self.environment).observe_recorded(data.data, index)
         action = self.distribution(policy, observation).mode()
-        return jnp.mean(jnp.min(self.q(critic, observation, action), axis=0))
+        return jnp.mean(jnp.min(self.q_values(critic, observation, action), axis=0))
 
     @partial(jax.jit, static_argnums=0)
     def _fitted_q(self, data: Experience, policy: Any) -> Float[Array, ""]:
-        config = self.settings
-        judge = FittedQ(config.fitted_q, config.networks, recorded(self.environment), config.gamma)
+        config = self.config
+        evaluation = FittedQ(config.fitted_q, config.networks, recorded(self.environment), config.gamma)
         statistics = self._statistics(data) if config.normalise else {}
-        return judge.value(
+        return evaluation.value(
             data, lambda observation: self.distribution(policy, observation).mode(), statistics
         )
 
-    def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
-        """The policy as a planner."""
-        return NetworkPlanner(parameters, self.graphs["policy"], name, samples)
-
 
 def _rest(trained: Trained) -> Trained:
-    return {name: part for name, part in trained.items() if name != "policy"}
-
-
-def by_key(sample: Callable[[Array], Array], key: Array, count: int) -> Array:
-    """So many samples, in a leading axis."""
-    return jax.vmap(sample)(jax.random.split(key, count))
+    return {name: value for name, value in trained.items() if name != "policy"}

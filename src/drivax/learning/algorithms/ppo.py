@@ -1,8 +1,9 @@
-"""Proximal policy optimisation (Schulman et al. 2017): configuration, state and one iteration on the device."""
+"""Proximal policy optimisation (Schulman et al. 2017, arXiv 1707.06347)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -11,16 +12,22 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
-from drivax.learning.algorithm import Also
+from drivax.learning.algorithm import AuxiliaryLoss
 from drivax.learning.algorithms.optimisers import clipped_adam
-from drivax.learning.collector import Rollout, collect
-from drivax.learning.devices import divided
-from drivax.learning.environment import Environment, Environments
+from drivax.learning.environment import (
+    Environment,
+    Environments,
+    Outcome,
+    Rollout,
+    SampledAction,
+    collect,
+    transition,
+)
+from drivax.learning.program import divided
 from drivax.networks.actor_critic import ActorCritic, NetworkConfig
 from drivax.networks.distributions import Actions, Distribution
 from drivax.planners.network_planner import NetworkPlanner
-from drivax.rl.advantages import generalised_advantages
-from drivax.rl.policy_gradients import clipped_surrogate_loss
+from drivax.rl.online import clipped_surrogate_loss, generalised_advantages
 from drivax.scenario.record import record
 
 
@@ -34,11 +41,11 @@ class PpoConfig:
         unroll: Steps per environment and iteration.
         epochs, minibatches: Passes over the experience, and updates per pass.
         learning_rate: Of Adam, falling linearly over the run to ``last_rate`` times itself.
-        last_rate: See ``learning_rate``; 1: it stays.
+        last_rate: See ``learning_rate``; 1: constant.
         gamma, lambda_: Discount, and mixing of advantages.
         clip: Of the probability ratio.
         value_coefficient, entropy_coefficient: Weights in the loss.
-        gradient_norm: Gradients are clipped to this global norm (None: not at all); those of policy and value apart,
+        gradient_norm: Gradients are clipped to this global norm (None: no clipping), separately for policy and value
             unless they share an encoder.
     """
 
@@ -71,7 +78,7 @@ class PpoConfig:
         return self.environments * self.unroll
 
     def build(self, environment: Environment, data: Any, iterations: int) -> Ppo:
-        """PPO in an environment."""
+        """Return PPO in an environment."""
         return Ppo(self, environment, data, iterations)
 
 
@@ -100,9 +107,9 @@ class Ppo:
             updates=max(iterations * config.epochs * config.minibatches, 1),
             last=config.last_rate,
             eps=1e-5,
-            apart=not config.network.shared_encoder,
+            per_network=not config.network.shared_encoder,
         )
-        # Only the structure is wanted: no number is drawn.
+        # Structure only: no number is drawn.
         self.graph = nnx.graphdef(nnx.eval_shape(lambda: self._network(jax.random.key(0))))
 
     def _network(self, key: Array) -> ActorCritic:
@@ -110,7 +117,7 @@ class Ppo:
         return ActorCritic(self.config.network, self.spec, nnx.Rngs(key), actions)
 
     def init(self, data: Any, key: Array) -> PpoState:
-        """The state before the first iteration."""
+        """Return the first state."""
         network_key, environment_key, key = jax.random.split(key, 3)
         parameters = nnx.state(self._network(network_key), nnx.Param)
         environments = self.environment.start(data, environment_key, self.config.environments)
@@ -119,55 +126,96 @@ class Ppo:
         )
 
     def network(self, parameters: Any) -> ActorCritic:
-        """The network with these parameters."""
+        """Return the network with these parameters."""
         return nnx.merge(self.graph, parameters)
 
     def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
-        """The policy with these parameters."""
+        """Return the policy's action distribution."""
         return self.network(parameters).policy(observation)
 
     def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
-        """The policy as a planner; the value network stays behind."""
+        """Return the policy as a planner, without the value network."""
         graph, weights = nnx.split(self.network(parameters).policy)
         return NetworkPlanner(weights, graph, name, samples)
 
     def with_policy(self, parameters: Any, of: Any) -> Any:
-        """Parameters whose policy, a shared encoder included, is that ``of`` other ones."""
+        """Return parameters with the policy ``of`` others, a shared encoder included."""
         return nnx.State({**parameters.raw_mapping, "policy": of.raw_mapping["policy"]})
 
     def iterate(
-        self, data: Any, state: PpoState, also: Also | None = None
+        self, data: Any, state: PpoState, auxiliary_loss: AuxiliaryLoss | None = None
     ) -> tuple[PpoState, dict[str, Array]]:
-        """One iteration: collect, then update. Pure; jit it with the state donated.
-
-        Args:
-            data: The environment's data.
-            state: The state.
-            also: A further loss of the parameters, added in every update.
+        """Collect a rollout, then update. Pure; jit it with the state donated.
 
         Returns:
-            The next state, and sums (``rollout/*``, see ``collector.collect``) and means (``loss/*``) to log.
+            The next state, and sums (``rollout/*``, see ``environment.collect``) and means (``loss/*``) to log.
         """
-        collect_key, update_key, key = jax.random.split(state.key, 3)
-        network = self.network(state.parameters)
-
-        def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            policy, value = network.both(observation)
-            choice = policy.sample(key)
-            return choice, policy.action(choice), {"log_prob": policy.log_prob(choice), "value": value}
-
+        actor, key = partial(self.sample_action, state), self.rollout_key(state)
         environments, rollout, totals = collect(
-            self.environment, data, state.environments, actor, collect_key, self.config.unroll
+            self.environment, data, state.environments, actor, key, self.config.unroll
         )
-        batch = self._batch(rollout, network.value(environments.observation))
-        parameters, optimiser, losses = self._update(state, batch, update_key, also)
-        following = PpoState(parameters, optimiser, environments, key, state.iteration + 1)
-        return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
+        state = replace(state, environments=environments)
+        state, losses = self.update(data, state, rollout, auxiliary_loss)
+        return state, {f"rollout/{name}": value for name, value in totals.items()} | losses
+
+    def rollout_key(self, state: PpoState) -> Array:
+        """Return the random key of the next rollout."""
+        return jax.random.split(state.key, 3)[0]
+
+    def sample_action(self, state: PpoState, observation: Any, key: Array) -> SampledAction:
+        """Sample the policy, with log-probabilities and values as extras."""
+        policy, value = self.network(state.parameters).both(observation)
+        raw_action = policy.sample(key)
+        extra = {"log_prob": policy.log_prob(raw_action), "value": value}
+        return SampledAction(raw_action, policy.action(raw_action), extra)
+
+    def transition(self, now: Environments, sampled: SampledAction, outcome: Outcome) -> Rollout:
+        """Return one row of a rollout, with its observation."""
+        return transition(self.environment, now, sampled, outcome)
+
+    def update(
+        self, data: Any, state: PpoState, rollout: Rollout, auxiliary_loss: AuxiliaryLoss | None = None
+    ) -> tuple[PpoState, dict[str, Array]]:
+        """Take the updates of one iteration on a rollout that ends at ``state.environments``.
+
+        Args:
+            data: The environment's data, unused.
+            state: The state that the rollout was sampled with, with the environments after it.
+            rollout: ``unroll`` steps.
+            auxiliary_loss: An additional loss of the parameters.
+        """
+        config = self.config
+        _, update_key, key = jax.random.split(state.key, 3)
+        batch = self._batch(rollout, self.network(state.parameters).value(state.environments.observation))
+
+        def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
+            order_key, noise_key = jax.random.split(key)
+            order = jax.random.permutation(order_key, config.steps_per_iteration)
+            order = order.reshape(config.minibatches, -1)
+            # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
+            shuffled = divided(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
+            keys = jax.random.split(noise_key, config.minibatches)
+            return jax.lax.scan(update, carry, (shuffled, keys))
+
+        def update(
+            carry: tuple[Any, Any], inputs: tuple[dict[str, Any], Array]
+        ) -> tuple[tuple[Any, Any], dict[str, Array]]:
+            (parameters, optimiser), (minibatch, key) = carry, inputs
+            slope = jax.value_and_grad(self._loss, has_aux=True)
+            (_, logs), gradient = slope(parameters, minibatch, key, auxiliary_loss)
+            logs["gradient_norm"] = optax.tree.norm(gradient)
+            change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
+            return (optax.apply_updates(parameters, change), optimiser), logs
+
+        carry, keys = (state.parameters, state.optimiser), jax.random.split(update_key, config.epochs)
+        (parameters, optimiser), logs = jax.lax.scan(epoch, carry, keys)
+        losses = {f"loss/{name}": value.mean() for name, value in logs.items()}
+        return PpoState(parameters, optimiser, state.environments, key, state.iteration + 1), losses
 
     def _batch(self, rollout: Rollout, last: Array) -> dict[str, Any]:
-        """What is learned from, ``[time x batch]``; ``last`` is the value of where the rollout ends."""
+        """Return the flattened rollout with advantages, given the values of the last observations."""
         value_t = rollout.extra["value"]
-        # The row behind a truncated step holds its final state, so this is the value that it bootstraps.
+        # The row after a truncated step holds its final state, so this is the value to bootstrap.
         value_tp1 = jnp.concatenate([value_t[1:], last[None]])
         advantage, target = generalised_advantages(
             rollout.reward,
@@ -180,7 +228,7 @@ class Ppo:
         )
         batch = {
             "observation": rollout.observation,
-            "choice": rollout.choice,
+            "raw_action": rollout.raw_action,
             "log_prob": rollout.extra["log_prob"],
             "advantage": advantage,
             "target": target,
@@ -188,58 +236,32 @@ class Ppo:
         }
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
 
-    def _update(
-        self, state: PpoState, batch: dict[str, Any], key: Array, also: Also | None
-    ) -> tuple[Any, Any, dict[str, Array]]:
-        config = self.config
-
-        def epoch(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            order_key, noise_key = jax.random.split(key)
-            order = jax.random.permutation(order_key, config.steps_per_iteration)
-            order = order.reshape(config.minibatches, -1)
-            # Shuffled once, outside of the loop: inside, the reads would be repeated for every use of a minibatch.
-            shuffled = divided(jax.tree.map(lambda leaf: leaf[order], batch), axis=1)
-            return jax.lax.scan(minibatch, carry, (shuffled, jax.random.split(noise_key, config.minibatches)))
-
-        def minibatch(
-            carry: tuple[Any, Any], now: tuple[dict[str, Any], Array]
-        ) -> tuple[tuple[Any, Any], dict[str, Array]]:
-            (parameters, optimiser), (part, key) = carry, now
-            (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(parameters, part, key, also)
-            logs["gradient_norm"] = optax.tree.norm(gradient)
-            change, optimiser = self.optimiser.update(gradient, optimiser, parameters)
-            return (optax.apply_updates(parameters, change), optimiser), logs
-
-        carry = (state.parameters, state.optimiser)
-        (parameters, optimiser), logs = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
-        return parameters, optimiser, {f"loss/{name}": value.mean() for name, value in logs.items()}
-
     def _loss(
-        self, parameters: Any, part: dict[str, Any], key: Array, also: Also | None
+        self, parameters: Any, minibatch: dict[str, Any], key: Array, auxiliary_loss: AuxiliaryLoss | None
     ) -> tuple[Array, dict[str, Array]]:
-        config, alive = self.config, part["alive"]
-        entropy_key, also_key = jax.random.split(key)
+        config, alive = self.config, minibatch["alive"]
+        entropy_key, auxiliary_key = jax.random.split(key)
 
         def mean(value: Array) -> Array:
             return jnp.sum(value * alive) / jnp.maximum(jnp.sum(alive), 1.0)
 
-        policy, value = self.network(parameters).both(part["observation"])
-        log_prob = policy.log_prob(part["choice"])
-        centre = mean(part["advantage"])
-        spread = jnp.sqrt(mean((part["advantage"] - centre) ** 2)) + 1e-8
-        advantage = (part["advantage"] - centre) / spread
-        policy_loss = mean(clipped_surrogate_loss(log_prob, part["log_prob"], advantage, config.clip))
-        value_loss = mean((value - part["target"]) ** 2)
+        policy, value = self.network(parameters).both(minibatch["observation"])
+        log_prob = policy.log_prob(minibatch["raw_action"])
+        centre = mean(minibatch["advantage"])
+        deviation = jnp.sqrt(mean((minibatch["advantage"] - centre) ** 2)) + 1e-8
+        advantage = (minibatch["advantage"] - centre) / deviation
+        policy_loss = mean(clipped_surrogate_loss(log_prob, minibatch["log_prob"], advantage, config.clip))
+        value_loss = mean((value - minibatch["target"]) ** 2)
         entropy = mean(policy.entropy_estimate(entropy_key))
         total = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
-        further, logs = (0.0, {}) if also is None else also(parameters, also_key)
-        ratio = jnp.exp(log_prob - part["log_prob"])
-        return total + further, logs | {
+        auxiliary, logs = (0.0, {}) if auxiliary_loss is None else auxiliary_loss(parameters, auxiliary_key)
+        ratio = jnp.exp(log_prob - minibatch["log_prob"])
+        return total + auxiliary, logs | {
             "policy": policy_loss,
             "value": value_loss,
             "entropy": entropy,
             "clipped_share": mean((jnp.abs(ratio - 1.0) > config.clip).astype(jnp.float32)),
-            "kl": mean(part["log_prob"] - log_prob),
+            "kl": mean(minibatch["log_prob"] - log_prob),
             "explained_variance": 1.0
-            - value_loss / jnp.maximum(mean((part["target"] - mean(part["target"])) ** 2), 1e-8),
+            - value_loss / jnp.maximum(mean((minibatch["target"] - mean(minibatch["target"])) ** 2), 1e-8),
         }

@@ -1,30 +1,37 @@
-"""Soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905): configuration, state and one iteration on the device."""
+"""Soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from drivax.errors import UsageError
-from drivax.learning import replay
-from drivax.learning.algorithm import Also
+from drivax.learning.algorithm import AuxiliaryLoss
+from drivax.learning.algorithms.off_policy import Carry, OffPolicy, target_entropy
 from drivax.learning.algorithms.optimisers import clipped_adam
-from drivax.learning.branches import in_any
-from drivax.learning.collector import Actor, collect
-from drivax.learning.environment import Environment, Environments
-from drivax.learning.replay import Replay, ReplayConfig, Transitions
-from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
-from drivax.networks.distributions import REPARAMETRISED, Actions, Distribution
-from drivax.planners.network_planner import NetworkPlanner
-from drivax.rl.temporal_difference import polyak, soft_policy_loss, soft_value, td_target, temperature_loss
+from drivax.learning.environment import (
+    Environment,
+    Environments,
+    Outcome,
+    Rollout,
+    SampledAction,
+    collect,
+    in_any,
+    transition,
+)
+from drivax.learning.replay import Replay, ReplayBuffer, ReplayConfig, ReplayIndex, Transitions
+from drivax.networks.actor_critic import NetworkConfig
+from drivax.networks.distributions import REPARAMETRISED
+from drivax.rl.online import soft_value
 from drivax.scenario.record import record
 
 
@@ -34,19 +41,19 @@ class SacConfig:
 
     Attributes:
         network: Policy and critics; an encoder each.
-        replay: How much is kept, and as what.
+        replay: Size and format of the replay buffer.
         environments: Environments in parallel.
         unroll: Steps per environment and iteration.
         updates_per_step: Updates per step of all environments.
         batch: Steps per update.
         warm_up: Steps before the first update.
-        explore: What acts before the first update: uniform actions, or the policy.
+        explore: Actions before the first update: uniform, or of the policy.
         policy_rate, critic_rate, temperature_rate: Learning rates of Adam.
         gamma: Discount.
-        tau: How far target critics move toward the critics per update.
-        temperature: The first one.
-        target_entropy: Of the policy; by default minus the numbers in an action.
-        gradient_norm: Gradients of the policy and of the critics are clipped to this global norm; None: not at all.
+        tau: Step of the target critics toward the critics per update.
+        temperature: Initial temperature.
+        target_entropy: Target entropy of the policy; by default minus the size of an action.
+        gradient_norm: Gradients of the policy and of the critics are clipped to this global norm; None: no clipping.
     """
 
     kind: Literal["sac"] = "sac"
@@ -73,16 +80,17 @@ class SacConfig:
         rows = self.replay.rows(self.environments)
         if self.unroll > rows:
             raise UsageError(
-                f"a replay of {rows} rows for an unroll of {self.unroll} steps", cure="give it more capacity"
+                f"unroll of {self.unroll} steps does not fit a replay buffer of {rows} rows",
+                cure="raise replay.capacity",
             )
         if self.unroll < 2 and self.warm_up < 2 * self.environments:
             raise UsageError(
-                "there is no step with a successor before the first update",
+                "the first update has no step with a successor to sample",
                 cure=f"set warm_up to {2 * self.environments} or more",
             )
         if self.network.distribution not in REPARAMETRISED:
             raise UsageError(
-                "SAC needs a policy with a gradient through its samples", cure="gaussian or beta"
+                "SAC needs a policy with reparameterised samples", cure="set distribution to gaussian or beta"
             )
 
     @property
@@ -97,11 +105,14 @@ class SacConfig:
 
 @record
 class Trained:
-    """What gradients change."""
+    """Everything that gradients change."""
 
     policy: Any
     critic: Any
     log_temperature: Any
+
+    def __getitem__(self, name: str) -> Any:
+        return getattr(self, name)
 
 
 @record
@@ -121,37 +132,25 @@ class SacState:
     iteration: Array
 
 
-class Sac:
-    """SAC in one environment. Holds configuration and the networks' graphs; everything computed is in the state."""
+class Sac(OffPolicy[SacConfig]):
+    """SAC in one environment."""
 
     def __init__(self, config: SacConfig, environment: Environment, data: Any) -> None:
-        self.config, self.environment = config, environment
-        self.spec = environment.shapes(data)
-        self.target_entropy = (
-            -float(environment.action_size) if config.target_entropy is None else config.target_entropy
-        )
+        super().__init__(config, environment, data)
+        self.buffer = ReplayBuffer(config.replay, environment)
+        self.target_entropy = target_entropy(config, environment)
         optimisers: dict[Hashable, optax.GradientTransformation] = {
             "policy": clipped_adam(config.policy_rate, config.gradient_norm),
             "critic": clipped_adam(config.critic_rate, config.gradient_norm),
             "temperature": optax.adam(config.temperature_rate),
         }
         self.optimiser = optax.partition(optimisers, Trained("policy", "critic", "temperature"))
-        # Only the structures are wanted: no number is drawn.
-        policy, critic = nnx.eval_shape(lambda: self._networks(jax.random.key(0)))
-        self.policy_graph, self.critic_graph = nnx.graphdef(policy), nnx.graphdef(critic)
-
-    def _networks(self, key: Array) -> tuple[Policy, TwinCritic]:
-        actions = Actions(self.environment.action_size, self.environment.levels)
-        policy_key, critic_key = jax.random.split(key)
-        return (
-            Policy(self.config.network, self.spec, nnx.Rngs(policy_key), actions),
-            TwinCritic(self.config.network, self.spec, nnx.Rngs(critic_key), actions),
-        )
 
     def init(self, data: Any, key: Array) -> SacState:
-        """The state before the first iteration."""
+        """Return the first state."""
         network_key, environment_key, key = jax.random.split(key, 3)
-        policy, critic = (nnx.state(network, nnx.Param) for network in self._networks(network_key))
+        networks = self.networks(network_key)
+        policy, critic = (nnx.state(networks[name], nnx.Param) for name in ("policy", "critic"))
         log_temperature = jnp.asarray(math.log(self.config.temperature), jnp.float32)
         environments = self.environment.start(data, environment_key, self.config.environments)
         trained: Any = Trained(policy, critic, log_temperature)
@@ -161,141 +160,128 @@ class Sac:
             log_temperature=log_temperature,
             target=jax.tree.map(jnp.copy, critic),
             optimiser=self.optimiser.init(trained),
-            replay=replay.init(self.config.replay, self.environment, environments),
+            replay=self.buffer.init(environments),
             environments=environments,
             key=key,
             iteration=jnp.zeros((), jnp.int32),
         )
 
-    def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
-        """The policy with these parameters."""
-        return nnx.merge(self.policy_graph, parameters)(observation)
-
-    def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
-        """The policy as a planner."""
-        return NetworkPlanner(parameters, self.policy_graph, name, samples)
-
     def with_policy(self, parameters: Any, of: Any) -> Any:
-        """Parameters whose policy is that ``of`` other ones: these, since there are no others among them."""
+        """Return parameters with the policy ``of`` others: those, since ``parameters`` are the policy's."""
         return of
 
     def iterate(
-        self, data: Any, state: SacState, also: Also | None = None
+        self, data: Any, state: SacState, auxiliary_loss: AuxiliaryLoss | None = None
     ) -> tuple[SacState, dict[str, Array]]:
-        """One iteration: collect, then update so many times. Pure; jit it with the state donated.
-
-        Args:
-            data: The environment's data.
-            state: The state.
-            also: A further loss of the policy.
+        """Collect a rollout, then update. Pure; jit it with the state donated.
 
         Returns:
             The next state, and sums to log: ``rollout/*`` of the collector, ``loss/*`` with ``loss/*/n``.
         """
-        config = self.config
-        collect_key, draw_key, update_key, key = jax.random.split(state.key, 4)
-        before = state.iteration * config.steps_per_iteration
-        actor = self._actor(state.parameters, explores=before < config.warm_up)
         environments, rollout, totals = collect(
-            self.environment, data, state.environments, actor, collect_key, config.unroll, config.replay.store
+            self.environment,
+            data,
+            state.environments,
+            partial(self.sample_action, state),
+            self.rollout_key(state),
+            self.config.unroll,
+            self.config.replay.store,
         )
-        kept = replay.add(state.replay, rollout)
-        first = (
+        state = replace(state, environments=environments, replay=self.buffer.add(state.replay, rollout))
+        state, losses = self.update(data, state, auxiliary_loss)
+        return state, {f"rollout/{name}": value for name, value in totals.items()} | losses
+
+    def rollout_key(self, state: SacState) -> Array:
+        """Return the random key of the next rollout."""
+        return jax.random.split(state.key, 4)[0]
+
+    def sample_action(self, state: SacState, observation: Any, key: Array) -> SampledAction:
+        """Sample the policy, or uniform actions during warm-up; the buffer stores the action as raw action."""
+        sample_key, uniform_key = jax.random.split(key)
+        policy = self.distribution(state.parameters, observation)
+        action = policy.action(policy.sample(sample_key))
+        if self.config.explore == "uniform":
+            uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0)
+            warming_up = state.iteration * self.config.steps_per_iteration < self.config.warm_up
+            action = jnp.where(warming_up, uniform, action)
+        return SampledAction(action, action, {})
+
+    def transition(self, now: Environments, sampled: SampledAction, outcome: Outcome) -> Rollout:
+        """Return one row of a rollout, in the format of the buffer."""
+        return transition(self.environment, now, sampled, outcome, self.config.replay.store)
+
+    def update(
+        self, data: Any, state: SacState, auxiliary_loss: AuxiliaryLoss | None = None
+    ) -> tuple[SacState, dict[str, Array]]:
+        """Take the updates of one iteration on batches from the buffer; none before ``warm_up`` steps.
+
+        Args:
+            data: The environment's data.
+            state: The state, with the rollout of this iteration in ``replay``.
+            auxiliary_loss: An additional loss of the policy.
+        """
+        config = self.config
+        _, draw_key, update_key, key = jax.random.split(state.key, 4)
+        before = state.iteration * config.steps_per_iteration
+        first: Carry = (
             Trained(state.parameters, state.critic, state.log_temperature),
-            state.target,
+            {"critic": state.target},
             state.optimiser,
         )
 
-        @jax.jit  # so that asking for the shapes of what it logs traces nothing a second time
-        def learn() -> tuple[tuple[Trained, Any, Any], dict[str, Array]]:
-            places = replay.draw(kept, draw_key, (config.unroll * config.updates_per_step, config.batch))
+        @jax.jit  # so that the shapes of its logs do not trace it a second time
+        def learn() -> tuple[Carry, dict[str, Array]]:
+            shape = (config.unroll * config.updates_per_step, config.batch)
+            index = self.buffer.draw(state.replay, draw_key, shape)
 
-            def update(now: Any, drawn: tuple[replay.Places, Array]) -> Any:
-                part = replay.sample(self.environment, data, kept, drawn[0])
-                return self._update(now, part, drawn[1], also)
+            def update(carry: Carry, drawn: tuple[ReplayIndex, Array]) -> tuple[Carry, dict[str, Array]]:
+                batch = self.buffer.sample(data, state.replay, drawn[0])
+                return self.update_networks(carry, batch, drawn[1], auxiliary_loss)
 
-            keys = jax.random.split(update_key, len(places[0]))
-            trained, logs = jax.lax.scan(update, first, (places, keys))
-            return trained, _sums(logs)
+            keys = jax.random.split(update_key, len(index[0]))
+            carry, logs = jax.lax.scan(update, first, (index, keys))
+            return carry, _sums(logs)
 
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(learn)[1])
         warm = in_any(before + config.steps_per_iteration >= config.warm_up)
-        (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, nothing))
-        following = SacState(
-            trained.policy, trained.critic, trained.log_temperature, target, optimiser, kept, environments, key,
-            state.iteration + 1,
+        (trained, target, optimiser), losses = jax.lax.cond(warm, learn, lambda: (first, zeros))
+        after = SacState(
+            trained.policy, trained.critic, trained.log_temperature, target["critic"], optimiser, state.replay,
+            state.environments, key, state.iteration + 1,
         )  # fmt: skip
-        return following, {f"rollout/{name}": value for name, value in totals.items()} | losses
+        return after, losses
 
-    def _actor(self, parameters: Any, explores: Bool[Array, ""]) -> Actor:
-        """Samples the policy, or as configured where it ``explores``; remembers the action as its choice."""
-
-        def actor(observation: Any, key: Array) -> tuple[Array, Array, dict[str, Array]]:
-            sample_key, uniform_key = jax.random.split(key)
-            policy = self.distribution(parameters, observation)
-            action = policy.action(policy.sample(sample_key))
-            if self.config.explore == "uniform":
-                anything = jax.random.uniform(uniform_key, action.shape, minval=-1.0)
-                action = jnp.where(explores, anything, action)
-            return action, action, {}
-
-        return actor
-
-    def _update(
-        self, now: tuple[Any, Any, Any], part: Transitions, key: Array, also: Also | None
-    ) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
-        """All three losses at the same parameters, then the target critics.
-
-        Args:
-            now: What is :class:`Trained`, the target critics, and the optimiser's state.
-            part: The batch.
-            key: Of samples.
-            also: A further loss of the policy.
-        """
-        trained, target, optimiser = now
-        (_, logs), gradient = jax.value_and_grad(self._loss, has_aux=True)(trained, target, part, key, also)
-        logs["policy_gradient_norm"] = optax.tree.norm(gradient.policy)
-        logs["critic_gradient_norm"] = optax.tree.norm(gradient.critic)
-        change, optimiser = self.optimiser.update(gradient, optimiser, trained)
-        trained: Any = optax.apply_updates(trained, change)
-        return (trained, polyak(target, trained.critic, self.config.tau), optimiser), logs
-
-    def _loss(
-        self, trained: Trained, target: Any, part: Transitions, key: Array, also: Also | None
+    def loss(
+        self,
+        trained: Trained,
+        target: Any,
+        batch: Transitions,
+        key: Array,
+        auxiliary_loss: AuxiliaryLoss | None,
     ) -> tuple[Array, dict[str, Array]]:
-        """The sum of the losses; each reaches its own parameters only."""
-        next_key, key, also_key = jax.random.split(key, 3)
+        """Return the sum of the losses of critics, policy and temperature."""
+        next_key, key, auxiliary_key = jax.random.split(key, 3)
+        next_policy = self.distribution(trained.policy, batch.next_observation)
+        raw_action = next_policy.sample(next_key)
+        next_q = self.q_values(target["critic"], batch.next_observation, next_policy.action(raw_action))
         temperature = jnp.exp(trained.log_temperature)
-        following = self.distribution(trained.policy, part.following)
-        choice = following.sample(next_key)
-        value = soft_value(
-            self._q(target, part.following, following.action(choice)), following.log_prob(choice), temperature
+        next_value = soft_value(next_q, next_policy.log_prob(raw_action), temperature)
+        critic_loss, q = self.critic_loss(trained, batch, next_value)
+        actor = self.soft_actor(trained, batch.observation, self.target_entropy, key)
+        policy_loss = jnp.mean(actor.loss)
+        auxiliary, logs = (
+            (0.0, {}) if auxiliary_loss is None else auxiliary_loss(trained.policy, auxiliary_key)
         )
-        goal = td_target(part.reward, value, part.terminated, self.config.gamma)
-        q = self._q(trained.critic, part.observation, part.action)
-        critic_loss = 0.5 * jnp.mean((q - goal) ** 2)
-
-        policy = self.distribution(trained.policy, part.observation)
-        choice = policy.sample(key)
-        log_prob = policy.log_prob(choice)
-        judged = self._q(jax.lax.stop_gradient(trained.critic), part.observation, policy.action(choice))
-        policy_loss = jnp.mean(soft_policy_loss(judged, log_prob, temperature))
-        heat = jnp.mean(temperature_loss(trained.log_temperature, log_prob, self.target_entropy))
-        further, logs = (0.0, {}) if also is None else also(trained.policy, also_key)
-        return critic_loss + policy_loss + heat + further, logs | {
+        total = critic_loss + policy_loss + actor.temperature_loss + auxiliary
+        return total, logs | actor.logs | {
             "critic": critic_loss,
             "policy": policy_loss,
             "mean_q": jnp.mean(q),
-            "entropy": -jnp.mean(log_prob),
-            "temperature": temperature,
         }
-
-    def _q(self, parameters: Any, observation: dict[str, Array], action: Array) -> Array:
-        return nnx.merge(self.critic_graph, parameters)(observation, action)
 
 
 def _sums(logs: dict[str, Array]) -> dict[str, Array]:
-    """Sums over updates, and of how many."""
+    """Sums over updates, with counts."""
     sums = {}
     for name, values in logs.items():
         sums[f"loss/{name}"] = values.sum()

@@ -1,4 +1,4 @@
-"""The emergency brake of PDM-Closed, for any planner: stop if ego is about to hit somebody by its own fault.
+"""The emergency brake of PDM-Closed, for any planner: stop if ego is about to hit another agent by its own fault.
 
 Source: Dauner, Hallgarten, Geiger and Chitta, "Parting with Misconceptions about Learning-based Vehicle Motion
 Planning" (CoRL 2023) and the numbers of its published implementation.
@@ -54,7 +54,7 @@ def is_emergency(
     """Whether to brake.
 
     Args:
-        fault_s: Time until ego would hit somebody by its own fault, infinite where it does not.
+        fault_s: Time until ego would hit another agent by its own fault, infinite where it does not.
         speed: Of ego, m/s.
         config: When to brake.
     """
@@ -73,15 +73,15 @@ def braking(
         config: Gains and bounds.
     """
     (p, d), (slow_p, slow_d) = config.gains, config.slow_gains
-    wanted = jnp.where(
+    unclipped = jnp.where(
         speed > config.slow_mps, -p * speed - d * acceleration, -slow_p * speed - slow_d * acceleration
     )
-    return jnp.clip(wanted, config.least_mps2, config.most_mps2)
+    return jnp.clip(unclipped, config.least_mps2, config.most_mps2)
 
 
 @record
 class EmergencyBrake:
-    """Another planner, braked when its action, kept up, would make ego hit somebody by its own fault.
+    """Another planner, braked when its action, kept up, would make ego hit another agent by its own fault.
 
     The others keep their velocities; what ego touches already does not count.
 
@@ -132,7 +132,7 @@ class EmergencyBrake:
         soon = until_overlap(drive, size, others, DT_S)
         fault_s = jnp.min(fault_times(drive, size, others, soon, unlawful))
         speed = motion[MOTION_SPEED]
-        wanted = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
-        brake = self.actions.action(motion, wanted, jnp.zeros(()), me[LENGTH])
+        unclipped = braking(speed, (speed - context.history[-2, MOTION_SPEED]) / DT_S, self.config)
+        brake = self.actions.action(motion, unclipped, jnp.zeros(()), me[LENGTH])
         chosen = jnp.where(is_emergency(fault_s, speed, self.config), brake, action)
-        return self.actions.actuated(motion, chosen, context.action), carry
+        return chosen, carry

@@ -1,4 +1,4 @@
-"""Everyone at constant velocity: where others will be, when ego would meet them, and whose fault that would be."""
+"""All agents at constant velocity: where others will be, when ego would meet them, and whose fault that would be."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Forecast:
         box: Their boxes now.
         velocity: m/s.
         kind: ``scenario.schema.AgentKind``.
-        valid: Whether there is somebody.
+        valid: Whether the agent is there.
     """
 
     box: Float[Array, "K 6"]
@@ -41,10 +41,10 @@ class Forecast:
         cls, frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
         most: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Those who come nearest to a way within five seconds.
+        """Those that come nearest to a way within five seconds.
 
         Args:
-            frame: Everyone now.
+            frame: All agents now.
             slot: Ego.
             ignored: Who does not count.
             way: Points that ego may come to.
@@ -98,9 +98,9 @@ def fault_times(
     motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
     unlawful: Bool[Array, " T"],
 ) -> Float[Array, " K"]:  # fmt: skip
-    """When each of the others is hit by ego's fault, s; infinite for those who are not.
+    """When each of the others is hit by ego's fault, s; infinite for those that are not.
 
-    Fault is decided at the first overlap, by the rule that judges episodes (``simulator.contact.classify_contacts``).
+    Fault is decided at the first overlap, by the rule of the metric (``simulator.contact.classify_contacts``).
 
     Args:
         motion: The drive.

@@ -1,4 +1,4 @@
-"""PDM-Closed: 15 proposals along the route, each driven in thought, judged as nuPlan judges, and the best one driven.
+"""PDM-Closed: simulates 15 proposals along the route, scores them as nuPlan does, and drives the best one.
 
 Source: Dauner, Hallgarten, Geiger and Chitta, "Parting with Misconceptions about Learning-based Vehicle Motion
 Planning" (CoRL 2023), and the numbers of its published implementation; where this one departs from it is written in
@@ -42,7 +42,7 @@ PUBLISHED_DRIVER = IdmParameters(
     exponent=10.0,
     max_braking_mps2=3.0,
 )
-#: Every so many points of the route are compared with where others will be.
+#: Stride of the route points that are compared with forecasts.
 _SPARSE = 5
 
 
@@ -56,12 +56,12 @@ class PdmConfig:
         fallback_mps: Limit where none is known.
         driver: The IDM of the proposals.
         steps: How far they are unrolled, steps of 0.1 s.
-        leader_every: Steps after which a proposal looks for its leader anew.
+        leader_every: Steps after which a proposal looks for its leader again.
         radius_m: Others further away are not looked at.
         agents: How many others are looked at: of those within the radius the ones that come nearest to the route. The
             publication looks at the nearest 50 vehicles, 25 pedestrians, 10 cyclists and 50 other things.
         tracking: How proposals are driven.
-        scoring: How they are judged.
+        scoring: How they are evaluated.
         brake: The emergency brake.
     """
 
@@ -108,7 +108,7 @@ class Weighed:
 
     Attributes:
         cars: As they would be driven, step by step.
-        judgement: How each is judged.
+        judgement: How each is evaluated.
         score: In [0, 1].
     """
 
@@ -130,7 +130,7 @@ class PdmPlanner:
     replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Memory:
-        """Nobody touched yet; acceleration and steering as the motion of the last half second has them."""
+        """No agent touched yet; acceleration and steering as the motion of the last half second has them."""
         context = state.context
         before, now = context.history[-1 - _PAST], context.history[-1]
         moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _PAST * DT_S
@@ -166,11 +166,10 @@ class PdmPlanner:
         steering = jnp.where(brakes, 0.0, weighed.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
-        action = self.actions.actuated(motion, action, context.action)
         return action, Memory(carry.touched, acceleration, steering)
 
     def weigh(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> Weighed:
-        """All proposals, driven and judged."""
+        """All proposals, driven and evaluated."""
         config, context, around = self.config, situation.context, situation.surroundings
         frame, motion = around.frame, context.history[-1]
         me = frame.box[context.slot]
@@ -178,13 +177,13 @@ class PdmPlanner:
         lines = Lines.beside_route(bank, context.index, around.route.along_m, config.offsets_m, me)
         way = lines.points[0, ::_SPARSE, :2]
         others = Forecast.of(frame, context.slot, carry.touched, way, config.agents, config.radius_m)
-        # Each stage is written out: XLA would compute it anew in every operation that uses it.
+        # Each stage is written out: XLA would compute it again in every operation that uses it.
         lines, others = jax.lax.optimization_barrier((lines, others))
         limit = jnp.where(lines.limit > 0.0, lines.limit, config.fallback_mps)
-        wanted = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
+        desired = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
         stop_m = stop_line_m(bank, context, frame)
         driver = (config.driver, config.steps, config.leader_every)
-        proposals = unrolled(lines, others, size, speed, wanted, stop_m, driver)
+        proposals = unrolled(lines, others, size, speed, desired, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
         wheelbase = self._wheelbase(size[0])
         car = Car(motion, carry.acceleration, carry.steering)

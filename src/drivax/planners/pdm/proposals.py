@@ -1,4 +1,4 @@
-"""PDM-Closed's proposals: lines beside the route, and IDM unrolled along each of them against forecast agents."""
+"""PDM-Closed's proposals: lines along the route, and IDM unrolled along each of them against forecast agents."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LINE_X, LINE_Y, LINE_COS, LINE_SIN, LINE_BEND, LINE_PLACE, LINE_Z = range(7)
 
 @record
 class Lines:
-    """P lines beside the route, each at points 1 m apart along itself, from abreast of ego on.
+    """P lines along the route, each at points 1 m apart along itself, from abreast of ego on.
 
     Attributes:
         points: x, y, cosine and sine of the heading, curvature (1/m), place along the route from ego on (m), and height
@@ -96,7 +96,7 @@ class Lines:
         return both(self.points, low) * (1.0 - part) + both(self.points, low + 1) * part
 
     def places(self, xy: Float[Array, "*T 2"]) -> Float[Array, "*T"]:
-        """Places along the route, from ego on, of points beside it."""
+        """Places along the route, from ego on, of points next to it."""
         there = jnp.ones(self.route.shape[0], bool)
         offsets = jnp.arange(self.route.shape[0], dtype=jnp.float32) * _EVERY
         flat = xy.reshape(-1, 2)
@@ -173,11 +173,11 @@ class Proposals:
 
 def unrolled(
     lines: Lines, others: Forecast, size: Float[Array, " 2"], speed: Float[Array, ""],
-    wanted: Float[Array, " F"], stop_m: Float[Array, ""], driver: tuple[IdmParameters, int, int],
+    desired: Float[Array, " F"], stop_m: Float[Array, ""], driver: tuple[IdmParameters, int, int],
 ) -> Proposals:  # fmt: skip
     """IDM along every line, Euler steps of 0.1 s.
 
-    The leader is found anew every few steps: of those whose box then reaches into the corridor as wide as ego and whose
+    Every few steps the leader is updated: of those whose box then reaches into the corridor as wide as ego and whose
     centre is ahead, the one whose box is nearest to ego's. Its place is held until the next search.
 
     Args:
@@ -185,12 +185,12 @@ def unrolled(
         others: The others.
         size: Length and width of ego.
         speed: Of ego, m/s.
-        wanted: Speeds that the drivers want, m/s.
+        desired: Speeds that the drivers want, m/s.
         stop_m: From ego's front to the nearest stop line that asks to stop; infinite where there is none.
         driver: Parameters, number of steps, and steps between searches.
     """
     parameters, steps, every = driver
-    count = lines.points.shape[0], wanted.shape[0]
+    count = lines.points.shape[0], desired.shape[0]
     boxes = others.at(jnp.arange(0, steps, every) * DT_S)
     inside = _on_corridor(lines.pieces(size[1]), boxes) & others.valid
     places = lines.places(boxes[..., :2])
@@ -213,7 +213,7 @@ def unrolled(
         states = []
         for _ in range(every):
             kept = jnp.maximum(free, parameters.min_gap_m)
-            acceleration = idm_acceleration(speed, wanted, kept, ahead, parameters)
+            acceleration = idm_acceleration(speed, desired, kept, ahead, parameters)
             way, free = way + DT_S * speed, free - DT_S * speed
             speed = jnp.maximum(speed + DT_S * acceleration, 0.0)
             states.append((way, speed))

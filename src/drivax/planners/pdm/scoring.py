@@ -1,4 +1,4 @@
-"""How PDM-Closed judges a proposal: gates that multiply a weighted mean of progress, time to collision and comfort.
+"""How PDM-Closed evaluates a proposal: gates that multiply a weighted mean of progress, time to collision and comfort.
 
 Source: Dauner et al. 2023 and the numbers of its published implementation, which follows nuPlan's closed-loop metrics.
 """
@@ -83,7 +83,7 @@ class Judgement:
         collision, road, direction: Gates: 1 passed, 0 failed.
         progress_m: Along the route.
         ttc, comfort: 1 kept, 0 not.
-        fault_s: When ego first hits somebody by its own fault, infinite where it does not.
+        fault_s: When ego first hits another agent by its own fault, infinite where it does not.
     """
 
     collision: Float[Array, "*batch"]
@@ -154,7 +154,7 @@ def judged(
     motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""], size: Float[Array, " 2"],
     others: Forecast, ground: Ground, progress_m: Float[Array, ""], config: ScoringConfig,
 ) -> Judgement:  # fmt: skip
-    """Judges one drive.
+    """Evaluate one drive.
 
     Args:
         motion: The drive.
@@ -216,10 +216,10 @@ def _foreseen(
     motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
     config: ScoringConfig,
 ) -> Bool[Array, ""]:  # fmt: skip
-    """Whether some step foresees a collision with somebody who is not behind ego at that step.
+    """Whether some step foresees a collision with another agent that is not behind ego at that step.
 
     The first step that foresees one decides for each of the others. Sources do not say where intersections are, so
-    everywhere counts as one: those beside ego count too.
+    everywhere counts as one: those next to ego count too.
     """
     steps = jnp.arange(motion.shape[0])
     sees = (soon_s <= config.ttc_s) & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]

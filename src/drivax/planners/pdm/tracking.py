@@ -84,17 +84,17 @@ class Reference:
 
 
 def acceleration_to(
-    speed: Float[Array, ""], wanted: Float[Array, ""], config: TrackingConfig
+    speed: Float[Array, ""], desired: Float[Array, ""], config: TrackingConfig
 ) -> Float[Array, ""]:
     """Acceleration that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a``, m/s2.
 
     Args:
         speed: v, m/s.
-        wanted: v*, the speed to have at the horizon, m/s.
+        desired: v*, the speed to have at the horizon, m/s.
         config: Weights q and r, and the horizon N.
     """
     q, r, b = config.speed_weight, config.acceleration_weight, config.horizon * DT_S
-    return b * q * (wanted - speed) / (b * q * b + r)
+    return b * q * (desired - speed) / (b * q * b + r)
 
 
 def steering_rate(
@@ -148,11 +148,11 @@ def tracked(car: Car, reference: Reference, wheelbase: Float[Array, ""], config:
     to_have = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]
 
     def step(car: Car, now: tuple[Any, Array, Array]) -> Any:
-        (x, y, cos, sin), wanted, curvatures = now
+        (x, y, cos, sin), desired, curvatures = now
         motion, speed = car.motion, car.motion[MOTION_SPEED]
-        stops = (wanted <= config.stopping_mps) & (speed <= config.stopping_mps)
-        gentle = config.stopping_gain * (wanted - speed)
-        acceleration = jnp.where(stops, gentle, acceleration_to(speed, wanted, config))
+        stops = (desired <= config.stopping_mps) & (speed <= config.stopping_mps)
+        gentle = config.stopping_gain * (desired - speed)
+        acceleration = jnp.where(stops, gentle, acceleration_to(speed, desired, config))
         lateral = (motion[1] - y) * cos - (motion[0] - x) * sin
         heading = wrap(motion[MOTION_HEADING] - jnp.arctan2(sin, cos))
         speeds = jnp.maximum(speed + acceleration * DT_S * np.arange(config.horizon), 0.0)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.evaluation.results import SHARES
+from drivax.evaluation.episode_table import SHARES
 from drivax.report.pictures.palette import Stroke, stroke
 from drivax.report.runs import Training
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from drivax.evaluation.results import RATES
-from drivax.evaluation.stored import ScenarioKey, comparable
+from drivax.evaluation.episode_table import RATES, ScenarioKey
+from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import CODES, UNKNOWN, metric_label, metric_names, ordered
 from drivax.report.episodes import outcome, worst_first
 from drivax.report.pages.page import data_element
@@ -81,14 +81,18 @@ def _run(
     outcomes = [outcome(run, row) for row in rows]
     distinct = list(dict.fromkeys(outcomes))
     keys = run.scenarios
-    scenarios = [keys[row] for row in rows]
+    scenarios, crashes = [keys[row] for row in rows], run.crash_by_scenario
     return {
         "name": run.name,
         "playable": comparable(run, runs[-1]),
         "scenario": [place[key] for key in scenarios],
         "outcomes": distinct,
         "outcome": [distinct.index(words) for words in outcomes],
-        "errors": {str(row): run.crashes[key] for row, key in enumerate(scenarios) if key in run.crashes},
+        "errors": {
+            str(row): (crashes[key].step, crashes[key].error)
+            for row, key in enumerate(scenarios)
+            if key in crashes
+        },
         "values": [_column(run.metrics.get(name), rows) for name in names],
     }
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.stored import ScenarioKey, comparable, mismatch
+from drivax.evaluation.episode_table import ScenarioKey
+from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import (
     COLLISION_KINDS,
     CONFIDENCE,
@@ -118,7 +119,7 @@ def _lead(runs: Sequence[Evaluation]) -> str:
                 f"<p class=lead><b>{name}</b> {words} <b>{share}</b> ({bounds(interval, 'rate')}) of {interval.n} "
                 f"{'episode' if interval.n == 1 else 'episodes'} of {where}, {escape(policy.traffic)} traffic.</p>"
             )
-    return f"<p class=lead><b>{name}</b>: {policy.episodes} episodes of {where}.</p>"
+    return f"<p class=lead><b>{name}</b>: {len(policy)} episodes of {where}.</p>"
 
 
 def _results(runs: Sequence[Evaluation]) -> str:
@@ -201,7 +202,7 @@ def _collisions(runs: Sequence[Evaluation]) -> str:
         for name, meaning in COLLISION_KINDS.values()
     )
     total = ", ".join(
-        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {run.episodes}"
+        f"{escape(run.name)} {int((run.metrics['collision_type'] > 0).sum())} of {len(run)}"
         for run in runs
         if "collision_type" in run.metrics
     )
@@ -289,7 +290,7 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
     rows = []
     for run in runs:
         data = run.data if isinstance(run, Evaluation) else {}
-        command, versions = run.about.get("command"), run.about.get("versions")
+        command, versions = run.info.get("command"), run.info.get("versions")
         texts = (
             " ".join(map(str, command)) if isinstance(command, list) else str(command or ""),
             f"{data.get('path', '')} {str(data.get('hash') or '')[:12]}".strip(),
@@ -297,7 +298,7 @@ def _origin(runs: Sequence[Evaluation | Training]) -> str:
         )
         rows.append((run.name, [text or "–" for text in texts]))
     settings = "".join(
-        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.about), indent=1, ensure_ascii=False))}</pre>"
+        f"<h3>{escape(run.name)}</h3><pre>{escape(json.dumps(dict(run.info), indent=1, ensure_ascii=False))}</pre>"
         for run in runs
     )
     return (

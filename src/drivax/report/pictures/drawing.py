@@ -130,7 +130,7 @@ class Boxes:
         rows: list[int] = np.flatnonzero(self.valid[step]).tolist()
         for colour in dict.fromkeys(self.colour[row] for row in rows):
             outlines = [
-                outline(self.xy[step, row], self.heading[step, row], self.size[row])
+                _outline(self.xy[step, row], self.heading[step, row], self.size[row])
                 for row in rows
                 if self.colour[row] == colour
             ]
@@ -165,11 +165,12 @@ class Drawing:
         """Return what is drawn of a scenario inside (low x, low y, high x, high y)."""
         signs = scenario.stop_xy[(scenario.stop_xy != 0).any(axis=1)]
         line, state = _lights(scenario)
-        near = within(line[:, 0], box)
+        near = _within(line[:, 0], box)
         route = scenario.route_xy[0, : int(scenario.route_points[0])]
+        goal = np.asarray(scenario.goal_xy)[None]
         return cls(
-            road_lines(scenario, box), signs[within(signs, box)], route[within(route, box)],
-            _inside(np.asarray(scenario.goal_xy)[None], box), line[near], state[:, near],
+            road_lines(scenario, box), signs[_within(signs, box)], route[_within(route, box)],
+            goal[_within(goal, box)], line[near], state[:, near],
             _agents(scenario, box), _parked(scenario, box), _box_of(scenario, slice(0, 1), None),
         )  # fmt: skip
 
@@ -200,11 +201,11 @@ class Drawing:
         path, size = path[: step + 1], self.log.size[0]
         yield Shape([path[np.isfinite(path).all(axis=1), :2]], "ego", level=4.5)
         if logged and self.log.valid[step, 0]:
-            box = outline(self.log.xy[step, 0], self.log.heading[step, 0], size)
+            box = _outline(self.log.xy[step, 0], self.log.heading[step, 0], size)
             yield Shape([box], "log", dash=(4.0, 3.0), level=5)
         if np.isfinite(path[-1]).all():
             x, y, heading = path[-1, :3]
-            yield Shape([outline((x, y), heading, size)], "ink", "ego", level=6)
+            yield Shape([_outline((x, y), heading, size)], "ink", "ego", level=6)
             ahead = np.array((np.cos(heading), np.sin(heading)))
             left = np.array((-ahead[1], ahead[0]))
             tip, base, side = 0.38 * size[0] * ahead, 0.05 * size[0] * ahead, 0.32 * size[1] * left
@@ -213,7 +214,7 @@ class Drawing:
             )
 
 
-def outline(xy: Any, heading: Any, size: Any) -> Float[Array, "5 2"]:
+def _outline(xy: Any, heading: Any, size: Any) -> Float[Array, "5 2"]:
     """Return the closed outline of a box."""
     shape = corners(np.array((xy[0], xy[1], np.cos(heading), np.sin(heading), size[0], size[1])))
     return np.concatenate((shape, shape[:1]))
@@ -225,13 +226,9 @@ def ring(xy: Array, radius: float) -> Float[Array, "25 2"]:
     return xy + radius * np.column_stack((np.cos(angle), np.sin(angle)))
 
 
-def within(xy: Array, box: Box) -> Bool[Array, "..."]:
+def _within(xy: Array, box: Box) -> Bool[Array, "..."]:
     """Return which points are inside a box."""
     return np.all((xy >= box[:2]) & (xy <= box[2:]), axis=-1)
-
-
-def _inside(xy: Array, box: Box) -> Array:
-    return xy[within(xy, box)]
 
 
 def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
@@ -247,7 +244,7 @@ def road_lines(scenario: Scenario, box: Box | None = None) -> dict[str, Lines]:
     rows = np.lexsort((scenario.segment_start_m[:used], scenario.segment_feature[:used]))
     a, b = scenario.segment_a[rows, :2], scenario.segment_b[rows, :2]
     if box is not None:
-        inside = within((a + b) / 2, box)
+        inside = _within((a + b) / 2, box)
         rows, a, b = rows[inside], a[inside], b[inside]
     layers: dict[str, Lines] = {name: [] for name in LAYERS}
     if not len(rows):
@@ -285,7 +282,7 @@ def _box_of(scenario: Scenario, rows: Any, valid: Any) -> Boxes:
 def _agents(scenario: Scenario, box: Box) -> Boxes:
     """Return all moving agents but ego, present while they are inside the box."""
     steps = int(scenario.steps)
-    near = scenario.agent_valid[:steps] & within(scenario.agent_xy[:steps], box)
+    near = scenario.agent_valid[:steps] & _within(scenario.agent_xy[:steps], box)
     near[:, 0] = False
     rows = np.flatnonzero(near.any(axis=0))
     return _box_of(scenario, rows, near[:, rows])
@@ -294,7 +291,7 @@ def _agents(scenario: Scenario, box: Box) -> Boxes:
 def _parked(scenario: Scenario, box: Box) -> Boxes:
     steps = int(scenario.steps)
     rows = np.flatnonzero(
-        scenario.parked_valid[:steps].any(axis=0) & within(scenario.parked_xy, box)
+        scenario.parked_valid[:steps].any(axis=0) & _within(scenario.parked_xy, box)
     )  # fmt: skip
     colours = [agent_colour(int(kind)) for kind in scenario.parked_kind[rows]]
     shape = (steps, len(rows))

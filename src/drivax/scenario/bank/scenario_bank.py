@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
@@ -170,9 +170,6 @@ class ScenarioBank:
         flags: ``scenario.schema.Flag`` bits.
         identity: Seeds of the random numbers of a scenario (:func:`identities`).
         extension: Points 4 m apart beyond the last logged pose of moving agents, along their lane: x, y.
-        paths: Paths of agents that react (``simulator.traffic.agent_paths.with_paths``), None where nobody does.
-        driver: Planner that drives others than ego (``planners.planner_traffic.with_driver``), None where nobody does.
-        given: Motions of agents that do what they are told (``scenario.given.with_given``), None where nobody is.
         cell_m, edge_run, lane_run: Grid cell size; longest run of a row of three cells.
         long_ego: Whether some ego is too long for a single grid query.
         trimmed: Whether unused padding was cut.
@@ -208,9 +205,6 @@ class ScenarioBank:
     lane_run: int = static()
     long_ego: bool = static()
     trimmed: bool = static()
-    paths: Any = None
-    given: Any = None
-    driver: Any = None
 
     def __len__(self) -> int:
         return self.agents.shape[0]
@@ -234,8 +228,8 @@ class ScenarioBank:
         return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
     def part(self, rows: Int[Array, " n"]) -> ScenarioBank:
-        """Select scenarios; the driver is shared."""
-        return replace(jax.tree.map(lambda leaf: leaf[rows], replace(self, driver=None)), driver=self.driver)
+        """Select scenarios."""
+        return jax.tree.map(lambda leaf: leaf[rows], self)
 
     @classmethod
     def from_scenarios(

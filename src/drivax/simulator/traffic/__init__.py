@@ -1,1 +1,5 @@
-"""Traffic models: how every agent that is not driven moves."""
+"""Traffic models: how agents that are not driven move."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

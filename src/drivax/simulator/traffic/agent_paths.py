@@ -6,7 +6,7 @@ of a path, a curve's speed is one of its columns, a red light is an arc length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from drivax.scenario.bank.scenario_bank import WORD, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import AgentKind, Flag
 from drivax.simulator.traffic.agent_lights import light_arcs
+from drivax.simulator.traffic.bank_data import TrafficData, find_data, with_data
 
 #: Points of a path, equally far apart along it.
 PATH_POINTS = 96
@@ -40,14 +41,14 @@ _KEY_M = 1.0
 _BACKWARDS_M = 1.5
 #: Lateral acceleration in curves and braking towards them, m/s2.
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
-#: Half the stretch over which a curvature is measured: at least so many metres, and so many seconds at peak speed.
+#: Half the stretch over which a curvature is measured: at least this many metres, and this many seconds at peak speed.
 _CURVE_M, _CURVE_S = 2.5, 0.25
 Numbers = np.ndarray[Any, Any]
 _Tables = tuple[Numbers, ...]
 
 
 @record
-class AgentPaths:
+class AgentPaths(TrafficData):
     """Paths of the R agents of a scenario that may react; rows without an agent have slot -1.
 
     Attributes:
@@ -110,10 +111,11 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     1.5 m/s2 of braking towards a curve.
 
     Args:
-        bank: The scenarios; one that has such paths already is returned as it is.
+        bank: The scenarios; one that has such paths already is returned unchanged.
         kinds: Classes of agents (``scenario.schema.AgentKind``) that may react.
     """
-    if bank.paths is not None and bank.paths.kinds == kinds:
+    known = find_data(bank, AgentPaths)
+    if known is not None and known.kinds == kinds:
         return bank
     logs = _candidates(bank, kinds)
     courses = _courses(bank, logs)
@@ -131,9 +133,9 @@ def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHIC
     points, profile, spacing = _sampled(courses.lines, _peak(logs))
     at_points = np.concatenate([points, profile], axis=-1)
     stop_arc, stop_light = light_arcs(bank, logs.scenario, at_points, spacing)
-    return replace(
+    return with_data(
         bank,
-        paths=AgentPaths(
+        AgentPaths(
             slot=placed(logs.slot, -1, np.int16),
             points=placed(points, 0.0, np.float32),
             profile=placed(profile, 0.0, np.float32),

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from drivax.errors import UsageError
 from drivax.plugins import find_named, is_dotted
-from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.simulator.types import Traffic
@@ -30,9 +29,3 @@ def make_traffic(name: str) -> Traffic:
     if not isinstance(made, Traffic):
         raise UsageError(f"{name!r} makes no traffic", cure="see drivax.simulator.types.Traffic")
     return made
-
-
-def prepared(traffic: Traffic, bank: ScenarioBank) -> ScenarioBank:
-    """The bank with what this traffic needs to have precomputed."""
-    prepare = getattr(traffic, "prepare", None)
-    return bank if prepare is None else prepare(bank)

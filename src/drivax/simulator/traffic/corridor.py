@@ -1,7 +1,7 @@
 """Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
 
 All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
-leaves those that are in the corridor or hardly beside it; the 8 closest of them are found by eight minima
+leaves those that are in the corridor or hardly next to it; the 8 closest of them are found by eight minima
 (a sort costs several times as much), and only these are measured against the path.
 """
 
@@ -24,21 +24,21 @@ from drivax.simulator.types import Frame
 
 #: How many things C are measured against a path. Six would do (docs/log), but eight fill a vector.
 CLOSEST = 8
-#: Free space that a corridor has beside the vehicle, m.
+#: Free space that a corridor has next to the vehicle, m.
 SIDE_M = 0.1
 #: Pieces that stand for the path ahead, and rectangles around as many of them each.
 PIECES, RECTANGLES = 12, 3
-#: How far the path may run beside its pieces, m: rectangles are so much wider.
+#: How far the path may run next to its pieces, m: rectangles are so much wider.
 _BULGE_M = 0.5
 #: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
 BEHIND_M = 1.0
-#: How far a vehicle looks: this, what it drives in so many seconds, what it needs to stop with 3 m/s2; at most so far.
+#: How far a vehicle looks: this, its way in this many seconds, and its way to stop with 3 m/s2; at most this far, m.
 _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 #: Gap of a free road, m; a number, so that gradients stay finite.
 FREE_M = 1e4
 #: No gap between things that overlap is below this, m.
 LEAST_GAP_M = -50.0
-#: So many low bits of a squared distance hold the thing or piece; what is left is exact to 0.03 % (of 1 m2 at least).
+#: Low bits of a squared distance that hold the thing or piece; the rest is exact to 0.03 % (of 1 m2 at least).
 _SLOT_BITS, _PIECE_BITS = 10, 4
 
 
@@ -111,7 +111,7 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
         paths: Paths of the bank.
         index: Row of the bank.
         movers: The vehicles.
-        frame: Everyone now.
+        frame: All agents now.
     """
     look = _look(movers.speed)
     rows, arcs = _path_ahead(paths, index, movers, look)
@@ -125,7 +125,7 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
         ends = x[:, number], y[:, number], x[:, number + 1], y[:, number + 1]
         keys.append(numbered(1.0 + _from_piece(*ends, box[..., X], box[..., Y])[1], number, _PIECE_BITS))
     best = number_of(reduce(jnp.minimum, keys), _PIECE_BITS)
-    # Written out once: XLA would compute it anew for each of the columns that are read.
+    # Written out once: XLA would compute it again for each of the columns that are read.
     best = jnp.zeros_like(best).at[jnp.arange(len(best))].set(best)
     x0, y0, *before, x1, y1, cos1, sin1 = jnp.moveaxis(_both_ends(rows, best), -1, 0)
     slopes = *before, cos1, sin1
@@ -229,7 +229,7 @@ def closest(
     """Of the boxes (their :func:`columns`) that are near the C whose centres are the closest; and which are real."""
     dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
     key = jnp.where(near, numbered(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
-    # Computed once: without the barrier XLA computes it anew for each of the minima.
+    # Computed once: without the barrier XLA computes it again for each of the minima.
     key = jax.lax.optimization_barrier(key)
     found = [jnp.min(key, axis=1, keepdims=True)]
     for _ in range(CLOSEST - 1):

@@ -1,4 +1,4 @@
-"""How everyone who is not driven moves. ``log``: they replay; they appear and disappear as recorded.
+"""How agents that are not driven move. ``log``: they replay; they appear and disappear as recorded.
 
 Others: ``simulator.traffic.reactive`` (``idm``) and ``simulator.traffic.override``; ``simulator.traffic.catalogue``
 knows them by name.
@@ -63,14 +63,14 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
 def frame_of(
     bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: AgentContext, back: int
 ) -> Frame:
-    """Everyone at one step: traffic's rows, the driven agents put in their place, and the parked ones.
+    """All agents at one step: traffic's rows, the driven agents put in their place, and the parked ones.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         step: The present step; the frame is that of ``step - back``.
         agents: Rows of the moving slots, from the traffic model.
-        cast: Scenes of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are nobody's.
+        cast: Contexts of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are empty.
         back: How many steps ago, 0 to 15; reactive traffic remembers 9.
     """
     driven = cast.history[:, HISTORY - 1 - back]
@@ -79,7 +79,7 @@ def frame_of(
     # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
     rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(one), cos, sin]
     rows += [driven[:, 3] * cos, driven[:, 3] * sin, one]
-    # Before the recording nobody else was seen.
+    # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
     z = agents[:, AgentColumn.Z].at[cast.slot].set(cast.z, mode="drop")
     agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")

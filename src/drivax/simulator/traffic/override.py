@@ -1,21 +1,21 @@
-"""Agents that do what they are told (``override``): given trajectories, or given actions."""
+"""Agents that follow given motions (``override``): given trajectories, or given actions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
 from drivax.scenario.bank.columns import AgentColumn
 from drivax.scenario.bank.queries import around_lanes
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 from drivax.scenario.schema import CURRENT_STEP
+from drivax.simulator.traffic.bank_data import TrafficData, data_of, prepare_bank, with_data
 from drivax.simulator.traffic.log import LogTraffic, logged_history
 from drivax.simulator.types import AgentContext, Traffic
 
@@ -24,11 +24,11 @@ Move = Callable[[Float[Array, " 4"], Float[Array, " D"], Any], Float[Array, " 4"
 
 
 @record
-class Given:
-    """What K agents of every scenario do, step by step; part of the bank.
+class OverrideMotions(TrafficData):
+    """Motions of K agents of every scenario.
 
     Attributes:
-        slot: Their slots, -1 for nobody.
+        slot: Their slots, -1 for none.
         motion: x, y, heading, speed.
         z: Height of the box centre, m.
         valid: Whether they are there.
@@ -42,7 +42,7 @@ class Given:
 
 @dataclass(frozen=True)
 class OverrideTraffic:
-    """The agents of ``bank.given`` do what they are told, everyone else behaves as in ``base``.
+    """The agents of :class:`OverrideMotions` follow given motions, every other agent behaves as in ``base``.
 
     In reactive traffic the others see and avoid them.
     """
@@ -56,8 +56,7 @@ class OverrideTraffic:
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
         """The bank with what ``base`` needs."""
-        prepare = getattr(self.base, "prepare", None)
-        return bank if prepare is None else prepare(bank)
+        return prepare_bank(self.base, bank)
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
         """State of ``base``; the bank says the rest.
@@ -65,10 +64,7 @@ class OverrideTraffic:
         Raises:
             UsageError: If nothing is given in the bank.
         """
-        if bank.given is None:
-            raise UsageError(
-                "the bank does not say what overridden agents do", cure="use override.with_given first"
-            )
+        data_of(bank, OverrideMotions, "use override.with_override")
         return self.base.start(bank, index, step)
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Any) -> Any:
@@ -77,7 +73,7 @@ class OverrideTraffic:
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of ``base``, with those of the overridden agents as given."""
-        rows, given = self.base.agents(bank, context, back), bank.given
+        rows, given = self.base.agents(bank, context, back), data_of(bank, OverrideMotions)
         step = jnp.clip(context.step - back, 0, bank.steps - 1)
         motion, valid = given.motion[context.index, step], given.valid[context.index, step]
         cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
@@ -88,7 +84,7 @@ class OverrideTraffic:
         return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
 
 
-def with_given(
+def with_override(
     bank: ScenarioBank,
     slots: Int[Array, "N K"],
     motion: Float[Array, "N T K 4"],
@@ -100,7 +96,7 @@ def with_given(
 
     Args:
         bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for nobody.
+        slots: Moving agents of each scenario, -1 for none.
         motion: x, y (m), heading (rad), speed (m/s) at every step of the log.
         valid: Whether they are there; always by default.
     """
@@ -121,7 +117,7 @@ def with_given(
         return jax.lax.scan(climb, bank.agents[index, seen, at, AgentColumn.Z] - half, line)[1]
 
     z = jax.vmap(jax.vmap(heights, (None, 0, 1), 1))(jnp.arange(len(bank)), slots, motion)
-    return replace(bank, given=Given(slots, motion, z, valid))
+    return with_data(bank, OverrideMotions(slots, motion, z, valid))
 
 
 def motions_of_actions(
@@ -138,13 +134,13 @@ def motions_of_actions(
 
     Args:
         bank: The scenarios.
-        slots: Moving agents of each scenario, -1 for nobody.
+        slots: Moving agents of each scenario, -1 for none.
         actions: One per step from ``begin`` on; after the last one it is repeated.
         move: The dynamics under the action space, such as ``Task().motion``.
         begin: Step of the log at which they take over, at most 15 steps of whose past are kept.
     """
     steps = bank.steps - 1 - begin
-    wanted = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
+    desired = jnp.minimum(jnp.arange(steps), actions.shape[1] - 1)
 
     def drive(index: Array, slot: Array, acts: Float[Array, "steps D"]) -> Float[Array, "T 4"]:
         at = jnp.maximum(slot, 0)
@@ -155,7 +151,7 @@ def motions_of_actions(
             after = move(motion, action, size)
             return after, after
 
-        driven = jax.lax.scan(one, past[-1], acts[wanted])[1]
+        driven = jax.lax.scan(one, past[-1], acts[desired])[1]
         before = jnp.concatenate([jnp.repeat(past[:1], max(begin + 1 - len(past), 0), 0), past])[-begin - 1 :]
         return jnp.concatenate([before, driven])
 

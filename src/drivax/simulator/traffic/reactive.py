@@ -8,7 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drivax.errors import UsageError
 from drivax.geometry.boxes import LENGTH, WIDTH, overlap
 from drivax.scenario.bank.columns import AgentColumn, SizeColumn
 from drivax.scenario.bank.queries import LEVEL_M
@@ -24,6 +23,7 @@ from drivax.simulator.traffic.agent_paths import (
     AgentPaths,
     with_paths,
 )
+from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
 from drivax.simulator.types import AgentContext, Frame
 
@@ -42,7 +42,7 @@ class Reactive:
     """State of the R vehicles of a scenario that may react; the last of the 10 rows is now.
 
     Attributes:
-        begin: Step at which the episode began; until then everyone moved as logged.
+        begin: Step at which the episode began; until then all agents moved as logged.
         phase: Replays (0), waits to appear (1), drives (2), has left (3).
         entry: Step at which the log has the vehicle appear.
         arc: Place along the path, m.
@@ -64,7 +64,7 @@ class Reactive:
 class IdmTraffic:
     """Vehicles react to ego, to each other, to everything else in their way and to red lights.
 
-    A vehicle that travels more than 2 m in the rest of its log follows its own path; everyone else replays. What a
+    A vehicle that travels more than 2 m in the rest of its log follows its own path; every other agent replays. What a
     driver cannot help is left alone: a pair that overlaps when the vehicle appears ignores each other until it parts.
 
     Attributes:
@@ -76,16 +76,16 @@ class IdmTraffic:
     name: str = "idm"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """The bank with the paths that this traffic needs; one that has them already is returned as it is."""
+        """The bank with the paths that this traffic needs; one that has them already is returned unchanged."""
         return with_paths(bank, tuple(kind for kind, _ in self.drivers))
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Reactive:
-        """Everyone where the log has them at ``step``.
+        """All agents where the log has them at ``step``.
 
         Raises:
-            UsageError: If the bank has no paths.
+            UsageError: The bank has no paths.
         """
-        paths = _paths(bank)
+        paths = data_of(bank, AgentPaths)
         index, step = jnp.asarray(index, jnp.int32), jnp.asarray(step, jnp.int32)
         slot = paths.slot[index].astype(jnp.int32)
         entry = paths.appears[index, step].astype(jnp.int32)
@@ -109,7 +109,7 @@ class IdmTraffic:
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
         """Rows of the moving slots ``back`` steps ago (at most 9): who reacts on its path, others as logged."""
-        paths, now = _paths(bank), context.traffic
+        paths, now = data_of(bank, AgentPaths), context.traffic
         step = context.step - back
         logged = bank.agents[context.index, jnp.clip(step, 0, bank.steps - 1)]
         at = PAST - 1 - min(back, PAST - 1)
@@ -124,15 +124,15 @@ class IdmTraffic:
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
-        """One step of 0.1 s: everyone looks at the present frame, then all move."""
-        paths, now = _paths(bank), context.traffic
+        """One step of 0.1 s: every agent looks at the present frame, then all move."""
+        paths, now = data_of(bank, AgentPaths), context.traffic
         slot = paths.slot[context.index].astype(jnp.int32)
         movers, most = _movers(bank, context, slot)
         movers, ignored = _without_parted(movers, frame, now.phase == WAITS)
         ahead = leaders(paths, context.index, movers, frame)
         driver = self._parameters(bank, context.index, slot)
-        wanted = _acceleration(bank, context, movers, most, ahead, driver)
-        arc, speed = _driven(movers.arc, movers.speed, wanted)
+        acceleration = _acceleration(bank, context, movers, most, ahead, driver)
+        arc, speed = _driven(movers.arc, movers.speed, acceleration)
         drives, waits = now.phase == DRIVES, now.phase == WAITS
         enters = waits & _may_enter(context, movers, ahead, frame)
         arrived = arc >= paths.spacing[context.index] * (PATH_POINTS - 1)
@@ -169,21 +169,13 @@ class IdmTraffic:
         return IdmParameters(**table)
 
 
-def _paths(bank: ScenarioBank) -> AgentPaths:
-    if bank.paths is None:
-        raise UsageError(
-            "the bank has no paths for reactive traffic", cure="use IdmTraffic().prepare(bank) first"
-        )
-    return bank.paths
-
-
 def _movers(
     bank: ScenarioBank, context: AgentContext, slot: Int[Array, " R"]
 ) -> tuple[Movers, Float[Array, " R"]]:
     """The vehicles where they are now (waiting ones where they will appear), and the speed that their paths allow."""
     now = context.traffic
     arc, speed = now.arc[-1], now.speed[-1]
-    here, profile = path_poses(bank.paths, context.index, arc)
+    here, profile = path_poses(data_of(bank, AgentPaths), context.index, arc)
     size = bank.agent_box[context.index, jnp.maximum(slot, 0), SizeColumn.FOOTPRINT]
     box, z = jnp.concatenate([here, size], axis=-1), profile[:, PROFILE_Z]
     return Movers(box, z, arc, speed, slot, now.ignored.astype(jnp.int32)), profile[:, PROFILE_SPEED]
@@ -216,9 +208,9 @@ def _stop_gap(
 ) -> Float[Array, " R"]:
     """Distance from the front bumper to the nearest stop line of the path that asks to stop, m.
 
-    A red light asks everyone who can still stop, a yellow one those who can do so comfortably.
+    A red light asks all that can still stop, a yellow one those that can do so comfortably.
     """
-    paths = bank.paths
+    paths = data_of(bank, AgentPaths)
     light = paths.stop_light[context.index].astype(jnp.int32)
     state = bank.light_state[context.index, jnp.clip(context.step, 0, bank.steps - 1)][light]
     line = paths.stop_arc[context.index] - movers.arc[:, None]
@@ -239,9 +231,9 @@ def _driven(
     arc: Float[Array, " R"], speed: Float[Array, " R"], acceleration: Float[Array, " R"]
 ) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
     """Place and speed one step later; who would go below zero stops inside the step."""
-    wanted = speed + acceleration * DT_S
-    stops = wanted < 0.0
-    after = jnp.where(stops, 0.0, wanted)
+    unclipped = speed + acceleration * DT_S
+    stops = unclipped < 0.0
+    after = jnp.where(stops, 0.0, unclipped)
     braking = jnp.where(stops, -acceleration, 1.0)
     distance = jnp.where(stops, speed * speed / (2.0 * braking), (speed + after) / 2.0 * DT_S)
     return arc + distance, after
@@ -267,7 +259,7 @@ def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Fra
     x, y = columns(movers.box)[:2]
     dx, dy = x[:, None] - x, y[:, None] - y
     near = dx * dx + dy * dy < (reach[:, None] + reach + 2 * _ENTRY_END_M) ** 2
-    # Those that are not ready come after everyone; one that is due now makes way for those that are late.
+    # Those that are not ready come last; one that is due now makes way for those that are late.
     order = jnp.where(ready, order, jnp.inf)
     rival = jnp.where(near & (late[None] | late[:, None]), order[None], jnp.inf)
     return ready & (jnp.min(rival, axis=1) >= order)

@@ -1,0 +1,4 @@
+from .gym import TASKS as TASKS
+from .gym import DrivingEnv as DrivingEnv
+from .gym import VectorDrivingEnv as VectorDrivingEnv
+from .gym import make as make

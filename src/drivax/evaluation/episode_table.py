@@ -1,0 +1,419 @@
+"""Episodes of an evaluation with metrics, trajectories and crashes, in memory or in a run folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import zipfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float, Float32, Int16, Int64
+
+from drivax.errors import DataError
+from drivax.metrics.catalogue import EVENTS, METRICS, Column, Direction, names_of
+from drivax.scenario.store import ScenarioSet
+from drivax.stats.clusters import recordings
+from drivax.stats.intervals import Interval, bootstrap_mean, rate
+from drivax.tracking.run_folder import RunFolder, existing
+
+#: Columns of ``episodes.csv`` before the metrics.
+KEYS = ("planner", "dataset", "scenario_id", "segment", "seed", "traffic")
+#: Columns that an evaluation adds to the metrics.
+ADDED = {
+    "crashed": Column(
+        "-", "low", "the planner raised an error, or its action was not finite: a failed episode", kind="rate"
+    ),
+    "action_jerk": Column(
+        "-",
+        "low",
+        "standard deviation of the change of the action from step to step; 0.82 for random actions",
+    ),
+}
+_COLUMNS: dict[str, Column] = {**METRICS, **ADDED}
+#: Columns of zeros and ones: their interval is Wilson's.
+RATES = names_of(_COLUMNS, "rate")
+#: Columns that lie between 0 and 1.
+SHARES = names_of(_COLUMNS, "rate", "score")
+#: Columns without a mean.
+NOT_SUMMARISED = tuple(name for name, column in _COLUMNS.items() if not column.summarised)
+#: Columns that are 0 in an episode in which the planner crashed.
+FAILED = tuple(name for name, column in _COLUMNS.items() if column.fails_on_crash)
+#: What to do about a damaged run folder.
+_RERUN = "run drivax evaluate again"
+
+Array = np.ndarray[Any, Any]
+#: ``(dataset, scenario_id)``.
+ScenarioKey = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Crash:
+    """An episode whose planner crashed: the first such step of the log, and the error in one line."""
+
+    dataset: str
+    scenario_id: str
+    step: int
+    error: str
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """What ego and traffic did, one row per episode, in each scenario's local frame.
+
+    Attributes:
+        ego: x, y [m], heading [rad], speed [m/s] at every step from ``start`` on.
+        action: Executed action at every step from ``start`` on, NaN after a crash; no columns where unknown.
+        start: Step of the log at which the planner took over.
+        events: Step of the first event by name (:data:`EVENTS`), -1 for none.
+        others: Poses of the other agents (``evaluation.traffic_trajectories``); None where they replayed the log.
+    """
+
+    ego: Float32[Array, "episode step 4"]
+    action: Float[Array, "episode action D"]
+    start: Int64[Array, " episode"]
+    events: Mapping[str, Int64[Array, " episode"]]
+    others: Int16[Array, "episode step A 3"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeTable:
+    """Episodes of one planner on one scenario set.
+
+    Attributes:
+        folder: Run folder; None for episodes in memory only.
+        name: Planner name in tables.
+        info: Content of ``run.json``.
+        keys: Columns :data:`KEYS` as text.
+        metrics: Values by metric name, NaN where undefined.
+        crashes: Episodes that failed because the planner crashed.
+        in_memory: Trajectories of an evaluation that has just run.
+    """
+
+    folder: Path | None
+    name: str
+    info: Mapping[str, Any]
+    keys: Mapping[str, tuple[str, ...]]
+    metrics: Mapping[str, Float[Array, " episode"]]
+    crashes: tuple[Crash, ...] = ()
+    in_memory: Trajectories | None = None
+
+    def __len__(self) -> int:
+        return len(self.keys["scenario_id"])
+
+    @classmethod
+    def read(cls, path: str | Path) -> EpisodeTable:
+        """Read the episodes of a run folder that ``drivax evaluate`` wrote; trajectories follow when asked for.
+
+        Raises:
+            DataError: The folder or a file is missing or damaged, or the run is not an evaluation.
+        """
+        run = RunFolder.open(path)
+        if run.kind != "evaluation":
+            raise DataError(
+                f"run is of kind {run.kind!r}, not evaluation",
+                file=run.path / "run.json",
+                cure="give a folder written by drivax evaluate",
+            )
+        keys, metrics = _read_columns(run.path / "episodes.csv")
+        name = str(run.info.get("planner", run.path.name))
+        return cls(run.path, name, run.info, keys, metrics, _read_crashes(run.path / "crashes.json"))
+
+    @classmethod
+    def read_seeds(cls, path: str | Path) -> tuple[EpisodeTable, ...]:
+        """Read the evaluation in a folder, or those in its sub-folders: one per training seed, ordered by name.
+
+        Raises:
+            DataError: As :meth:`read`.
+        """
+        path = Path(path)
+        inside = sorted(file.parent for file in path.glob("*/episodes.csv"))
+        if (path / "run.json").is_file() or not inside:
+            return (cls.read(path),)
+        return tuple(cls.read(folder) for folder in inside)
+
+    @property
+    def planner(self) -> str:
+        """Name of the planner in ``run.json``."""
+        return str(self.info.get("planner", self.name))
+
+    @property
+    def traffic(self) -> str:
+        """Traffic model: ``log``, ``idm``, ..."""
+        return str(self.info.get("traffic", "log"))
+
+    @property
+    def own_metrics(self) -> Mapping[str, Column]:
+        """Unit, direction and text of user-defined metrics."""
+        info = self.info.get("own_metrics") or {}
+        return {
+            name: Column(str(m["unit"]), cast(Direction, str(m["better"])), str(m["text"]))
+            for name, m in info.items()
+        }
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """Path, hash and name of the scenario set, as far as they are known."""
+        data = self.info.get("data") or {}
+        return data[0] if isinstance(data, list) and data else data if isinstance(data, dict) else {}
+
+    @cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """Content of ``config.yaml``; empty without one."""
+        return {} if self.folder is None else RunFolder(self.folder, dict(self.info)).settings
+
+    @property
+    def scenarios(self) -> list[ScenarioKey]:
+        """The scenario of every episode."""
+        return list(zip(self.keys["dataset"], self.keys["scenario_id"], strict=True))
+
+    @property
+    def clusters(self) -> list[str]:
+        """Cluster of every episode: its segment, or its scenario where no segment is known."""
+        return recordings(*(self.keys[name] for name in ("dataset", "segment", "scenario_id")))
+
+    @property
+    def crash_by_scenario(self) -> dict[ScenarioKey, Crash]:
+        """The crash of each scenario whose planner crashed."""
+        return {(crash.dataset, crash.scenario_id): crash for crash in self.crashes}
+
+    @cached_property
+    def trajectories(self) -> Trajectories:
+        """Trajectories of the episodes, in their order.
+
+        Raises:
+            DataError: ``trajectories.npz`` is missing, damaged, or lacks an episode.
+        """
+        if self.in_memory is not None:
+            return self.in_memory
+        if self.folder is None:
+            raise DataError("episodes have no trajectories", cure="evaluate again, or read a run folder")
+        return _read_trajectories(
+            self.folder / "trajectories.npz", self.keys["scenario_id"], self.traffic == "log"
+        )
+
+    def metric(self, name: str) -> Column | None:
+        """Unit and direction of a metric; None where unknown."""
+        return METRICS.get(name) or ADDED.get(name) or self.own_metrics.get(name)
+
+    def by_scenario(self, metric: str) -> dict[ScenarioKey, float]:
+        """Mean of a metric per scenario over its defined episodes; NaN where there is none."""
+        column = self.metrics.get(metric)
+        by_key: dict[ScenarioKey, list[float]] = {}
+        for row, key in enumerate(self.scenarios):
+            by_key.setdefault(key, []).append(math.nan if column is None else float(column[row]))
+        means = {}
+        for key, values in by_key.items():
+            defined = [value for value in values if not math.isnan(value)]
+            means[key] = float(np.mean(defined)) if defined else math.nan
+        return means
+
+    def summary(self) -> dict[str, Any]:
+        """Mean and 95 % interval of every metric, the content of ``summary.json``.
+
+        Rates have Wilson's interval over the effective number of recordings, other means a bootstrap over them. A
+        metric that is defined nowhere has mean null and n 0.
+        """
+        clusters = np.array(self.clusters)
+        table = {
+            name: interval_of(name, values, clusters).as_dict()
+            for name, values in self.metrics.items()
+            if name not in NOT_SUMMARISED
+        }
+        return {"planner": self.planner, "traffic": self.traffic, "metrics": table}
+
+    def rows(self) -> list[dict[str, str]]:
+        """Rows of ``episodes.csv``: undefined metrics are empty cells, booleans 0 or 1."""
+        columns = {name: self.keys[name] for name in KEYS} | {
+            name: [_cell(value) for value in values] for name, values in self.metrics.items()
+        }
+        return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
+
+    def write(self, folder: Path) -> None:
+        """Write ``episodes.csv``, ``summary.json``, ``trajectories.npz`` and, after crashes, ``crashes.json``."""
+        if self.crashes:
+            _write_json(folder / "crashes.json", [asdict(crash) for crash in self.crashes])
+        with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [*KEYS, *self.metrics], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self.rows())
+        _write_json(folder / "summary.json", self.summary())
+        driven = self.trajectories
+        arrays = {f"{name}_step": driven.events[name].astype(np.int16) for name in EVENTS}
+        arrays |= {} if driven.others is None else {"others": driven.others}
+        np.savez_compressed(
+            folder / "trajectories.npz",
+            allow_pickle=False,
+            scenario_id=np.array(self.keys["scenario_id"]),
+            ego=driven.ego.astype(np.float32),
+            action=driven.action.astype(np.float16),
+            start=driven.start.astype(np.int32),
+            **arrays,
+        )
+
+    def open_set(self, data: Path | None = None) -> ScenarioSet:
+        """Open the scenario set that was evaluated.
+
+        Args:
+            data: Where the set is, if it has moved.
+
+        Raises:
+            DataError: The set is missing, or has another hash.
+        """
+        run_path = self.data.get("path")
+        if data is None and run_path is None:
+            file = None if self.folder is None else self.folder / "run.json"
+            raise DataError("names no scenario set", file=file, cure="pass it with --data SET")
+        path = data if data is not None else Path(str(run_path))
+        if data is None and not path.exists():
+            raise DataError(
+                "scenario set of this run not found", file=path, cure="pass its new path with --data SET"
+            )
+        scenarios, expected = ScenarioSet.open(path), str(self.data.get("hash") or "")
+        if expected and scenarios.hash != expected:
+            raise DataError(
+                f"not the set that {self.name!r} was evaluated on (hash {scenarios.hash[:12]}, not {expected[:12]})",
+                file=path,
+                cure="pass the set that was evaluated with --data SET",
+            )
+        return scenarios
+
+
+def fail_crashed(metrics: Mapping[str, Array], crashed: Any) -> dict[str, Array]:
+    """Set the metrics :data:`FAILED` of crashed episodes to 0 where defined, and add the column ``crashed``.
+
+    So crashing never improves a score. All other metrics are those measured until the crash.
+
+    Args:
+        metrics: Values by name, NaN where undefined; user-defined metrics last.
+        crashed: Boolean per episode.
+    """
+    values = {
+        name: np.where(crashed & ~np.isnan(column), 0.0, column) if name in FAILED else column
+        for name, column in metrics.items()
+    }
+    ours = {name: column for name, column in values.items() if name in METRICS}
+    return ours | {"crashed": np.asarray(crashed, np.float64)} | values
+
+
+def interval_of(name: str, values: Any, clusters: Any, confidence: float = 0.95, seed: int = 0) -> Interval:
+    """Mean and interval over the episodes that define the metric; Wilson's interval for rates."""
+    if name in RATES:
+        return rate(values, clusters, confidence)
+    return bootstrap_mean(values, clusters, confidence, seed=seed)
+
+
+def _cell(value: Any) -> str:
+    if not np.isfinite(value):
+        return ""
+    return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
+
+
+def _write_json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def _read_columns(path: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, Array]]:
+    """Columns of ``episodes.csv``: :data:`KEYS` as text, metrics as float64 with NaN where undefined."""
+    with existing(path, _RERUN).open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    header = rows[0] if rows else []
+    missing = [key for key in KEYS if key not in header]
+    if missing or len(set(header)) < len(header):
+        problem = f"lacks the column {missing[0]!r}" if missing else "names a column twice"
+        raise DataError(problem, file=path, record="header", cure=_RERUN)
+    if len(rows) < 2:
+        raise DataError("holds no episodes", file=path, cure=_RERUN)
+    for number, row in enumerate(rows[1:], start=1):
+        if len(row) != len(header):
+            raise DataError(f"has {len(row)} cells, not {len(header)}", file=path, record=number, cure=_RERUN)
+    columns = dict(zip(header, zip(*rows[1:], strict=True), strict=True))
+    keys = {name: columns[name] for name in KEYS}
+    return keys, {name: _read_metric(path, name, columns[name]) for name in header if name not in KEYS}
+
+
+def _read_metric(path: Path, name: str, cells: Sequence[str]) -> Array:
+    """A metric's cells as float64; an empty cell is NaN (undefined), any other must be finite."""
+    values = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cells):
+        if not cell.strip():
+            continue
+        try:
+            values[row] = float(cell)
+        except ValueError:
+            problem = f"{name} is {cell!r}, not a number or empty"
+            raise DataError(problem, file=path, record=row + 1, cure=_RERUN) from None
+        if not math.isfinite(values[row]):
+            problem = f"{name} is {'infinite' if math.isinf(values[row]) else 'NaN'}"
+            raise DataError(problem, file=path, record=row + 1, cure=_RERUN)
+    return values
+
+
+def _read_crashes(path: Path) -> tuple[Crash, ...]:
+    """Content of ``crashes.json``, which only exists after crashes."""
+    if not path.is_file():
+        return ()
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        return tuple(
+            Crash(row["dataset"], row["scenario_id"], int(row["step"]), str(row["error"])) for row in rows
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
+
+
+def _read_trajectories(path: Path, scenario_ids: Sequence[str], log_traffic: bool) -> Trajectories:
+    """Content of ``trajectories.npz``, in the order of ``scenario_ids``; those repeated are matched in order."""
+    try:
+        with existing(path, _RERUN).open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            ids = [_text(value) for value in stored["scenario_id"]]
+            ego = stored["ego"].astype(np.float32)
+            action = (stored["action"] if "action" in stored else ego[:, 1:, :0]).astype(np.float32)
+            start = stored["start"].astype(np.int64)
+            events = {name: stored[f"{name}_step"].astype(np.int64) for name in EVENTS}
+            others = None if log_traffic else stored["others"]
+    except KeyError as error:
+        raise DataError(f"lacks an array: {error.args[0]}", file=path, cure=_RERUN) from error
+    except (ValueError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"cannot be read ({error})", file=path, cure=_RERUN) from error
+    n = len(ids)
+    if ego.ndim != 3 or ego.shape[::2] != (n, 4) or action.shape[:-1] != (n, ego.shape[1] - 1) or any(
+        array.shape != (n,) for array in (start, *events.values())
+    ) or (others is not None and (
+        others.ndim != 4 or others.shape[:2] != ego.shape[:2] or others.shape[3] != 3 or others.dtype != np.int16
+    )):  # fmt: skip
+        raise DataError("its arrays disagree in shape", file=path, cure=_RERUN)
+    row_of = {key: row for row, key in enumerate(_numbered(ids))}
+    try:
+        rows = [row_of[key] for key in _numbered(scenario_ids)]
+    except KeyError as error:
+        raise DataError("lacks an episode", file=path, record=error.args[0][0], cure=_RERUN) from None
+    if rows == list(range(n)):
+        return Trajectories(ego, action, start, events, others)
+    return Trajectories(
+        ego[rows],
+        action[rows],
+        start[rows],
+        {name: steps[rows] for name, steps in events.items()},
+        None if others is None else others[rows],
+    )
+
+
+def _numbered(ids: Sequence[str]) -> list[tuple[str, int]]:
+    """Each id with the number of its earlier occurrences."""
+    seen: Counter[str] = Counter()
+    keys = []
+    for name in ids:
+        keys.append((name, seen[name]))
+        seen[name] += 1
+    return keys
+
+
+def _text(value: Any) -> str:
+    return value.rstrip(b"\0").decode() if isinstance(value, bytes) else str(value)

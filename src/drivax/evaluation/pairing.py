@@ -1,0 +1,127 @@
+"""Pair the episodes of evaluations by scenario, and refuse those that cannot be compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.errors import UsageError, did_you_mean
+from drivax.evaluation.episode_table import NOT_SUMMARISED, EpisodeTable, ScenarioKey
+
+#: Settings of an evaluation that must agree between paired episodes.
+_STARTS = ("noisy_start", "start_step")
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The scenarios that evaluations have in common, in the order of the first, and the cluster of each."""
+
+    keys: tuple[ScenarioKey, ...]
+    clusters: tuple[str, ...]
+
+    @classmethod
+    def of(cls, first: EpisodeTable, *others: EpisodeTable) -> Pairs:
+        """Return the common scenarios of evaluations."""
+        cluster = dict(zip(first.scenarios, first.clusters, strict=True))
+        evaluated = [set(other.scenarios) for other in others]
+        keys = tuple(key for key in cluster if all(key in scenarios for scenarios in evaluated))
+        return cls(keys, tuple(cluster[key] for key in keys))
+
+    def values(self, table: EpisodeTable, metric: str) -> Float64[np.ndarray[Any, Any], " scenario"]:
+        """A metric of one evaluation per scenario; repeated episodes are averaged."""
+        means = table.by_scenario(metric)
+        return np.array([means[key] for key in self.keys], np.float64)
+
+
+def mismatch(a: EpisodeTable, b: EpisodeTable) -> tuple[str, str] | None:
+    """Why the episodes of two runs cannot be paired, worded to follow their names, and what to do; None if they can.
+
+    Pairs need the same scenario set, traffic and starts.
+    """
+    hashes = [str(run.data.get("hash") or "") for run in (a, b)]
+    if all(hashes) and hashes[0] != hashes[1]:
+        sets = f"{hashes[0][:12]} and {hashes[1][:12]}"
+        return f"differ in scenario set ({sets})", "evaluate both with the same --data"
+    if a.traffic != b.traffic:
+        traffic = f"{a.traffic} and {b.traffic}"
+        return f"differ in traffic ({traffic})", "evaluate both with the same --traffic"
+    for name in _STARTS:
+        values = [run.settings.get(name) for run in (a, b)]
+        if None not in values and values[0] != values[1]:
+            return f"differ in {name} ({values[0]} and {values[1]})", "evaluate both with the same"
+    return None
+
+
+def comparable(a: EpisodeTable, b: EpisodeTable) -> bool:
+    """Whether the episodes of two runs can be paired."""
+    return mismatch(a, b) is None
+
+
+def check_pairs(a: Sequence[EpisodeTable], b: Sequence[EpisodeTable]) -> None:
+    """Refuse evaluations whose episodes cannot be paired.
+
+    Args:
+        a: The evaluations of A, one per training seed.
+        b: Those of B.
+
+    Raises:
+        UsageError: A run is named twice, a side holds several planners, or sets, traffic or starts differ.
+    """
+    tables = (*a, *b)
+    if len({id(t) if t.folder is None else t.folder.resolve() for t in tables}) < len(tables):
+        raise UsageError("A and B are the same run", file=a[0].folder, cure="name two runs")
+    for side in (a, b):
+        # Seeds are numbered at the end of the name, before the checkpoint; two checkpoints are two planners.
+        planners = {re.sub(r"^(.*?)[0-9]*(@[0-9]+)?$", r"\1\2", table.name): table.name for table in side}
+        if len(planners) > 1:
+            raise UsageError(
+                f"holds evaluations of several planners ({', '.join(sorted(planners.values()))})",
+                file=None if side[0].folder is None else side[0].folder.parent,
+                cure=f"name one of them, as {side[0].folder}",
+            )
+    for table in tables[1:]:
+        if problem := mismatch(tables[0], table):
+            names = [run.folder or run.name for run in (tables[0], table)]
+            raise UsageError(f"{names[0]} and {names[1]} {problem[0]}", cure=problem[1])
+
+
+def check_metric(metric: str, tables: Sequence[EpisodeTable], *, primary: bool) -> None:
+    """Refuse a metric that a comparison cannot use.
+
+    Raises:
+        UsageError: An evaluation lacks it, it has no meaningful mean, or it is primary without a direction.
+    """
+    for table in tables:
+        if metric not in table.metrics:
+            known = [name for name in table.metrics if all(name in other.metrics for other in tables)]
+            raise UsageError(
+                f"{table.folder or table.name} has no metric {metric!r}", cure=did_you_mean(metric, known)
+            )
+    if metric in NOT_SUMMARISED:
+        raise UsageError(f"{metric} is a code or count without a mean", cure="choose another metric")
+    if metric.endswith("_partial"):
+        raise UsageError(
+            f"{metric} combines different inputs in different scenarios, so its mean has no meaning",
+            cure=f"choose {metric.removesuffix('_partial')}, or one of its inputs",
+        )
+    info = tables[0].metric(metric)
+    if primary and (info is None or info.better == "-"):
+        raise UsageError(f"{metric} is neither better high nor low", cure="choose another primary metric")
+
+
+def undefined_metric(metric: str, tables: Sequence[EpisodeTable]) -> UsageError:
+    """Return the error for a primary metric without a single pair of values."""
+    partial = [table.metrics.get(f"{metric}_partial", np.full(1, np.nan)) for table in tables]
+    if any(not np.isnan(values).all() for values in partial):
+        return UsageError(
+            f"every {metric} is partial: one of its inputs is undefined in these scenarios",
+            cure="choose another primary metric, as success or accuracy",
+        )
+    return UsageError(
+        f"{metric} is defined for A and B in no common scenario", cure="choose another primary metric"
+    )

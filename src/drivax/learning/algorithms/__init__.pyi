@@ -1,0 +1,12 @@
+from .behaviour_cloning import BcConfig as BcConfig
+from .behaviour_cloning import Cloning as Cloning
+from .cql import CqlConfig as CqlConfig
+from .iql import IqlConfig as IqlConfig
+from .offline import FittedQConfig as FittedQConfig
+from .offline import OfflineConfig as OfflineConfig
+from .ppo import PpoConfig as PpoConfig
+from .sac import SacConfig as SacConfig
+from .td3_bc import Td3BcConfig as Td3BcConfig
+from .warm_start import BcPpoConfig as BcPpoConfig
+from .warm_start import BcSacConfig as BcSacConfig
+from .warm_start import WarmStart as WarmStart

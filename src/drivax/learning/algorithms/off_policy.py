@@ -1,0 +1,158 @@
+"""What off-policy algorithms share, online (SAC) and offline (CQL, IQL, TD3+BC).
+
+A policy with twin critics, TD errors, the losses of a soft actor, and one update: a gradient step of all losses, then
+the target networks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx
+from jaxtyping import Array, Float
+
+from drivax.learning.environment import Environment
+from drivax.learning.replay import Transitions
+from drivax.networks.actor_critic import NetworkConfig, Policy, TwinCritic
+from drivax.networks.distributions import Actions, Distribution
+from drivax.planners.network_planner import NetworkPlanner
+from drivax.rl.online import polyak, soft_policy_loss, td_target, temperature_loss
+
+
+@runtime_checkable
+class OffPolicyConfig(Protocol):
+    """Settings that off-policy algorithms share."""
+
+    @property
+    def network(self) -> NetworkConfig:
+        """Policy and critics, with an encoder each."""
+        ...
+
+    @property
+    def gamma(self) -> float:
+        """Discount."""
+        ...
+
+    @property
+    def tau(self) -> float:
+        """Step of target networks per update."""
+        ...
+
+
+Config = TypeVar("Config", bound=OffPolicyConfig)
+#: Everything that gradients change: networks and scalars, by name (``trained["policy"]``).
+Trained = Any
+#: What is trained, target networks by name, and the optimiser's state.
+Carry = tuple[Trained, dict[str, Any], Any]
+
+
+class SoftActor(NamedTuple):
+    """The soft actor's losses, and what they are made of."""
+
+    policy: Distribution
+    q_values: Float[Array, "2 B"]
+    loss: Float[Array, " B"]
+    temperature_loss: Float[Array, ""]
+    logs: dict[str, Array]
+
+
+def squared_error(q: Array, target: Array) -> Float[Array, ""]:
+    """Return half the mean squared error of Q values from targets."""
+    return 0.5 * jnp.mean((q - target) ** 2)
+
+
+def target_entropy(config: Any, environment: Environment) -> float:
+    """Return the configured target entropy, by default minus the size of an action."""
+    return -float(environment.action_size) if config.target_entropy is None else config.target_entropy
+
+
+class OffPolicy(Generic[Config]):
+    """An off-policy algorithm in one environment: a subclass adds its losses and optimisers.
+
+    Holds configuration and the networks' graphs; everything computed is in the state.
+    """
+
+    #: Names of networks that have a target network.
+    targets: ClassVar[tuple[str, ...]] = ("critic",)
+    optimiser: optax.GradientTransformationExtraArgs
+
+    def __init__(self, config: Config, environment: Environment, data: Any) -> None:
+        self.config, self.environment = config, environment
+        self.spec = environment.shapes(data)
+        # Structures only: no number is drawn.
+        networks = nnx.eval_shape(lambda: self.networks(jax.random.key(0)))
+        self.graphs = {name: nnx.graphdef(network) for name, network in networks.items()}
+
+    @property
+    def network(self) -> NetworkConfig:
+        """Configuration of all networks."""
+        return self.config.network
+
+    def networks(self, key: Array) -> dict[str, nnx.Module]:
+        """Return all networks by name, with initial parameters."""
+        actions = Actions(self.environment.action_size, self.environment.levels)
+        policy_key, critic_key = jax.random.split(key)
+        return {
+            "policy": Policy(self.network, self.spec, nnx.Rngs(policy_key), actions),
+            "critic": TwinCritic(self.network, self.spec, nnx.Rngs(critic_key), actions),
+        }
+
+    def distribution(self, parameters: Any, observation: dict[str, Array]) -> Distribution:
+        """Return the policy's action distribution."""
+        return nnx.merge(self.graphs["policy"], parameters)(observation)
+
+    def q_values(
+        self, parameters: Any, observation: dict[str, Array], action: Float[Array, "*actions D"]
+    ) -> Float[Array, "2 *actions"]:
+        """Return the values of both critics."""
+        return nnx.merge(self.graphs["critic"], parameters)(observation, action)
+
+    def planner(self, parameters: Any, name: str, samples: bool) -> NetworkPlanner:
+        """Return the policy as a planner."""
+        return NetworkPlanner(parameters, self.graphs["policy"], name, samples)
+
+    #: The sum of all losses, each of which reaches its own parameters only, and values to log: of what is trained, the
+    #: target networks, and a batch.
+    loss: Callable[..., tuple[Array, dict[str, Array]]]
+
+    def update_networks(self, carry: Carry, *batch: Any) -> tuple[Carry, dict[str, Array]]:
+        """Take a gradient step of :meth:`loss` on a batch, then move the target networks."""
+        trained, target, optimiser = carry
+        (_, logs), gradient = jax.value_and_grad(self.loss, has_aux=True)(trained, target, *batch)
+        for name in ("policy", "critic"):
+            logs[f"{name}_gradient_norm"] = optax.tree.norm(gradient[name])
+        change, optimiser = self.optimiser.update(gradient, optimiser, trained)
+        trained: Any = optax.apply_updates(trained, change)
+        online = {name: trained[name] for name in self.targets}
+        return (trained, polyak(target, online, self.config.tau), optimiser), logs
+
+    def critic_loss(
+        self, trained: Trained, batch: Transitions, next_value: Float[Array, " B"]
+    ) -> tuple[Float[Array, ""], Float[Array, "2 B"]]:
+        """Return the squared TD error, given the values of the next states, and the Q values of the batch."""
+        target = td_target(batch.reward, next_value, batch.terminated, self.config.gamma)
+        q = self.q_values(trained["critic"], batch.observation, batch.action)
+        return squared_error(q, target), q
+
+    def soft_actor(
+        self, trained: Trained, observation: dict[str, Array], entropy: float, key: Array
+    ) -> SoftActor:
+        """Return the losses of a policy with entropy bonus and of its temperature, given the target entropy."""
+        temperature = jnp.exp(trained["log_temperature"])
+        policy = self.distribution(trained["policy"], observation)
+        raw_action = policy.sample(key)
+        log_prob = policy.log_prob(raw_action)
+        q_values = self.q_values(
+            jax.lax.stop_gradient(trained["critic"]), observation, policy.action(raw_action)
+        )
+        return SoftActor(
+            policy,
+            q_values,
+            soft_policy_loss(q_values, log_prob, temperature),
+            jnp.mean(temperature_loss(trained["log_temperature"], log_prob, entropy)),
+            {"entropy": -jnp.mean(log_prob), "temperature": temperature},
+        )

@@ -1,0 +1,14 @@
+from .offline import advantage_weights as advantage_weights
+from .offline import conservative_penalty as conservative_penalty
+from .offline import expectile_loss as expectile_loss
+from .offline import log_mass as log_mass
+from .offline import penalty_weight_loss as penalty_weight_loss
+from .offline import scaled_policy_loss as scaled_policy_loss
+from .offline import smoothed_action as smoothed_action
+from .online import clipped_surrogate_loss as clipped_surrogate_loss
+from .online import generalised_advantages as generalised_advantages
+from .online import polyak as polyak
+from .online import soft_policy_loss as soft_policy_loss
+from .online import soft_value as soft_value
+from .online import td_target as td_target
+from .online import temperature_loss as temperature_loss

@@ -1,0 +1,110 @@
+"""Advantages, temporal-difference targets, and the losses of PPO and SAC: arrays in, arrays out.
+
+Time is the leading axis; ``_t`` and ``_tp1`` mark steps t and t + 1. Losses are per sample; callers average them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+def generalised_advantages(
+    reward_t: Float[Array, "time *batch"],
+    value_t: Float[Array, "time *batch"],
+    value_tp1: Float[Array, "time *batch"],
+    terminated_t: Bool[Array, "time *batch"],
+    truncated_t: Bool[Array, "time *batch"],
+    gamma: float,
+    lambda_: float,
+) -> tuple[Float[Array, "time *batch"], Float[Array, "time *batch"]]:
+    """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
+
+    ``delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)`` and
+    ``A_t = delta_t + gamma lambda (1 - terminated_t) (1 - truncated_t) A_{t+1}``, zero beyond the end. A truncated
+    step bootstraps ``value_tp1``, the value of its final state, and no reward of the next episode reaches it.
+    ``lambda_`` 0 gives one-step TD errors, 1 Monte Carlo returns.
+
+    Returns:
+        Advantages, and value targets ``A_t + V(s_t)``.
+    """
+    alive = 1.0 - terminated_t.astype(jnp.float32)
+    delta_t = reward_t + gamma * alive * value_tp1 - value_t
+    decay_t = gamma * lambda_ * alive * (1.0 - truncated_t.astype(jnp.float32))
+
+    def step(advantage_tp1: Array, step_t: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, decay = step_t
+        advantage = delta + decay * advantage_tp1
+        return advantage, advantage
+
+    _, advantages = jax.lax.scan(step, jnp.zeros_like(delta_t[0]), (delta_t, decay_t), reverse=True)
+    return advantages, advantages + value_t
+
+
+def clipped_surrogate_loss(
+    log_prob: Float[Array, "*batch"],
+    old_log_prob: Float[Array, "*batch"],
+    advantage: Float[Array, "*batch"],
+    clip: float,
+) -> Float[Array, "*batch"]:
+    """Clipped surrogate objective of PPO as a loss (Schulman et al. 2017, arXiv 1707.06347, eq. 7).
+
+    ``-min(rho A, clip(rho, 1 - eps, 1 + eps) A)`` with ``rho = exp(log_prob - old_log_prob)``.
+    """
+    ratio = jnp.exp(log_prob - old_log_prob)
+    return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
+
+
+def td_target(
+    reward_t: Float[Array, "*batch"],
+    value_tp1: Float[Array, "*batch"],
+    terminated_t: Bool[Array, "*batch"],
+    gamma: float,
+) -> Float[Array, "*batch"]:
+    """One-step target ``r_t + gamma (1 - terminated_t) V(s_{t+1})`` (Sutton 1988).
+
+    A terminated step has its reward alone as target; a truncated step bootstraps the value of its final state. No
+    gradient flows into the targets.
+    """
+    # Selected, not multiplied by zero: a value that overflowed must not reach a terminated step.
+    return jax.lax.stop_gradient(reward_t + gamma * jnp.where(terminated_t, 0.0, value_tp1))
+
+
+def soft_value(
+    q: Float[Array, "critic *batch"], log_prob: Float[Array, "*batch"], temperature: Float[Array, ""]
+) -> Float[Array, "*batch"]:
+    """``min_i Q_i(s, a) - alpha log pi(a|s)`` of an action that the policy sampled.
+
+    Soft state value (Haarnoja et al. 2018, arXiv 1812.05905, eq. 3) with the minimum over critics against
+    overestimation (clipped double Q, Fujimoto et al. 2018, arXiv 1802.09477, eq. 10).
+    """
+    return jnp.min(q, axis=0) - temperature * log_prob
+
+
+def soft_policy_loss(
+    q: Float[Array, "critic *batch"], log_prob: Float[Array, "*batch"], temperature: Float[Array, ""]
+) -> Float[Array, "*batch"]:
+    """``alpha log pi(a|s) - min_i Q_i(s, a)`` per sample, reparameterised (arXiv 1812.05905, eq. 7 and 9).
+
+    No gradient reaches the temperature.
+    """
+    return -soft_value(q, log_prob, jax.lax.stop_gradient(temperature))
+
+
+def temperature_loss(
+    log_temperature: Float[Array, ""], log_prob: Float[Array, "*batch"], target_entropy: float
+) -> Float[Array, "*batch"]:
+    """``-alpha (log pi(a|s) + H)`` per sample, with ``alpha = exp(log_temperature)`` (arXiv 1812.05905, eq. 18).
+
+    Its gradient lowers the temperature where the policy's entropy ``-E log pi`` is above the target ``H`` and raises it
+    where it is below. No gradient reaches the policy.
+    """
+    return -jnp.exp(log_temperature) * jax.lax.stop_gradient(log_prob + target_entropy)
+
+
+def polyak(target: Any, online: Any, tau: float) -> Any:
+    """``(1 - tau) target + tau online``, leaf by leaf; tau 1 copies, tau 0 keeps (Polyak and Juditsky 1992)."""
+    return jax.tree.map(lambda old, new: (1.0 - tau) * old + tau * new, target, online)

@@ -1,0 +1,74 @@
+"""Seeds in parts: a loop of one's own learns the same parameters as ``drivax.train``."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from drivax import settings
+from drivax.errors import UsageError
+from drivax.learning import TrainConfig, make_agent, train
+from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.tracking.checkpoints import Checkpoints
+
+NETWORK = {"encoder": {"rows": [4], "hidden": [8]}, "head": [4]}
+SAC = {
+    "kind": "sac", "network": NETWORK, "environments": 2, "unroll": 4, "updates_per_step": 1, "batch": 4,
+    "warm_up": 8, "replay": {"capacity": 32},
+}  # fmt: skip
+PPO = {"kind": "ppo", "network": NETWORK, "environments": 2, "unroll": 4, "epochs": 1, "minibatches": 2}
+TASK = {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 2}, "metrics": ["success"]}
+
+
+def config_of(algorithm, iterations):
+    return settings.load(
+        TrainConfig, {"task": TASK, "algorithm": algorithm, "total_steps": 8 * iterations, "seed": 3}
+    )
+
+
+def own_loop(config, bank):
+    """Train step by step, as docs/start/own_loop.md does."""
+    agent = make_agent(config, bank)
+
+    @jax.jit
+    def iteration(bank, state):
+        def step(carry, _):
+            now, cache, key = carry
+            key, act_key, step_key = jax.random.split(key, 3)
+            sampled = agent.sample_action(state, now.observation, act_key)
+            after, outcome = agent.environment.step(bank, now, cache, sampled.action, step_key)
+            return (after, outcome.cache, key), agent.transition(now, sampled, outcome)
+
+        cache = agent.environment.cache(bank, state.environments.state)
+        first = (state.environments, cache, agent.rollout_key(state))
+        (environments, _, _), rollout = jax.lax.scan(step, first, None, config.algorithm.unroll)
+        state = replace(state, environments=environments)
+        if not hasattr(agent, "buffer"):
+            return agent.update(bank, state, rollout)[0]
+        return agent.update(bank, replace(state, replay=agent.buffer.add(state.replay, rollout)))[0]
+
+    first = state = jax.jit(agent.init)(bank, jax.random.key(config.seed))
+    for _ in range(config.iterations):
+        state = iteration(bank, state)
+    return first, state
+
+
+@pytest.mark.parametrize("algorithm", [SAC, pytest.param(PPO, marks=pytest.mark.slow)], ids=["sac", "ppo"])
+def test_own_loop_equals_training(data, algorithm, tmp_path):
+    config = config_of(algorithm, 3)
+    first, state = own_loop(config, ScenarioBank.from_scenarios(data))
+    run = train(config, data, tmp_path / "run")
+    trained = Checkpoints(run.checkpoints).restore(jax.eval_shape(lambda: state))
+    jax.tree.map(np.testing.assert_array_equal, state.parameters, trained.parameters)
+    moved = [
+        (one != other).any()
+        for one, other in zip(*map(jax.tree.leaves, (first.parameters, state.parameters)), strict=True)
+    ]
+    assert any(moved)
+
+
+def test_offline_algorithms_have_no_agent(data):
+    with pytest.raises(UsageError, match=r"BcConfig has no parts for a loop of your own; use ppo or sac"):
+        bc = {"kind": "bc", "network": NETWORK, "batch": 4, "updates": 2}
+        make_agent(config_of(bc, 1), ScenarioBank.from_scenarios(data))

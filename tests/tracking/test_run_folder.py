@@ -1,0 +1,152 @@
+"""Run folders hold what is needed to believe and repeat a run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from drivax.errors import DataError, UsageError
+from drivax.scenario.schema import Capacity, Scenario, SourceCounts, record_dtype
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.tracking import run_folder as runs
+from drivax.tracking.run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class Config:
+    lr: float = 3e-4
+    hidden: tuple[int, ...] = (8, 8)
+
+
+@pytest.fixture
+def scenarios(tmp_path: Path) -> ScenarioSet:
+    capacity = Capacity(name="tiny", agents=1, parked=1, steps=2, segments=1, features=1, lanes=1, grid=1)
+    record = np.zeros((), record_dtype(capacity))
+    record["scenario_id"] = b"one"
+    with ScenarioWriter(tmp_path / "set", capacity) as writer:
+        writer.add(Scenario(record, capacity, SourceCounts(2, 1, 1, {}, 0, 0)))
+    return ScenarioSet.open(tmp_path / "set")
+
+
+def test_create_and_open(tmp_path: Path, scenarios: ScenarioSet):
+    config = Config(lr=1e-5)
+    created = RunFolder.create(tmp_path / "run", config, data=[scenarios], seed=3)
+    opened = RunFolder.open(tmp_path / "run")
+    assert opened == created
+    assert opened.config(Config) == config
+    info = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert info["seed"] == 3
+    assert info["data"] == [
+        {"path": str((tmp_path / "set").resolve()), "hash": scenarios.hash, "scenarios": 1}
+    ]
+    assert info["versions"]["jax"] == jax.__version__
+    assert info["versions"]["numpy"] == np.__version__
+    assert info["versions"]["python"].startswith(f"{sys.version_info.major}.{sys.version_info.minor}.")
+    assert info["machine"]["device"] == jax.devices()[0].device_kind
+    assert info["machine"]["cpu_count"] >= 1
+    assert "pytest" in info["command"] or info["command"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "set"]
+
+
+def test_notes(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config()).note(result=0.5)
+    assert RunFolder.open(tmp_path / "run").info["result"] == 0.5
+    assert run.info["result"] == 0.5
+    assert sorted(path.name for path in run.path.iterdir()) == ["config.yaml", "run.json"]
+
+
+def test_existing_folders(tmp_path: Path):
+    run = RunFolder.create(tmp_path / "run", Config())
+    (run.path / "metrics.jsonl").write_text("{}")
+    with pytest.raises(UsageError, match="--overwrite"):
+        RunFolder.create(tmp_path / "run", Config())
+    RunFolder.create(tmp_path / "run", Config(), overwrite=True)
+    assert not (run.path / "metrics.jsonl").exists()
+    RunFolder.create(tmp_path / "days", Config(), kind="training")
+    with pytest.raises(UsageError, match="holds a run of kind training, not evaluation"):
+        RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="evaluation")
+    RunFolder.create(tmp_path / "days", Config(), overwrite=True, kind="seeds")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "main.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="is not a run folder"):
+        RunFolder.create(tmp_path / "thesis", Config(), overwrite=True)
+    (tmp_path / "empty").mkdir()
+    RunFolder.create(tmp_path / "empty", Config())
+
+
+def test_a_configuration_that_cannot_be_written_leaves_nothing(tmp_path: Path):
+    @dataclass(frozen=True)
+    class Odd:
+        value: object = object()
+
+    with pytest.raises(Exception, match="represent"):
+        RunFolder.create(tmp_path / "run", Odd())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_run(tmp_path: Path):
+    with pytest.raises(DataError, match=r"not a run folder: no run\.json; give a folder"):
+        RunFolder.open(tmp_path)
+    run = RunFolder.create(tmp_path / "run", Config())
+    (run.path / "run.json").write_text("{")
+    with pytest.raises(DataError, match=r"run\.json: not valid JSON"):
+        RunFolder.open(run.path)
+
+
+def test_git_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Against a repository made here: a clean commit, a run next to it, a new file, a change."""
+
+    def git(*arguments: str) -> str:
+        options = ["-c", "user.name=t", "-c", "user.email=t@t", "-c", "init.defaultBranch=main"]
+        command = ["git", "-C", str(tmp_path), *options, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    file = tmp_path / "package" / "tracking" / "runs.py"
+    file.parent.mkdir(parents=True)
+    file.write_text("one")
+    monkeypatch.setattr(runs, "__file__", str(file))
+    assert runs.git_state(tmp_path) is None
+    git("init")
+    assert runs.git_state(tmp_path) is None
+    git("add", str(file))
+    git("commit", "-m", "one")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").write_text("beside the package")
+    assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": False}
+    new, preset = file.with_name("new.py"), tmp_path / "configs" / "preset.yaml"
+    preset.parent.mkdir()
+    for changed in (new, preset, file):
+        changed.write_text("two")
+        assert runs.git_state(tmp_path) == {"commit": git("rev-parse", "HEAD"), "changed": True}
+        for made in (new, preset):
+            made.unlink(missing_ok=True)
+
+
+def test_where_a_planner_was_trained(tmp_path):
+    data = [{"path": "sets/a", "hash": "abc", "scenarios": 3}]
+    for name, kind in (("policy", "training"), ("judged", "evaluation")):
+        RunFolder.create(tmp_path / name, Config(), kind=kind).note(data=data)
+    trained = str(tmp_path / "policy")
+    assert runs.learned_from(trained) == runs.learned_from(f"{trained}@1000") == data
+    assert runs.learned_from(str(tmp_path / "judged")) == runs.learned_from("idm") == []
+    assert [entry["scenarios"] for entry in runs.learned_from("zoo:aggressive")] == [4096]
+    # What the run learned from whose networks it began with counts too, each set once.
+    former = [{"hash": "abc"}, {"path": "sets/b", "hash": "def", "scenarios": 2}]
+    RunFolder.open(trained).note(networks_from={"run": "runs/a", "step": 10, "data": former})
+    assert runs.learned_from(trained) == [*data, former[1]]
+
+
+def test_steps_of_runs():
+    assert runs.run_and_step("runs/a") == ("runs/a", None) and runs.run_and_step("runs/a@20") == (
+        "runs/a",
+        20,
+    )
+    with pytest.raises(UsageError, match="'best' is not a checkpoint step; write RUN@STEP"):
+        runs.run_and_step("runs/a@best")
