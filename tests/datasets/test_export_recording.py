@@ -1,4 +1,4 @@
-"""The way back from a stored scenario: what it keeps exactly, what it keeps within tolerance, what it computes again."""
+"""From a stored scenario back to a recording: fields kept exactly, kept within tolerance, or recomputed."""
 
 from __future__ import annotations
 

@@ -218,8 +218,8 @@ def convert(
         announce: Called once before the work begins.
 
     Raises:
-        UsageError: Options that cannot be meant, ``out`` exists, is being written, or was started with other options, or
-            a package that the format needs is missing.
+        UsageError: Options that cannot be meant, ``out`` exists, is being written, or was started with other options,
+            or a package that the format needs is missing.
         DataError: ``src`` holds nothing that can be converted, the disk is too small, or with ``strict`` a record
             cannot be read.
     """
