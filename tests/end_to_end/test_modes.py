@@ -66,7 +66,7 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
         drivax.evaluate(find_planner(planner, load(data).bank)[0], data, sample=True)
     (out / "crashes.json").write_text("[]")
     capsys.readouterr()
-    assert evaluate(data, planner, out) == 2 and "exists already" in capsys.readouterr().err
+    assert evaluate(data, planner, out) == 2 and "already exists" in capsys.readouterr().err
     assert (out / "crashes.json").exists(), "a run that was not to be replaced is whole"
     assert evaluate(data, planner, out, "--overwrite") == 0
     modes = driven(out)
