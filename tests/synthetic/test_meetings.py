@@ -8,8 +8,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from drivax.synthetic.roads.families import FAMILIES
 from drivax.synthetic.roads.network import Control
-from drivax.synthetic.traffic.conflicts import giving_way, met_on, with_feeders
 from drivax.synthetic.traffic.paths import LaneChange, Sway, lane_path
+from drivax.synthetic.traffic.role_assignment import giving_way, met_on, with_feeders
 
 from .traffic_scenes import crossroads, road
 

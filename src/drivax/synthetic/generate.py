@@ -8,12 +8,14 @@ audit that needs it is handed in.
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import os
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,33 @@ from drivax.errors import DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
-from drivax.synthetic.portable import portable_workers
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
+
+#: What NumPy was built for beyond the oldest processor, and what of it this one has.
+_umath = importlib.import_module("numpy._core._multiarray_umath")
+#: Tells NumPy which of them to leave alone.
+_FEATURES = "NPY_DISABLE_CPU_FEATURES"
+
+
+@contextmanager
+def portable_workers() -> Iterator[None]:
+    """Processes that are started within compute alike on any x86-64 processor; this one is as it was."""
+    # What this process was told to leave alone it does not have any more, but they would.
+    told = os.environ.get(_FEATURES, "").split()
+    newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in told]
+    found = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
+    before = {name: os.environ.get(name) for name in found}
+    os.environ.update(found)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4

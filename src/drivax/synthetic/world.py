@@ -37,9 +37,8 @@ from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
 from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, sight
-from drivax.synthetic.traffic.conflicts import met_on
 from drivax.synthetic.traffic.population import LONGEST_M
-from drivax.synthetic.traffic.role_assignment import SignalTiming, draw_cast
+from drivax.synthetic.traffic.role_assignment import SignalTiming, draw_cast, met_on
 from drivax.synthetic.traffic.roles import Cast, Motion, Staging
 from drivax.synthetic.traffic.simulation import Traffic
 

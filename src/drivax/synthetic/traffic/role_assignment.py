@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,14 +15,65 @@ from drivax.synthetic.events.destinations import Aim, AimedWay, drawn_aimed_way,
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
-from drivax.synthetic.traffic.conflicts import giving_way, met_on, with_feeders
 from drivax.synthetic.traffic.drivers import Drivers
-from drivax.synthetic.traffic.parking import parked_cars
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path, random_lanes
 from drivax.synthetic.traffic.pedestrians import placed_walkers
-from drivax.synthetic.traffic.population import drawn_drivers, driven_path, joined_drivers, placed
+from drivax.synthetic.traffic.population import (
+    drawn_drivers,
+    driven_path,
+    joined_drivers,
+    parked_cars,
+    placed,
+)
 from drivax.synthetic.traffic.roles import Cast
+
+#: Lanes that lead to a meeting are followed back for this long, m.
+_BACK_M = 160.0
+#: When ego would come to where it gives way if nothing held it up, s after the recording's beginning.
+_WHEN_S = (0.4, 4.0)
+
+
+def giving_way(network: RoadNetwork) -> tuple[Aim, ...]:
+    """Connectors whose users give way to others who need not wait themselves."""
+    return tuple(
+        Aim(index, (0.0, min(3.0, lane.length_m)), _WHEN_S)
+        for index, lane in enumerate(network.lanes)
+        if lane.control == Control.ALL_WAY_STOP or any(not network.lanes[k].yields_to for k in lane.yields_to)
+    )
+
+
+def met_on(network: RoadNetwork, path: Path) -> frozenset[int]:
+    """Connectors that a path gives way to, and lanes that it changes to; of those that give way themselves none.
+
+    Args:
+        network: The roads.
+        path: Ego's.
+    """
+    found: set[int] = set()
+    for before, span in pairwise((path.spans[0], *path.spans)):
+        lane, previous = network.lanes[span.lane], network.lanes[before.lane]
+        if span.lane in (previous.left, previous.right):
+            found.add(span.lane)
+        if lane.control == Control.ALL_WAY_STOP:
+            found.update(np.flatnonzero(network.conflicts[span.lane]).tolist())
+        # Who has to wait for others comes when they let it.
+        found.update(rival for rival in lane.yields_to if not network.lanes[rival].yields_to)
+    return frozenset(found)
+
+
+def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
+    """Lanes, and those from which they are reached within 160 m."""
+    found: set[int] = set()
+    ahead = [(lane, 0.0) for lane in sorted(lanes)]
+    while ahead:
+        lane, away = ahead.pop()
+        if lane not in found and away < _BACK_M:
+            found.add(lane)
+            this = network.lanes[lane]
+            ahead += [(before, away + this.length_m) for before in this.predecessors]
+    return frozenset(found)
+
 
 #: Shares of what the light does for ego: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]

@@ -14,19 +14,137 @@ import copy
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from drivax.scenario.schema import DT_S
+from drivax.scenario.schema import DT_S, AgentKind
 from drivax.simulator.idm import idm_acceleration
-from drivax.synthetic.traffic.detours import DETOUR_MARGIN_M, LOOK_M, Detours, swerver
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.lane_changes import HELP_MPS2, Change, Helped, LaneChanges, Situation
-from drivax.synthetic.traffic.lateral import change_onto, followed
-from drivax.synthetic.traffic.leaders import Leaders
+from drivax.synthetic.traffic.lateral import DETOUR_MARGIN_M, LOOK_M, Detours, change_onto, followed, swerver
 from drivax.synthetic.traffic.obstacles import Boxes, Standing, in_the_way
 from drivax.synthetic.traffic.path_arrays import PathTables
-from drivax.synthetic.traffic.paths import Path, Sway, lane_path, onward
+from drivax.synthetic.traffic.paths import SLOTS, Path, Sway, lane_path, onward
 from drivax.synthetic.traffic.pedestrians import Walkers
 from drivax.synthetic.traffic.right_of_way import Moment, RightOfWay
-from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion, Staging
-from drivax.synthetic.traffic.scripted import boxes_at, everybody, standing_and_moving
+from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion, Scripted, Staging
+
+
+def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
+    """Where scripted users are at a step."""
+    if not scripted:
+        return Boxes(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)))
+    return Boxes(
+        np.array([s.xy[step] for s in scripted]),
+        np.array([s.heading[step] for s in scripted]),
+        np.array([s.speed[step] for s in scripted]),
+        np.array([s.size_m[:2] for s in scripted]),
+    )
+
+
+def standing_and_moving(extras: tuple[Scripted, ...]) -> tuple[tuple[Scripted, ...], tuple[Scripted, ...]]:
+    """Those who stand in one place all the time, and the others."""
+    fixed = [bool(e.valid.all() and not e.speed.any() and not np.ptp(e.xy, axis=0).any()) for e in extras]
+    return (
+        tuple(e for e, still in zip(extras, fixed, strict=True) if still),
+        tuple(e for e, still in zip(extras, fixed, strict=True) if not still),
+    )
+
+
+def everybody(
+    cast: Cast,
+    staging: Staging,
+    vehicles: tuple[
+        Float64[np.ndarray, "v time 3"],
+        Float64[np.ndarray, "v time"],
+        Bool[np.ndarray, "v time"],
+        Float64[np.ndarray, "v time"],
+        Float64[np.ndarray, "v time"],
+    ],
+    walked: Float64[np.ndarray, "walker time 4"],
+    paths: list[Path],
+) -> Motion:
+    """The motion of all users of a scenario, in their order.
+
+    Args:
+        cast: Who there is.
+        staging: Whose extras are there too.
+        vehicles: Their poses (x, y, heading), speeds, presence, path positions and accelerations.
+        walked: x, y, heading and speed of the walkers.
+        paths: The vehicles' paths.
+    """
+    pose, speed, valid, at, acceleration = vehicles
+    steps = pose.shape[1]
+    scripted = (*cast.parked, *staging.extras)
+    kinds = [AgentKind.PEDESTRIAN] * len(cast.walkers) + [s.kind for s in scripted]
+    sizes = [w.size_m for w in cast.walkers] + [s.size_m for s in scripted]
+    there = np.ones(walked.shape[:2], bool)
+    return Motion(
+        kind=np.concatenate([cast.drivers.kind, np.array(kinds, np.int8)]),
+        size_m=np.concatenate([cast.drivers.size_m, np.array(sizes, float).reshape(-1, 3)]),
+        xy=np.concatenate([pose[..., :2], walked[..., :2], *(s.xy[None, :steps] for s in scripted)]),
+        heading=np.concatenate([pose[..., 2], walked[..., 2], *(s.heading[None, :steps] for s in scripted)]),
+        speed=np.concatenate([speed, walked[..., 3], *(s.speed[None, :steps] for s in scripted)]),
+        valid=np.concatenate([valid, there, *(s.valid[None, :steps] for s in scripted)]),
+        distance_m=at,
+        acceleration=acceleration,
+        paths=paths,
+    )
+
+
+#: What a cyclist at a lane's side needs of half its width: half a bicycle, its place, and 1.5 m to a car.
+_PASS_CYCLIST_M = 0.35 + 0.55 + 1.5
+
+
+class Leaders:
+    """Finds the leader of every vehicle.
+
+    Args:
+        network: The roads.
+        drivers: Who drives.
+    """
+
+    def __init__(self, network: RoadNetwork, drivers: Drivers) -> None:
+        self._half_m, width_m = drivers.size_m[:, 0] / 2, drivers.size_m[:, 1]
+        self._rows = np.arange(len(width_m))
+        self._cyclist, self._any_cyclist = drivers.cyclist, bool(drivers.cyclist.any())
+        # Half the widest car that passes a cyclist at the side of a lane.
+        spare_m = np.array([lane.width_m for lane in network.lanes]) / 2 - _PASS_CYCLIST_M
+        self._passes = spare_m >= width_m[:, None] / 2
+        self._found = np.full(len(width_m), np.inf), np.zeros(len(width_m), int)
+
+    def ahead(
+        self, tables: PathTables, at_m: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
+    ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
+        """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and that vehicle.
+
+        Args:
+            tables: Everyone's paths.
+            at_m: Where they are on them.
+            active: Which of them are there.
+        """
+        own = at_m[:, None]
+        lane, along = tables.on(at_m, self._rows)
+        lane[~active] = -1
+        # position[i, k]: where the k-th occupied (vehicle, lane) is on the path of vehicle i.
+        used = (lane.ravel() >= 0).nonzero()[0]
+        if not len(used):
+            return self._found
+        who, taken = used // SLOTS, lane.ravel().take(used)
+        # nan where the lane is not on the path, or does not matter now: comparisons with it are false.
+        begin = np.where((tables.since <= own) & (own <= tables.until), tables.begin, np.nan)
+        position = tables.scale.take(taken, axis=1)
+        position *= along.ravel().take(used)
+        position = begin.take(taken, axis=1) + position
+        seen = position > own
+        seen &= who != self._rows[:, None]
+        if self._any_cyclist:
+            # Cyclists are overtaken within the lane where it is wide enough.
+            seen &= ~(self._cyclist[who] & self._passes.take(taken, axis=1))
+        position -= self._half_m[who]
+        gap = np.where(seen, position, np.inf) - own - self._half_m[:, None]
+        nearest = gap.argmin(axis=1)
+        self._found = gap[self._rows, nearest], who[nearest]
+        return self._found
+
 
 #: Where drivers want to come to rest before a stop line, m from the front bumper.
 _STOP_SHORT_M = 1.0
