@@ -20,7 +20,7 @@ from drivax.synthetic.generate import (
     GeneratedSet,
     Generation,
     Progress,
-    written,
+    write_set,
 )
 from drivax.synthetic.world import WorldConfig
 
@@ -95,7 +95,7 @@ def generate_benchmark(
         )
     counts, done = sizes(train), 0
     total = sum(counts.values())
-    made: dict[str, GeneratedSet] = {}
+    sets: dict[str, GeneratedSet] = {}
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:
@@ -103,18 +103,18 @@ def generate_benchmark(
         notes = {"benchmark": BENCHMARK_VERSION, "split": name}
         before = done
 
-        def further(here: int, _: int, before: int = before) -> None:
+        def report(here: int, _: int, before: int = before) -> None:
             if progress is not None:
                 progress(before + here, total)
 
-        made[name] = written(
+        sets[name] = write_set(
             Path(out) / name,
             counts[name],
             split.seed,
             dataclasses.replace(options, world=world),
             notes,
-            further,
+            report,
             audit,
         )
         done += counts[name]
-    return made
+    return sets

@@ -37,11 +37,11 @@ _FEATURES = "NPY_DISABLE_CPU_FEATURES"
 def portable_workers() -> Iterator[None]:
     """Processes that are started within compute alike on any x86-64 processor; this one is as it was."""
     # What this process was told to leave alone it does not have any more, but they would.
-    told = os.environ.get(_FEATURES, "").split()
-    newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in told]
-    found = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
-    before = {name: os.environ.get(name) for name in found}
-    os.environ.update(found)
+    disabled = os.environ.get(_FEATURES, "").split()
+    newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
+    settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
     try:
         yield
     finally:
@@ -133,7 +133,7 @@ class GeneratedSet:
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _Draw:
     scenario: Scenario
     family: str
     rejected: dict[tuple[str, str], int]
@@ -148,15 +148,15 @@ class _Counts:
         self._rejected: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._events: defaultdict[str, Counter[str]] = defaultdict(Counter)
 
-    def add(self, one: _Drawn) -> None:
-        self._kept[one.family] += 1
-        for (family, cause), times in one.rejected.items():
+    def add(self, draw: _Draw) -> None:
+        self._kept[draw.family] += 1
+        for (family, cause), times in draw.rejected.items():
             if cause in UNSUITED:
                 self._unsuited[family] += times
             else:
                 self._rejected[family][cause] += times
-        if _EVENT in one.scenario.tags:
-            self._events[one.family][one.scenario.tags[_EVENT]] += 1
+        if _EVENT in draw.scenario.tags:
+            self._events[draw.family][draw.scenario.tags[_EVENT]] += 1
 
     def families(self) -> dict[str, FamilyCount]:
         """Sorted by name; also those of which no draw was kept."""
@@ -195,10 +195,10 @@ def generate(
         raise UsageError(f"scenarios is {scenarios}", cure="use 1 or more")
     if not 0 <= seed < RESERVED_SEED:
         raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1:,}".replace(",", ""))
-    return written(out, scenarios, seed, options, {}, progress, audit)
+    return write_set(out, scenarios, seed, options, {}, progress, audit)
 
 
-def written(
+def write_set(
     out: str | Path,
     scenarios: int,
     seed: int,
@@ -215,11 +215,11 @@ def written(
     batch: list[Scenario] = []
     with (
         ScenarioWriter(out, CAPACITIES[options.capacity], source, overwrite=options.overwrite) as writer,
-        closing(_drawn(scenarios, seed, options)) as drawn,
+        closing(_draws(scenarios, seed, options)) as draws,
     ):
-        for done, one in enumerate(drawn, start=1):
-            counts.add(one)
-            batch.append(one.scenario)
+        for done, draw in enumerate(draws, start=1):
+            counts.add(draw)
+            batch.append(draw.scenario)
             if len(batch) == _BATCH or done == scenarios:
                 _write(writer, batch, audit)
                 batch = []
@@ -234,29 +234,29 @@ def _write(writer: ScenarioWriter, batch: list[Scenario], audit: Audit | None) -
         writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
 
 
-def _draw(first: int, last: int, seed: int, options: Generation) -> list[_Drawn]:
+def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
     """Scenarios ``first`` to ``last - 1``; runs in workers."""
     capacity, result = CAPACITIES[options.capacity], []
     for index in range(first, last):
-        one = generate_one(seed, index, options.world)
-        scenario = assemble(one.recording, capacity)
-        result.append(_Drawn(scenario, one.family, one.rejected))
+        draw = generate_one(seed, index, options.world)
+        scenario = assemble(draw.recording, capacity)
+        result.append(_Draw(scenario, draw.family, draw.rejected))
     return result
 
 
-def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, None, None]:
+def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:
     """All scenarios in order."""
     spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
     if options.workers == 0:
         for first, last in spans:
-            yield from _draw(first, last, seed, options)
+            yield from _draw_chunk(first, last, seed, options)
         return
     pool = worker_pool(min(options.workers, len(spans)))
-    waiting: deque[Future[list[_Drawn]]] = deque()
+    waiting: deque[Future[list[_Draw]]] = deque()
     try:
         for first, last in spans:
             with portable_workers():  # processes are started as they are needed
-                waiting.append(pool.submit(_draw, first, last, seed, options))
+                waiting.append(pool.submit(_draw_chunk, first, last, seed, options))
             if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
         while waiting:

@@ -140,7 +140,7 @@ def visible(
         return seen
     points = np.concatenate((corners(box[target, step]), box[target, step, None, :2]), axis=1)
     hidden = np.zeros(points.shape[:2], bool)
-    row, other = _in_the_way(box, valid & blocks[:, None], target, step)
+    row, other = _occluders(box, valid & blocks[:, None], target, step)
     eye = height_m[0] + config.above_roof_m
     cut = _cuts(
         box[0, step[row], :2],
@@ -154,7 +154,7 @@ def visible(
     return seen
 
 
-def _in_the_way(
+def _occluders(
     box: Float64[np.ndarray, "user time 6"],
     blocking: Bool[np.ndarray, "user time"],
     target: Int64[np.ndarray, " look"],
@@ -171,25 +171,25 @@ def _in_the_way(
     farthest = length.max() + 2.0 * (radius.max() + radius)
     near = (blocking & (x**2 + y**2 < farthest[:, None] ** 2)).any(axis=1)
     near[0] = False
-    who = np.flatnonzero(near)
+    near_rows = np.flatnonzero(near)
     pairs = []
     # So few looks at a time that the tables stay in the processor's cache.
     for first in range(0, len(target), _LOOKS):
-        part = slice(first, first + _LOOKS)
-        at, to, ax, ay = step[part], target[part], ray_x[part], ray_y[part]
-        to_x, to_y = x[who].take(at, axis=1), y[who].take(at, axis=1)
+        batch = slice(first, first + _LOOKS)
+        at, to, ax, ay = step[batch], target[batch], ray_x[batch], ray_y[batch]
+        to_x, to_y = x[near_rows].take(at, axis=1), y[near_rows].take(at, axis=1)
         ahead = to_x * ax + to_y * ay
         to_y *= ax
         to_x *= ay
         to_y -= to_x
-        reach = radius[who, None] + radius[to]
-        meets = blocking[who].take(at, axis=1) & (np.abs(to_y, out=to_y) < reach)
-        meets &= ahead > -radius[who, None]
-        reach += length[part]
+        reach = radius[near_rows, None] + radius[to]
+        meets = blocking[near_rows].take(at, axis=1) & (np.abs(to_y, out=to_y) < reach)
+        meets &= ahead > -radius[near_rows, None]
+        reach += length[batch]
         meets &= ahead < reach
-        meets &= who[:, None] != to
+        meets &= near_rows[:, None] != to
         other, row = np.nonzero(meets)
-        pairs.append((row + first, who[other]))
+        pairs.append((row + first, near_rows[other]))
     row, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return row, other
 
@@ -208,7 +208,7 @@ def _cuts(
     return (enters < leaves) & (lowest < top_m[:, None])
 
 
-def farthest_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
+def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
     """How far :func:`noisy` can move a corner of a box: all errors at their largest, and with the worse signs.
 
     Args:
@@ -243,7 +243,7 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
     deviations = (config.along_m, config.across_m, config.heading_rad, config.speed_mps)
     correlations = (config.position_correlation,) * 2 + (config.heading_correlation, config.speed_correlation)
     along, across, turn, faster = (
-        config.level * sigma * share * _tremble(tracks.valid.shape, correlation, rng)
+        config.level * sigma * share * _jitter(tracks.valid.shape, correlation, rng)
         for sigma, correlation in zip(deviations, correlations, strict=True)
     )
     cos, sin = np.cos(tracks.heading), np.sin(tracks.heading)
@@ -260,7 +260,7 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
     )
 
 
-def _tremble(
+def _jitter(
     shape: tuple[int, ...], correlation: float, rng: np.random.Generator
 ) -> Float64[np.ndarray, "track time"]:
     """Unit-variance AR(1) noise x(t+1) = c x(t) + sqrt(1 - c^2) e(t), stationary from the first step on."""

@@ -36,10 +36,10 @@ from drivax.synthetic.expert.violations import EGO_SKIN_M
 from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, sight
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, sight
 from drivax.synthetic.traffic.population import LONGEST_M
-from drivax.synthetic.traffic.role_assignment import SignalTiming, draw_cast, met_on
-from drivax.synthetic.traffic.roles import Cast, Motion, Staging
+from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
+from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Traffic
 
 #: Raised whenever the same seed gives another world; part of every scenario id.
@@ -57,7 +57,7 @@ _LIGHTS_M = 95.0
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
 #: Causes that say nothing against anybody's driving: the event that was wanted cannot happen, or comes to nothing.
 UNSUITED = ("no_occasion", "no_threat")
-#: Events that are tried with the same cast.
+#: Events that are tried with the same roles.
 _STAGINGS = 3
 #: Of the others, so many that come nearest to ego are recorded.
 _RECORDED = 76
@@ -107,7 +107,7 @@ class WorldConfig:
         self.sensor.check()
         if self.scenarios_per_map < 1:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
-        if farthest_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
+        if largest_shift_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
             raise UsageError(
                 f"noise.level {self.noise.level} could make a recorded vehicle touch ego that did not",
                 cure="use a smaller one",
@@ -221,28 +221,30 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
     """One draw: the recording, or why it was thrown away."""
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
-    cast = draw_cast(
+    roles = assign_roles(
         draw.network, domain, times, config.lane_change_share, config.signal_timing, rng, draw.aims, critical
     )
-    traffic = Traffic(cast, times)
+    traffic = Traffic(roles, times)
     if not draw.event:
         motion, first = traffic.run(), None
         if critical:
             first = _critical_step(traffic, motion, rng)
         begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
         traffic, motion = traffic.until(begin + STEPS), motion.until(begin + STEPS)
-        motion, cause = expert.drive(cast, traffic.times_s, Staging(), begin, traffic.run, begun=motion)
-        return cause or _perceived(replace(_recorded(cast, motion, begin, None), tags=tags), config, rng)
-    scene, cause = Scene(cast, traffic.run(), _WARM_UP), UNSUITED[0]
+        motion, cause = expert.drive_ego(
+            roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
+        )
+        return cause or _perceived(replace(_recorded(roles, motion, begin, None), tags=tags), config, rng)
+    scene, cause = Scene(roles, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
         staged = stage(draw.event, scene, draw.severity_mps2, rng)
         if staged is None:
             break
         # Ego may foresee an event a little: an attentive driver sees it coming.
         aware = staged.first_step - _FORESEEN
-        motion, cause = expert.drive(cast, times, staged.staging, _WARM_UP, traffic.run, aware)
+        motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and threatens(scene, motion, staged):
-            return _perceived(_recorded(cast, motion, _WARM_UP, staged), config, rng)
+            return _perceived(_recorded(roles, motion, _WARM_UP, staged), config, rng)
         cause = cause or UNSUITED[1]
     return cause
 
@@ -250,23 +252,23 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
 def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
     """With the errors of a perception system, and the mask of what ego's sensors see."""
     tracks, ego = recording.tracks, recording.ego
-    seen = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
+    visible = sight(tracks, ego, config.sensor)
+    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=visible)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
     """Where a recording begins in which ego has to give way, if there is such a step."""
-    network = traffic.cast.network
-    if not met_on(network, motion.paths[0]):
+    network = traffic.roles.network
+    if not conflicts_on(network, motion.paths[0]):
         return None
     steps = np.arange(_EARLIEST, _WARM_UP + _LATER + 1, _EVERY)
-    found = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
-    return int(steps[rng.choice(found)]) if len(found) else None
+    candidates = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
+    return int(steps[rng.choice(candidates)]) if len(candidates) else None
 
 
-def _recorded(cast: Cast, motion: Motion, first: int, staged: Staged | None) -> Recording:
+def _recorded(roles: Roles, motion: Motion, first: int, staged: Staged | None) -> Recording:
     """The log from a step on, without names."""
-    network, motion = cast.network, motion.since(first)
+    network, motion = roles.network, motion.since(first)
     times = np.arange(STEPS) * DT_S
     lights: tuple[Light, ...] = ()
     if network.signals is not None:
@@ -323,18 +325,18 @@ def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
     apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
     nearest = np.where(valid, apart, np.inf).min(axis=1)
     nearest[[0, *actors]] = -1.0
-    seen = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
-    seen = seen[np.isfinite(nearest[seen])]
-    valid = valid[seen]
-    heading = np.where(valid, wrap(motion.heading[seen]), 0.0)
-    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[seen], 0.0)
+    nearest_rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
+    nearest_rows = nearest_rows[np.isfinite(nearest[nearest_rows])]
+    valid = valid[nearest_rows]
+    heading = np.where(valid, wrap(motion.heading[nearest_rows]), 0.0)
+    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[nearest_rows], 0.0)
     return Tracks(
-        xy=np.where(valid[..., None], motion.xy[seen], 0.0),
+        xy=np.where(valid[..., None], motion.xy[nearest_rows], 0.0),
         z=np.zeros(valid.shape),
         heading=heading,
         velocity=speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1),
-        size=np.where(valid[..., None], motion.size_m[seen, None], 0.0),
+        size=np.where(valid[..., None], motion.size_m[nearest_rows, None], 0.0),
         valid=valid,
-        kind=motion.kind[seen],
-        track_id=(seen + 1).astype(np.int64),
+        kind=motion.kind[nearest_rows],
+        track_id=(nearest_rows + 1).astype(np.int64),
     )

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import overlap
-from drivax.synthetic.expert.trajectories import SPACING_M, Way, way_boxes
+from drivax.synthetic.expert.trajectories import SPACING_M, CandidatePath, candidate_boxes
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import LaneSpan, Path
@@ -28,7 +28,7 @@ _SHORT_M = 0.5
 
 
 @dataclass(frozen=True)
-class Meetings:
+class Conflicts:
     """Where ego's box on its way would meet other users: one entry for each (user, step, sample of the way).
 
     Attributes:
@@ -40,13 +40,13 @@ class Meetings:
     point: Int64[np.ndarray, " meeting"]
     hard: Bool[np.ndarray, " meeting"]
 
-    def only(self, keep: Bool[np.ndarray, " meeting"]) -> Meetings:
+    def only(self, keep: Bool[np.ndarray, " meeting"]) -> Conflicts:
         """Some of the meetings."""
-        return Meetings(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
+        return Conflicts(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
 
 
 @dataclass(frozen=True)
-class Wall:
+class StopLine:
     """A line that ego's centre may not pass for a while.
 
     Attributes:
@@ -60,17 +60,17 @@ class Wall:
     late: Bool[np.ndarray, " time"]
 
 
-def meetings(
-    way: Way,
+def find_conflicts(
+    candidate: CandidatePath,
     size_m: Float64[np.ndarray, " 3"],
     others: Float64[np.ndarray, "user time 6"],
     valid: Bool[np.ndarray, "user time"],
     people: Bool[np.ndarray, " user"],
-) -> Meetings:
+) -> Conflicts:
     """All meetings of ego's box along a way with the boxes of others.
 
     Args:
-        way: Ego's way.
+        candidate: Ego's way.
         size_m: Ego's length, width, height.
         others: Boxes of the others.
         valid: When they exist.
@@ -78,12 +78,12 @@ def meetings(
     """
     liked = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
-    ego = way_boxes(way, size_m)
-    moving = _met(ego, others, valid & ~still[:, None], liked)
+    ego = candidate_boxes(candidate, size_m)
+    moving = _box_conflicts(ego, others, valid & ~still[:, None], liked)
     # Who never moves is looked at once.
-    once = _met(ego, others[:, :1], still[:, None], liked)
+    once = _box_conflicts(ego, others[:, :1], still[:, None], liked)
     steps = others.shape[1]
-    return Meetings(
+    return Conflicts(
         user=np.concatenate([moving.user, np.repeat(once.user, steps)]),
         step=np.concatenate([moving.step, np.tile(np.arange(steps), len(once.step))]),
         point=np.concatenate([moving.point, np.repeat(once.point, steps)]),
@@ -91,14 +91,14 @@ def meetings(
     )
 
 
-def _met(
+def _box_conflicts(
     ego: Float64[np.ndarray, "point 6"],
     others: Float64[np.ndarray, "user time 6"],
     valid: Bool[np.ndarray, "user time"],
-    liked_m: Float64[np.ndarray, "user 2"],
-) -> Meetings:
+    margin_m: Float64[np.ndarray, "user 2"],
+) -> Conflicts:
     """Meetings of boxes: first of circles around them at every fourth sample, then exactly."""
-    reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + liked_m).T)
+    reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
     reach += _STRIDE * SPACING_M / 2
     user, step = np.nonzero(valid & _around(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
@@ -110,10 +110,10 @@ def _met(
     inside = (point >= 0) & (point < len(ego))
     row, point = row[inside], point[inside]
     other, mine = others[user[row], step[row]], ego[point]
-    close = overlap(_wider(mine, liked_m[user[row]]), other)
+    close = overlap(_wider(mine, margin_m[user[row]]), other)
     row, point, other, mine = row[close], point[close], other[close], mine[close]
     hard = overlap(_wider(mine, np.array(HARD_M)), other)
-    return Meetings(user[row], step[row], point, hard)
+    return Conflicts(user[row], step[row], point, hard)
 
 
 def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
@@ -133,14 +133,14 @@ def _around(
     return outside < reach[:, None]
 
 
-def walls(
+def stop_lines(
     network: RoadNetwork,
     path: Path,
     ego_m: tuple[float, float],
     times_s: Float64[np.ndarray, " time"],
     passed: Float64[np.ndarray, " time"],
     arrivals: dict[int, Bool[np.ndarray, " time"]],
-) -> list[Wall]:
+) -> list[StopLine]:
     """The stop lines ahead.
 
     Args:
@@ -171,7 +171,7 @@ def walls(
         for first in lane.yields_to:
             late |= arrivals.get(first, np.zeros(len(times_s), bool))
         if closed.any() or late.any():
-            result.append(Wall(line - _SHORT_M - from_m, closed, late))
+            result.append(StopLine(line - _SHORT_M - from_m, closed, late))
     return result
 
 

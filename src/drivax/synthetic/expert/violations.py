@@ -13,7 +13,7 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import Path
-from drivax.synthetic.traffic.roles import Cast, Motion, Staging
+from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 
 #: Ego is tested for overlap with so much around it, m: its replay in float32, beside others who are recorded with
 #: noise, must not touch either.
@@ -31,7 +31,7 @@ _DOUBT_M = 0.5
 
 
 @dataclass(frozen=True)
-class Fault:
+class Violation:
     """Why a scenario must not be shown.
 
     Attributes:
@@ -52,18 +52,18 @@ def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
     return np.concatenate([motion.xy, np.cos(heading), np.sin(heading), size], axis=-1)
 
 
-def fault(
-    cast: Cast,
+def find_violation(
+    roles: Roles,
     motion: Motion,
     times_s: Float64[np.ndarray, " time"],
     first_step: int,
     staging: Staging,
     hardest_mps2: float,
-) -> Fault:
+) -> Violation:
     """Judges a motion from a step on.
 
     Args:
-        cast: Everybody.
+        roles: Everybody.
         motion: What they did.
         times_s: Times of its steps, on the clock of the lights.
         first_step: Where the recording begins.
@@ -73,28 +73,28 @@ def fault(
     now = slice(first_step, None)
     speed = motion.speed[0, now]
     if np.sum(np.abs(speed)) * DT_S < _LEAST_M:
-        return Fault("ego_hardly_moves")
+        return Violation("ego_hardly_moves")
     if not motion.valid[0, now].all():
-        return Fault("ego_leaves_map")
+        return Violation("ego_leaves_map")
     box = user_boxes(motion)[:, now]
     pairs = touching(box, motion.valid[:, now], _tested(motion))
     if (pairs[0] < box.shape[1]).any():
         users = np.flatnonzero(pairs[0] < box.shape[1])
-        return Fault("ego_collides", tuple(users.tolist()), first_step + int(pairs[0].min()))
+        return Violation("ego_collides", tuple(users.tolist()), first_step + int(pairs[0].min()))
     if np.diff(speed).min() < -(hardest_mps2 + 0.02) * DT_S:
-        return Fault("ego_brakes_hard")
-    if leaves_road(cast.network, box[0]):
-        return Fault("ego_leaves_road")
-    cause = _rules_broken(cast, motion, times_s, first_step)
+        return Violation("ego_brakes_hard")
+    if leaves_road(roles.network, box[0]):
+        return Violation("ego_leaves_road")
+    cause = _rules_broken(roles, motion, times_s, first_step)
     if cause:
-        return Fault(cause)
-    excused = bool(cast.parked) or eventful(staging)
-    if not excused and goes_against_traffic(cast.network, box[0, :, :2], motion.heading[0, now]):
-        return Fault("ego_wrong_way")
-    return Fault("others_collide" if (pairs < box.shape[1]).any() else "")
+        return Violation(cause)
+    excused = bool(roles.parked) or is_staged(staging)
+    if not excused and goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now]):
+        return Violation("ego_wrong_way")
+    return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
 
 
-def eventful(staging: Staging) -> bool:
+def is_staged(staging: Staging) -> bool:
     """Whether anything is staged."""
     return any(vars(staging).values())
 
@@ -130,13 +130,13 @@ def touching(
         low = np.where(valid[..., None], at, np.inf).min(axis=1) - reach[:, None]
         high = np.where(valid[..., None], at, -np.inf).max(axis=1) + reach[:, None]
     meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=-1)
-    one, other = np.nonzero(np.triu(tested & meet, 1))
-    gap = np.sum((box[one, :, :2] - box[other, :, :2]) ** 2, axis=-1)
-    near = (gap < ((reach[one] + reach[other]) ** 2)[:, None]) & valid[one] & valid[other]
+    first, second = np.nonzero(np.triu(tested & meet, 1))
+    gap = np.sum((box[first, :, :2] - box[second, :, :2]) ** 2, axis=-1)
+    near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
     pair, time = np.nonzero(near)
-    hit = overlap(box[one[pair], time], box[other[pair], time])
+    hit = overlap(box[first[pair], time], box[second[pair], time])
     result = np.full((len(box), len(box)), box.shape[1])
-    np.minimum.at(result, (one[pair[hit]], other[pair[hit]]), time[hit])
+    np.minimum.at(result, (first[pair[hit]], second[pair[hit]]), time[hit])
     return np.minimum(result, result.T)
 
 
@@ -184,32 +184,32 @@ def passes(
 
 
 def _rules_broken(
-    cast: Cast,
+    roles: Roles,
     motion: Motion,
     times_s: Float64[np.ndarray, " time"],
     first_step: int,
 ) -> str:
     """Whether somebody runs a red light, or ego passes a stop sign without standing."""
-    network, now = cast.network, slice(first_step, None)
+    network, now = roles.network, slice(first_step, None)
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
     if network.signals is not None:
         red = network.signals.colours(times_s[now], len(network.lanes))[0] == Colour.RED
-    dark = red[:-1] & red[1:]
-    for i, path in enumerate(motion.paths or cast.paths):
+    red_steps = red[:-1] & red[1:]
+    for i, path in enumerate(motion.paths or roles.paths):
         heading, valid = motion.heading[i, now], motion.valid[i, now]
         ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[i, 0] / 2
         front = motion.xy[i, now] + ahead
         for span in path.spans:
             lane = network.lanes[span.lane]
             stop = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
-            if not lane.connector or not (stop or dark[:, span.lane].any()):
+            if not lane.connector or not (stop or red_steps[:, span.lane].any()):
                 continue
             passed = passes(lane, front, heading) & valid[:-1] & valid[1:]
-            if np.any(passed & dark[:, span.lane]):
+            if np.any(passed & red_steps[:, span.lane]):
                 return "ego_runs_red" if i == 0 else "other_runs_red"
             if stop and not _stood(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
-        if i == 0 and _passes_beside(network, path, motion.xy[0, now], front, heading, dark):
+        if i == 0 and _passes_beside(network, path, motion.xy[0, now], front, heading, red_steps):
             return "ego_runs_red"
     return ""
 
@@ -220,29 +220,29 @@ def _passes_beside(
     xy: Float64[np.ndarray, "time 2"],
     front: Float64[np.ndarray, "time 2"],
     heading: Float64[np.ndarray, " time"],
-    dark: Bool[np.ndarray, "step lane"],
+    red_steps: Bool[np.ndarray, "step lane"],
 ) -> bool:
     """Whether ego goes around something over the line of a lane that is not its own and has red.
 
     As the metric has it: beside the way the lights of other lanes count, too.
     """
     own = {span.lane for span in path.spans}
-    others = [k for k in np.flatnonzero(dark.any(axis=0)) if network.lanes[k].connector and k not in own]
-    passed = [passes(network.lanes[k], front, heading) & dark[:, k] for k in others]
+    others = [k for k in np.flatnonzero(red_steps.any(axis=0)) if network.lanes[k].connector and k not in own]
+    passed = [passes(network.lanes[k], front, heading) & red_steps[:, k] for k in others]
     if not np.any(passed):
         return False
-    way = np.concatenate([network.lanes[k].curve.xy for k in own])
-    off = np.hypot(*(xy[:, None] - way).transpose(2, 0, 1)).min(axis=1) > _BESIDE_M
+    route_xy = np.concatenate([network.lanes[k].curve.xy for k in own])
+    off = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _BESIDE_M
     return bool((np.any(passed, axis=0) & off[1:]).any())
 
 
-def last_stop(cast: Cast, motion: Motion, first_step: int) -> int:
+def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
     """When ego last stands before a stop sign that it then passes; the first step where it never does so."""
     heading = motion.heading[0]
     front = motion.xy[0] + np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[0, 0] / 2
     result = first_step
-    for span in (motion.paths or cast.paths)[0].spans:
-        lane = cast.network.lanes[span.lane]
+    for span in (motion.paths or roles.paths)[0].spans:
+        lane = roles.network.lanes[span.lane]
         if lane.connector and lane.control in (Control.STOP, Control.ALL_WAY_STOP):
             for step in np.flatnonzero(passes(lane, front, heading)):
                 standing = np.flatnonzero(motion.speed[0, first_step : step + 1] < _STANDING_MPS)

@@ -28,7 +28,7 @@ _EDGE_M, _PASS_MPS = 0.2, 6.0
 
 
 @dataclass(frozen=True)
-class Swerver:
+class DetourRequest:
     """Who wants to pass: where it is on its path, how fast, how long and how wide, and lanes of its direction."""
 
     path: Path
@@ -38,9 +38,9 @@ class Swerver:
     beside: tuple[Occupied, ...] = ()
 
 
-def swerver(
+def detour_request(
     network: RoadNetwork, tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
-) -> Swerver:
+) -> DetourRequest:
     """A vehicle (at a path position with a speed) with the lanes of its own direction beside it."""
     at = float(now[0])
     lane, along = tables.on(np.array([at]), np.array([row]))
@@ -51,7 +51,7 @@ def swerver(
             if other >= 0:
                 scale = here.length_m / network.lanes[other].length_m
                 beside.append(Occupied(other, at - float(along[0, 0]), scale, at, at + _BESIDE_M))
-    return Swerver(tables.paths[row], at, float(now[1]), size_m, tuple(beside))
+    return DetourRequest(tables.paths[row], at, float(now[1]), size_m, tuple(beside))
 
 
 class Detours:
@@ -66,12 +66,12 @@ class Detours:
         xy = np.concatenate(points) if points else np.zeros((0, 2))
         self._edge = Boxes(xy, np.zeros(len(xy)), np.zeros(len(xy)), np.zeros((len(xy), 2)))
 
-    def find(self, who: Swerver, standing: Boxes, moving: Boxes) -> tuple[Path, float] | None:
+    def find(self, request: DetourRequest, standing: Boxes, moving: Boxes) -> tuple[Path, float] | None:
         """A path around what stands ahead, and where it is back on the old one (m); None where there is none."""
-        path, half_width, half_length = who.path, who.size_m[1] / 2, who.size_m[0] / 2
-        near = standing.chosen(_close(standing, path, who.at_m, LOOK_M + 40.0))
+        path, half_width, half_length = request.path, request.size_m[1] / 2, request.size_m[0] / 2
+        near = standing.chosen(_close(standing, path, request.at_m, LOOK_M + 40.0))
         seen, _ = extents(path, near)
-        front = who.at_m + half_length
+        front = request.at_m + half_length
         blocks = (
             (seen.right_m < half_width + DETOUR_MARGIN_M)
             & (seen.left_m > -half_width - DETOUR_MARGIN_M)
@@ -92,27 +92,31 @@ class Detours:
             float(seen.right_m[group].min()) - half_width - _ROOM_M,
         ]
         for aside in sorted(sides, key=abs):
-            plan = self._plan(who, first, last, aside)
-            if plan is not None and self._is_free(who, plan, aside, seen, moving):
-                return around(path, plan, aside, who.beside), plan[3]
+            plan = self._plan(request, first, last, aside)
+            if plan is not None and self._is_free(request, plan, aside, seen, moving):
+                return around(path, plan, aside, request.beside), plan[3]
         return None
 
     @staticmethod
     def _plan(
-        who: Swerver, first: float, last: float, aside: float
+        request: DetourRequest, first: float, last: float, aside: float
     ) -> tuple[float, float, float, float] | None:
-        half = who.size_m[0] / 2
+        half = request.size_m[0] / 2
         out = first - half - 0.3
-        begin = max(who.at_m, out - max(_STEEPEST * 2 * abs(aside), 2.4 * who.speed))
+        begin = max(request.at_m, out - max(_STEEPEST * 2 * abs(aside), 2.4 * request.speed))
         back = last + half + 0.5
-        end = back + max(_STEEPEST * 1.6 * abs(aside), 2.0 * min(who.speed, _PASS_MPS))
-        if abs(aside) > _FURTHEST_M or out - begin < _STEEPEST * abs(aside) or end > who.path.length_m - 5.0:
+        end = back + max(_STEEPEST * 1.6 * abs(aside), 2.0 * min(request.speed, _PASS_MPS))
+        if (
+            abs(aside) > _FURTHEST_M
+            or out - begin < _STEEPEST * abs(aside)
+            or end > request.path.length_m - 5.0
+        ):
             return None
         return begin, out, back, end
 
     def _is_free(
         self,
-        who: Swerver,
+        request: DetourRequest,
         plan: tuple[float, float, float, float],
         aside: float,
         seen: Extents,
@@ -120,26 +124,30 @@ class Detours:
     ) -> bool:
         """Whether the band that is driven through holds no edge, nothing that stands, and nobody who comes."""
         begin, out, back, end = plan
-        half = who.size_m[1] / 2
+        half = request.size_m[1] / 2
         low, high = aside - half - _EDGE_M, aside + half + _EDGE_M
         beside = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
         if beside.any():
             return False
-        edge = self._edge.chosen(_close(self._edge, who.path, (out + back) / 2, (end - begin) / 2 + 15.0))
-        edges, _ = extents(who.path, edge)
+        edge = self._edge.chosen(_close(self._edge, request.path, (out + back) / 2, (end - begin) / 2 + 15.0))
+        edges, _ = extents(request.path, edge)
         sweep = (edges.near_m > out) & (edges.near_m < back)
         sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
         if sweep.any():
             return False
-        lasts = (end - who.at_m) / max(who.speed, _PASS_MPS) + 1.0
-        near = moving.chosen(_close(moving, who.path, (who.at_m + end) / 2, end - who.at_m + 90.0))
-        others, which = extents(who.path, near, within_m=6.0)
-        place = np.rint(np.clip((others.near_m + others.far_m) / 2, 0, who.path.length_m) / who.path.step_m)
-        turned = wrap(near.heading[which] - who.path.curve.heading[place.astype(int)])
+        lasts = (end - request.at_m) / max(request.speed, _PASS_MPS) + 1.0
+        near = moving.chosen(
+            _close(moving, request.path, (request.at_m + end) / 2, end - request.at_m + 90.0)
+        )
+        others, which = extents(request.path, near, within_m=6.0)
+        place = np.rint(
+            np.clip((others.near_m + others.far_m) / 2, 0, request.path.length_m) / request.path.step_m
+        )
+        turned = wrap(near.heading[which] - request.path.curve.heading[place.astype(int)])
         speed = near.speed[which] * np.cos(turned)
         meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
-        ahead = (others.far_m > who.at_m) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
-        behind = (others.far_m <= who.at_m) & (others.far_m + speed * 3.0 > who.at_m - 6.0)
+        ahead = (others.far_m > request.at_m) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
+        behind = (others.far_m <= request.at_m) & (others.far_m + speed * 3.0 > request.at_m - 6.0)
         # Who drives ahead of the swerver in its own lane is met by nobody: it is a leader.
         ahead &= ~((speed > 1.0) & (others.near_m > back))
         return not bool(np.any(meets & (ahead | behind)))

@@ -43,8 +43,8 @@ def parked_cars(
         size = _size(rng, bay.length_m)
         along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
-        taken = rng.random() < share
-        if taken and size[0] < bay.length_m:
+        occupied = rng.random() < share
+        if occupied and size[0] < bay.length_m:
             play = (bay.length_m - size[0]) / 2
             pose = _moved(bay.pose, float(np.clip(along, -play, play)), float(np.clip(aside, -0.15, 0.15)))
             pose = Pose(pose.x, pose.y, pose.heading + turn)
@@ -187,40 +187,40 @@ def placed(
         busy: Lanes that are as full as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
-    found: list[tuple[int, float]] = []
+    vehicles: list[tuple[int, float]] = []
     if rng.random() < density.leader_share:
         ahead = ego_along_m + rng.uniform(18.0, 45.0)
         if ahead < network.lanes[ego_lane].length_m - 6.0:
-            found.append((ego_lane, ahead))
+            vehicles.append((ego_lane, ahead))
     for index, lane in enumerate(network.lanes):
         if lane.connector:
             continue
         least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
-        taken = [along for where, along in found if where == index]
-        taken += [ego_along_m] if index == ego_lane else []
+        occupied = [along for where, along in vehicles if where == index]
+        occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
         at = rng.uniform(6.0, 6.0 + mean)
         while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
-            if all(abs(at - other) > least for other in taken):
-                found.append((index, float(at)))
-                taken.append(float(at))
+            if all(abs(at - other) > least for other in occupied):
+                vehicles.append((index, float(at)))
+                occupied.append(float(at))
             at += least + rng.exponential(mean)
-    found = [place for place in found if not _blocked(network, *place, parked)]
-    found = _apart_at_joints(network, found, ego_lane, ego_along_m)
+    vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
+    vehicles = _apart_at_joints(network, vehicles, ego_lane, ego_along_m)
     here = network.lanes[ego_lane].curve
     ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
-    found.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
-    found = _apart_in_space(network, found, (ego_lane, ego_along_m))[: density.vehicles]
-    return Placement(tuple(lane for lane, _ in found), tuple(along for _, along in found))
+    vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
+    vehicles = _apart_in_space(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
+    return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
 def _apart_in_space(
-    network: RoadNetwork, found: list[tuple[int, float]], ego: tuple[int, float]
+    network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
 ) -> list[tuple[int, float]]:
     """Drops who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
     kept: list[tuple[float, float]] = []
     result = []
-    for place in [ego, *found]:
+    for place in [ego, *vehicles]:
         lane, along = network.lanes[place[0]], place[1]
         x, y = _point(network, *place)
         heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
@@ -249,17 +249,17 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
 
 
 def _apart_at_joints(
-    network: RoadNetwork, found: list[tuple[int, float]], ego_lane: int, ego_along_m: float
+    network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
 ) -> list[tuple[int, float]]:
     """Drops who stands too close behind the first vehicle of a following lane."""
     kept = []
     first: dict[int, float] = {}
-    for lane, along in [*found, (ego_lane, ego_along_m)]:
+    for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
         first[lane] = min(along, first.get(lane, np.inf))
     last: dict[int, float] = {ego_lane: ego_along_m}
-    for lane, along in found:
+    for lane, along in vehicles:
         last[lane] = max(along, last.get(lane, 0.0))
-    for lane, along in found:
+    for lane, along in vehicles:
         this = network.lanes[lane]
         least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
         after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
@@ -276,7 +276,7 @@ def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray,
     return curve.xy[min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)]
 
 
-def drawn_drivers(
+def draw_drivers(
     count: int, density: Density, rng: np.random.Generator, lanes: Sequence[Lane] | None = None
 ) -> Drivers:
     """Draws vehicles and drivers: hurried and patient, close and careful.
@@ -327,7 +327,7 @@ def driven_path(
     return lane_path(network, lanes, Sway.drawn(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
 
 
-def joined_drivers(first: Drivers, rest: Drivers) -> Drivers:
+def join_drivers(first: Drivers, rest: Drivers) -> Drivers:
     """One table of both."""
     return Drivers(
         **{name: np.concatenate([value, getattr(rest, name)]) for name, value in vars(first).items()}

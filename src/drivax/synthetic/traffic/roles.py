@@ -19,7 +19,7 @@ class Walker:
     """A pedestrian: walks along a curve and waits at kerbs.
 
     Attributes:
-        way: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
+        curve: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
         start_m: Position along the way when traffic begins, before the warm-up.
         speed_mps: Wanted speed.
         crossing: Index of the crossing that the way leads over, -1 none.
@@ -27,7 +27,7 @@ class Walker:
         size_m: Length, width, height.
     """
 
-    way: Curve
+    curve: Curve
     start_m: float
     speed_mps: float
     crossing: int = -1
@@ -62,7 +62,7 @@ class Scripted:
 
 
 @dataclass(frozen=True)
-class Cast:
+class Roles:
     """Everybody in a scenario; row 0 of ``paths`` and ``drivers`` is ego.
 
     Attributes:
