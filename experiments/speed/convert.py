@@ -25,11 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets.convert import Conversion, convert, convert_file
-from drivax.datasets.export.tfrecord import write_record
+from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.womd.messages import scenario_class
 from drivax.datasets.womd.scenario_reader import WomdScenario
-from drivax.datasets.womd.tfrecord import read_records
+from drivax.datasets.womd.tfrecord import read_records, write_record
 from drivax.evaluation.audit import audit
 from drivax.scenario.schema import record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter

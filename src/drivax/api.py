@@ -10,8 +10,8 @@ from typing import Any
 from drivax.curation.methods import Request
 from drivax.curation.methods import curate as curate_set
 from drivax.curation.scores import ScoreTable
-from drivax.datasets.convert import Conversion, Converted
-from drivax.datasets.convert import convert as convert_set
+from drivax.datasets.conversion import Conversion, Converted
+from drivax.datasets.conversion import convert as convert_set
 from drivax.errors import UsageError
 from drivax.evaluation import runner
 from drivax.evaluation.audit import audit, scenario_names

@@ -67,7 +67,8 @@ def missing_package(error: ImportError) -> UsageError | None:
     package = (error.name or "").split(".")[0]
     if package not in _EXTRAS:
         return None
-    return UsageError(f"{package} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
+    name = "protobuf" if package == "google" else package
+    return UsageError(f"{name} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
 
 
 def did_you_mean(

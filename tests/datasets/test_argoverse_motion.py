@@ -112,7 +112,7 @@ def test_check_list_3_sizes_are_those_of_the_class_and_flagged(recording):
 
 
 def test_the_ego_is_moved_from_its_rear_axle_to_its_middle(recording):
-    """And stands on the sloping road like everyone else: box centres half a height above it."""
+    """And stands on the sloping road like all agents: box centres half a height above it."""
     tracks, t = recording.tracks, np.arange(110)
     np.testing.assert_allclose(tracks.xy[4], place(4 + 1.34 + 0.8 * t, 1.75)[:, :2])
     on_map = tracks.xy[4, :, 0] - av2_motion.ORIGIN[0]
@@ -250,7 +250,7 @@ def test_missing_pyarrow_names_the_extra(sample, monkeypatch):
         return found(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", blocked)
-    with pytest.raises(UsageError, match=r"pip install 'drivax\[av2,maps\]'"):
+    with pytest.raises(UsageError, match=r"pip install 'drivax\[av2\]'"):
         list(READER.read(sample))
 
 

@@ -15,8 +15,12 @@ import pytest
 from datasets.samples import scenarionet as sample
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.scenarionet import pickles
-from drivax.datasets.scenarionet.edges import drivable_on_left, inside, outlines_on_left
-from drivax.datasets.scenarionet.map import third_column_is_heading
+from drivax.datasets.scenarionet.map import (
+    drivable_on_left,
+    inside,
+    outlines_on_left,
+    third_column_is_heading,
+)
 from drivax.datasets.scenarionet.reader import ScenarioNet, decode
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
@@ -99,7 +103,7 @@ def test_12_units_of_speed_limits(tree):
 
 
 @pytest.mark.parametrize("dataset", ["nuscenes", "nuplan", "av2"])
-def test_limits_that_nobody_measured_are_unknown(tree, dataset):
+def test_invented_limits_are_unknown(tree, dataset):
     tree["metadata"]["dataset"] = dataset
     recording = decode(tree)
     assert all(f.limit_mps is None for f in recording.features)

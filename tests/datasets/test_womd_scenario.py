@@ -119,7 +119,7 @@ def test_other_features(recording, wire):
 
 
 def test_10_lights_are_keyed_by_lane(recording, wire):
-    """Check-list 10: -1 where nobody observed; the place in the list of a step means nothing."""
+    """Check-list 10: -1 where unobserved; the place in the list of a step means nothing."""
     lights = {light.lane_id: light for light in recording.lights}
     assert set(lights) == {2, 4}
     assert lights[2].states.tolist() == [4] * 50 + [6] * 41

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from drivax.datasets.convert import Conversion, Converted, Plan, convert
+from drivax.datasets.conversion import Conversion, Converted, Plan, convert
 from drivax.datasets.estimate import counted
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
@@ -93,8 +93,8 @@ def run(args: Convert) -> int:
 
 
 def _announce(plan: Plan) -> None:
-    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.found.formats.items())]
-    unknown = len(plan.found.inputs) - plan.found.formats.total()
+    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
+    unknown = len(plan.data.inputs) - plan.data.formats.total()
     parts += [f"{counted(unknown, 'file')} of no known format"] if unknown else []
     print(f"found {', '.join(parts)}: {plan.estimate}", flush=True)
     if plan.written:

@@ -44,7 +44,7 @@ class Export:
 
 def run(args: Export) -> int:
     """Export, and say what the format had no room for."""
-    from drivax.datasets.export import subset as export
+    from drivax.datasets.export import writer as export
     from drivax.tracking.progress import Progress
 
     options = export.Export(

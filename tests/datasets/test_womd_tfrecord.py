@@ -122,7 +122,7 @@ def test_counts_by_lengths_alone(good, tmp_path, wire):
     assert count_records(path) == count_records(tmp_path / "none") == count_records(tmp_path) == 0
 
 
-def test_framing_is_told_by_the_first_header(good, tmp_path):
+def test_framing_is_detected_by_the_first_header(good, tmp_path):
     path = tmp_path / "some.tfrecord"
     path.write_bytes(good)
     assert looks_framed(path)

@@ -1,4 +1,4 @@
-"""SQLite files that nobody vouches for, read-only and bounded, and the layers of GeoPackages among them.
+"""Untrusted SQLite files, opened read-only with bounded queries, and the layers of GeoPackages.
 
 A GeoPackage is a SQLite file whose geometries are BLOBs: a header of 8 bytes, an optional envelope, then WKB (OGC
 12-128r19, clause 2.1.3). So sqlite3 and shapely read it; no GDAL is needed.
@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 
 Array = np.ndarray[Any, Any]
 
@@ -51,11 +52,7 @@ class Database:
         return int(self._left < 0)
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All rows of a query.
-
-        Raises:
-            DataError: The file is damaged, or lacks a table or column that the query names.
-        """
+        """All rows of a query."""
         self._left = 1_000_000 + _STEPS_PER_BYTE * self.path.stat().st_size
         try:
             return self._connection.execute(query, values).fetchall()
@@ -72,25 +69,17 @@ class Database:
         )
 
     def require(self, table: str, *columns: str) -> None:
-        """Check that a table has columns.
-
-        Raises:
-            DataError: It has not.
-        """
-        found = self.columns(table)
-        if not found:
+        """Check that a table has columns."""
+        present = self.columns(table)
+        if not present:
             raise DataError(f"has no table {table}", file=self.path, cure=_CURE)
-        if missing := [name for name in columns if name not in found]:
+        if missing := [name for name in columns if name not in present]:
             raise DataError(f"its table {table} has no column {missing[0]}", file=self.path, cure=_CURE)
 
 
 @contextlib.contextmanager
 def open_database(path: Path) -> Iterator[Database]:
-    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written beside it.
-
-    Raises:
-        DataError: It is missing or no SQLite file.
-    """
+    """A SQLite file, opened read-only and as immutable: no lock, no journal, nothing is written next to it."""
     try:
         with path.open("rb") as file:
             head = file.read(len(SQLITE_MAGIC))
@@ -142,23 +131,18 @@ class Layer:
 
 
 def read_layer(database: Database, name: str, columns: Sequence[str] = ()) -> Layer | None:
-    """The rows of a layer without their geometries; None where the GeoPackage has no such layer.
-
-    Raises:
-        DataError: The file is damaged.
-        UsageError: shapely is not installed, and a geometry has no envelope.
-    """
-    found = database.columns(name)
+    """The rows of a layer without their geometries; None where the GeoPackage has no such layer."""
+    present = database.columns(name)
     database.require("gpkg_geometry_columns", "table_name", "column_name", "srs_id")
     described = database.rows(
         "SELECT column_name, srs_id FROM gpkg_geometry_columns WHERE table_name = ?", (name,)
     )
-    if not found or not described:
+    if not present or not described:
         return None
     geometry, epsg = described[0]
-    if geometry not in found or not str(geometry).isidentifier():
+    if geometry not in present or not str(geometry).isidentifier():
         raise DataError(f"layer {name} has no geometry column", file=database.path, cure=_CURE)
-    kept = [column for column in columns if column in found]
+    kept = [column for column in columns if column in present]
     listed = ", ".join(["rowid", f"substr({geometry}, 1, {_HEAD_BYTES})", *(f'"{c}"' for c in kept)])
     rows = database.rows(f"SELECT {listed} FROM {name} ORDER BY rowid")
     fid = np.array([row[0] for row in rows], np.int64)
@@ -200,25 +184,17 @@ def _measure_bounds(database: Database, layer: Layer) -> None:
 
 
 def geometries(database: Database, layer: Layer, rows: Int64[np.ndarray, " row"]) -> Array:
-    """Geometries of some rows as an array of shapely objects; None where one cannot be read.
-
-    Raises:
-        DataError: The file is damaged.
-        UsageError: shapely is not installed.
-    """
-    try:
-        import shapely
-    except ImportError as error:
-        raise UsageError("GeoPackages need shapely", cure="pip install 'drivax[maps]'") from error
+    """Geometries of some rows as an array of shapely objects; None where one cannot be read."""
+    shapely = import_extra("shapely")
     if not len(rows):
         return np.zeros(0, dtype=object)
-    found: dict[int, bytes | None] = {}
+    blob_by_fid: dict[int, bytes | None] = {}
     for start in range(0, len(rows), _ROWS_AT_ONCE):
-        wanted = [int(fid) for fid in layer.fid[rows[start : start + _ROWS_AT_ONCE]]]
-        marks = ", ".join("?" * len(wanted))
+        fids = [int(fid) for fid in layer.fid[rows[start : start + _ROWS_AT_ONCE]]]
+        marks = ", ".join("?" * len(fids))
         query = f"SELECT rowid, {layer.geometry} FROM {layer.name} WHERE rowid IN ({marks})"
-        found.update((fid, _wkb(blob)) for fid, blob in database.rows(query, wanted))
-    blobs = np.array([None, *(found.get(int(fid)) for fid in layer.fid[rows])], dtype=object)[1:]
+        blob_by_fid.update((fid, _wkb(blob)) for fid, blob in database.rows(query, fids))
+    blobs = np.array([None, *(blob_by_fid.get(int(fid)) for fid in layer.fid[rows])], dtype=object)[1:]
     with np.errstate(invalid="ignore"):  # coordinates that are NaN
         try:
             return np.asarray(shapely.from_wkb(blobs, on_invalid="ignore"))

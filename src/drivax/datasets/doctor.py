@@ -16,11 +16,11 @@ from drivax.errors import DataError, DrivaxError
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import CAPACITIES
 
-#: So many files of a format are looked into; more are taken to be like them.
+#: Files of a format that are inspected; they stand for the others.
 _SAMPLE = 24
-#: So many damaged or unknown files are named.
+#: Damaged or unknown files that are named.
 _NAMED = 10
-#: So many notes are given on files of one kind.
+#: Notes given on files of one kind.
 _NOTES = 6
 _FLAVOURS = 3
 _SHARD = re.compile(r"(?P<prefix>.*)-(?P<number>\d{5})-of-(?P<total>\d{5})")
@@ -92,42 +92,42 @@ def diagnose(path: str | Path, format: str = AUTO) -> Diagnosis:
     try:
         if known is not None:
             raise known
-        found = survey(path, format)
+        data = survey(path, format)
     except DataError as error:
         return Diagnosis(path, problems=(BadRecord.of(error, path),))
-    parts, problems = _parts(found)
+    parts, problems = _parts(data)
     if not parts and path.is_dir() and (whole := unsupported.explain_folder(path)) is not None:
         problems.insert(0, BadRecord.of(whole, path))
-    expected = estimate(found, path, CAPACITIES["default"], STRIDE, None)
+    expected = estimate(data, path, CAPACITIES["default"], STRIDE, None)
     return Diagnosis(
         path=path,
         parts=parts,
-        files=found.formats,
-        input_bytes=input_bytes(found.inputs),
-        companions=found.companions,
-        ignored=found.ignored,
+        files=data.formats,
+        input_bytes=input_bytes(data.inputs),
+        companions=data.companions,
+        ignored=data.ignored,
         scenarios=expected.scenarios,
         set_bytes=expected.size_bytes,
         free_bytes=free_bytes(path),
-        shards=tuple(gaps([one.path for one in found.inputs])),
+        shards=tuple(gaps([entry.path for entry in data.inputs])),
         problems=tuple(problems),
         convertible=any(not part.description.missing for part in parts),
     )
 
 
-def _parts(found: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
+def _parts(data: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
     groups: defaultdict[tuple[str, str, str | None, bool], list[Description]] = defaultdict(list)
-    problems = [_unknown(one) for one in found.inputs if one.format is None][:_NAMED]
-    for name in sorted(found.formats):
-        files = [one.path for one in found.inputs if one.format == name]
+    problems = [_unknown(entry) for entry in data.inputs if entry.format is None][:_NAMED]
+    for name in sorted(data.formats):
+        files = [entry.path for entry in data.inputs if entry.format == name]
         step = -(-len(files) // _SAMPLE)
         for file in files[::step]:
             try:
-                one = reader_named(name).describe(file)
+                description = reader_named(name).describe(file)
             except DataError as error:
                 problems.append(BadRecord.of(error, file))
                 continue
-            groups[name, one.dataset, one.version, step == 1].append(one)
+            groups[name, description.dataset, description.version, step == 1].append(description)
     parts = tuple(
         Part(format, Description(dataset, _flavours(many), version, *_together(many)), len(many), whole)
         for (format, dataset, version, whole), many in groups.items()
@@ -136,52 +136,52 @@ def _parts(found: Survey) -> tuple[tuple[Part, ...], list[BadRecord]]:
 
 
 def _flavours(many: Sequence[Description]) -> str:
-    found = sorted({one.flavour for one in many})
-    more = f" and {len(found) - _FLAVOURS} more" if len(found) > _FLAVOURS else ""
-    return "; ".join(found[:_FLAVOURS]) + more
+    flavours = sorted({description.flavour for description in many})
+    more = f" and {len(flavours) - _FLAVOURS} more" if len(flavours) > _FLAVOURS else ""
+    return "; ".join(flavours[:_FLAVOURS]) + more
 
 
 def _together(many: Sequence[Description]) -> tuple[int | None, tuple[str, ...], tuple[str, ...]]:
-    counts = [one.recordings for one in many if one.recordings is not None]
-    missing = dict.fromkeys(name for one in many for name in one.missing)
+    counts = [description.recordings for description in many if description.recordings is not None]
+    missing = dict.fromkeys(name for description in many for name in description.missing)
     return sum(counts) if len(counts) == len(many) else None, tuple(_notes(many)), tuple(missing)
 
 
 def _notes(many: Sequence[Description]) -> Iterator[str]:
     """The notes that most files share, with how many do where it is not all."""
-    counts = Counter(note for one in many for note in dict.fromkeys(one.notes))
+    counts = Counter(note for description in many for note in dict.fromkeys(description.notes))
     for note, times in counts.most_common(_NOTES):
         yield note if times == len(many) else f"{note} (in {times} of {len(many)} files)"
     if len(counts) > _NOTES:
         yield f"{len(counts) - _NOTES} more notes on single files; name one of them to see its own"
 
 
-def _unknown(one: Input) -> BadRecord:
+def _unknown(entry: Input) -> BadRecord:
     """What is wrong with a file that is called as those of a format are, and holds something else."""
     try:
-        detect(one.path)
+        detect(entry.path)
     except DrivaxError as error:
-        return BadRecord.of(error, one.path)
-    return BadRecord(one.path, None, "changed while it was looked at", "run drivax doctor again")
+        return BadRecord.of(error, entry.path)
+    return BadRecord(entry.path, None, "changed while it was looked at", "run drivax doctor again")
 
 
 def gaps(paths: Sequence[Path]) -> list[str]:
     """Which shards of numbered families (``NAME-00003-of-00150``) are not there, one sentence per family."""
     families: defaultdict[tuple[Path, str, int], set[int]] = defaultdict(set)
     for path in paths:
-        found = _SHARD.fullmatch(path.name)
-        if found:
-            families[path.parent, found["prefix"], int(found["total"])].add(int(found["number"]))
-    told = []
+        match = _SHARD.fullmatch(path.name)
+        if match:
+            families[path.parent, match["prefix"], int(match["total"])].add(int(match["number"]))
+    sentences = []
     for (_, prefix, total), numbers in sorted(families.items()):
         missing = sorted(set(range(total)) - numbers)
         if not missing:
-            told.append(f"{prefix}: all {total:,} shards")
+            sentences.append(f"{prefix}: all {total:,} shards")
             continue
         runs = _runs(missing)
         named = f", missing {', '.join(runs)}" if len(runs) <= 8 else ""
-        told.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{named}")
-    return told
+        sentences.append(f"{prefix}: {total - len(missing):,} of {total:,} shards{named}")
+    return sentences
 
 
 def _runs(numbers: Sequence[int]) -> list[str]:

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from drivax.cli import main
-from drivax.datasets.convert import Conversion, convert, convert_file
+from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.estimate import estimate
 from drivax.datasets.formats import survey
 from drivax.datasets.reader import BadRecord
@@ -202,9 +202,9 @@ def test_reading_and_assembling_never_import_jax(wire, write_records):
     path = write_records("x.tfrecord", wire.scenario(), wire.example())
     program = f"""
 import sys, pathlib
-import drivax.datasets.convert, drivax.scenario.build.assemble, drivax.scenario.store
+import drivax.datasets.conversion, drivax.scenario.build.assemble, drivax.scenario.store
 assert "google.protobuf" not in sys.modules and "google_crc32c" not in sys.modules
-from drivax.datasets.convert import Conversion, convert_file
+from drivax.datasets.conversion import Conversion, convert_file
 kinds = [type(item).__name__ for item in convert_file(pathlib.Path({str(path)!r}), Conversion())]
 assert kinds == ["Scenario", "BadRecord"], kinds
 assert "jax" not in sys.modules
@@ -261,7 +261,7 @@ def test_interrupt_leaves_nothing(wire, write_records, tmp_path):
     assert leftovers(tmp_path) == ["src"]
 
 
-# --- What is left out, and what is written beside the scenarios.
+# --- What is left out, and what is written next to the scenarios.
 
 
 def numbered(scenarios):
@@ -366,7 +366,7 @@ def test_plan_is_announced_before_the_work(thirty, tmp_path):
         thirty, tmp_path / "set", Conversion(limit=7), lambda *call: calls.append(call), None, plans.append
     )
     (plan,) = plans
-    assert plan.found.formats == {"womd-scenario": 3} and plan.written == 0
+    assert plan.data.formats == {"womd-scenario": 3} and plan.written == 0
     assert plan.estimate.scenarios == 7
     assert plan.estimate.size_bytes == 7 * record_dtype(CAPACITIES["default"]).itemsize
     assert plan.estimate.free_bytes > 0 and not plan.estimate.sampled
@@ -385,7 +385,7 @@ def test_many_files_are_sampled_and_scaled_by_size(wire, tmp_path, monkeypatch):
     assert estimate(found, tmp_path / "set", CAPACITIES["default"], 40, 10).scenarios == 10
 
 
-def test_a_disk_that_is_too_small_is_told_before_the_start(thirty, tmp_path, monkeypatch):
+def test_too_small_disk_is_reported_before_the_start(thirty, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000_000))
     with pytest.raises(
         DataError, match=r"set: the disk has 5\.0 MB left, the set needs about 1\d MB; make room"
@@ -401,7 +401,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_start(thirty, tmp_path, mon
 PROGRAM = """
 import os, sys, time
 from pathlib import Path
-from drivax.datasets.convert import Conversion, convert
+from drivax.datasets.conversion import Conversion, convert
 
 def audit(batch):
     return [{"distance_m": float(scenario.id[1:]), "batch": len(batch)} for scenario in batch]
@@ -551,7 +551,7 @@ def test_two_conversions_to_one_set_at_once_are_refused(thirty, tmp_path):
     assert len(ScenarioSet.open(tmp_path / "set")) == 27
 
 
-def test_a_worker_that_dies_is_told_in_one_line(thirty, tmp_path, program):
+def test_dead_worker_is_reported_in_one_line(thirty, tmp_path, program):
     process = program(thirty, tmp_path / "set", workers=2)
     while not list(tmp_path.glob(".set.partial/spool-*/*")):
         time.sleep(0.01)
@@ -571,7 +571,7 @@ def test_memory_of_workers(real_data, tmp_path):
         (tmp_path / "src" / f"{name}.tfrecord").write_bytes(record * 300)
     program = """
 import resource, sys
-from drivax.datasets.convert import Conversion, convert
+from drivax.datasets.conversion import Conversion, convert
 if __name__ == "__main__":
     convert(sys.argv[1], sys.argv[2], Conversion(workers=2))
     for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
@@ -658,16 +658,11 @@ def test_inspect_tables_fit_a_hundred_columns(folder, tmp_path, capsys):
     assert main(["inspect", str(tmp_path / "set")]) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 100
-    for words in (
-        "4 (recorded segments: 4",
-        "every checksum is right",
-        "LANE_GRAPH",
-        "b2",
-    ):
+    for words in ("4 (recorded segments: 4", "every checksum is right", "LANE_GRAPH", "b2"):
         assert words in out
 
 
-def test_inspect_notices_damage_unless_told_not_to_look(folder, tmp_path, capsys):
+def test_inspect_reports_damage_unless_the_check_is_off(folder, tmp_path, capsys):
     convert(folder, tmp_path / "set")
     shard = tmp_path / "set" / "shard-00000.npy"
     data = bytearray(shard.read_bytes())

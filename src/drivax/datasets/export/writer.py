@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drivax.datasets.export import gpudrive as export_gpudrive
-from drivax.datasets.export import tfrecord as export_tfrecord
 from drivax.datasets.export.gpudrive import gpudrive_scene
 from drivax.datasets.export.tfexample import PATHS, tf_example
+from drivax.datasets.womd.tfrecord import example, shard_name, write_record
 from drivax.errors import UsageError
-from drivax.files import PartialFolder, sync_and_close, write_json
+from drivax.files import PartialFolder, check_output, sync_and_close, write_json
 from drivax.scenario.select.selection import select_scenarios
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 
@@ -35,7 +35,7 @@ class Export:
         format: ``set`` (a scenario set again), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
         filters: Conditions that all must hold (``scenario.select.selection``).
         ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None for all.
-        limit: At most so many scenarios, the first of those selected.
+        limit: Write only the first of the selected scenarios; None: all.
         paths: Form of ``path_samples`` in tf.Examples, a name in ``export_tfexample.PATHS``.
         shard_size: Scenarios per TFRecord shard.
         overwrite: Replace an earlier export of the same kind; other folders are never replaced.
@@ -197,11 +197,11 @@ def _write_examples(work: _Work) -> _Written:
     size = work.options.shard_size
     shards = -(-len(work.rows) // size)
     for number in range(shards):
-        path = work.folder / export_tfrecord.shard_name(work.name, number, shards)
+        path = work.folder / shard_name(work.name, number, shards)
         with path.open("wb") as file:
             for row in work.rows[number * size : (number + 1) * size]:
                 features, missing = tf_example(work.opened[row], PATHS[work.options.paths])
-                export_tfrecord.write_record(file, export_tfrecord.example(features))
+                write_record(file, example(features))
                 lost.update(missing)
                 files.append(path.name)
                 work.tell(len(files))
@@ -248,5 +248,4 @@ def _refuse_existing(out: Path, options: Export) -> None:
         return
     if not (out / NOTE).is_file():
         raise UsageError("exists and is no export", file=out, cure="choose another name")
-    if not options.overwrite:
-        raise UsageError("exists already", file=out, cure="choose another name or pass --overwrite")
+    check_output(out, options.overwrite, folder=True)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 
@@ -41,15 +42,8 @@ def road_edges(areas: Sequence[Area], first_id: int) -> list[MapFeature]:
 
     Returns:
         One EDGE_BOUNDARY per ring, its first point repeated at the end.
-
-    Raises:
-        DataError: A coordinate is not finite, or no coordinate of a map.
-        UsageError: shapely is not installed.
     """
-    try:
-        import shapely
-    except ImportError as error:
-        raise UsageError("drivable areas need shapely", cure="pip install 'drivax[maps]'") from error
+    shapely = import_extra("shapely")
     rings = [ring for exterior, holes in areas for ring in (exterior, *holes)]
     if not all((np.abs(ring) < _FARTHEST_M).all() for ring in rings):  # NaN compares false
         raise DataError("a drivable area has a point that is nowhere", cure="download the map again")

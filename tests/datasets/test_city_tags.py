@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivax.datasets.places import PLACES, place_tags
+from drivax.datasets.parsing import PLACES, place_tags
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from drivax.datasets.places import PLACES, place_tags
         ("washington-dc", ["WDC", "washington-dc"]),
     ],
 )
-def test_one_name_per_city_and_the_own_word_beside_it(city, locations):
+def test_tags_hold_the_city_and_the_name_in_the_source(city, locations):
     for location in locations:
         assert place_tags(location) == {"place": city, "location": location}
 

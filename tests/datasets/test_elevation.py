@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivax.datasets import ground
-from drivax.datasets.ground import flatten, lift
+from drivax.datasets import elevation as ground
+from drivax.datasets.elevation import flatten, lift
 from drivax.scenario.recording import MapFeature, Tracks
 from drivax.scenario.schema import AgentKind, RoadKind
 

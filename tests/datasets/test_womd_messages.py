@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 
-from drivax.datasets.womd.message_tables import POINTS, STATES, read_one, read_table
+from drivax.datasets.womd.messages import POINTS, STATES, read_one, read_table
 from drivax.errors import DataError
 
 
@@ -69,8 +69,6 @@ def test_damage_is_refused(blob, wire):
 
 def test_usual_messages_never_reach_protobuf(wire, monkeypatch):
     """What makes it fast: states and points as WOMD writes them are read as records."""
-    monkeypatch.setattr(
-        "drivax.datasets.womd.message_tables.read_one", lambda *_: pytest.fail("read one by one")
-    )
+    monkeypatch.setattr("drivax.datasets.womd.messages.read_one", lambda *_: pytest.fail("read one by one"))
     states = [wire.state(1, 2, 3, 4, 5, 6, 7, 8, 9, valid=v) for v in (True, False, True)]
     assert read_table(states, STATES)[:, 9].tolist() == [1, 0, 1]

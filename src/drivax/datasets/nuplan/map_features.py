@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.datasets.areas import Area, road_edges
-from drivax.datasets.nuplan.geopackage import Database, geometries, open_database
 from drivax.datasets.nuplan.map import CURE, NUMBERS, City, Lane, feature_id, whole
-from drivax.errors import DataError, UsageError
+from drivax.datasets.nuplan.sqlite import Database, geometries, open_database
+from drivax.datasets.parsing import import_extra
+from drivax.datasets.road_edges import Area, road_edges
+from drivax.errors import DataError
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import RoadKind
 
@@ -38,16 +39,8 @@ _STOP_SIGN = 1
 def features_around(
     city: City, xy: Float64[np.ndarray, "point 2"]
 ) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
-    """Map features within ``MARGIN_M`` of the box of a drive, in the system of the logs, z = 0; and what was lost.
-
-    Raises:
-        DataError: The map is damaged.
-        UsageError: shapely or pyproj is not installed.
-    """
-    try:
-        import shapely
-    except ImportError as error:
-        raise UsageError("nuPlan maps need shapely", cure="pip install 'drivax[maps]'") from error
+    """Map features within ``MARGIN_M`` of the box of a drive, in the system of the logs, z = 0; and what was lost."""
+    shapely = import_extra("shapely")
     try:
         with open_database(city.path) as database:
             around = _Around(city, database, (*xy.min(axis=0), *xy.max(axis=0)))
@@ -106,15 +99,15 @@ class _Around:
             return np.zeros(0, dtype=object)
         layer = self.city.layers[name]
         with np.errstate(invalid="ignore"):  # coordinates that are NaN
-            found = shapely.force_2d(geometries(self._database, layer, rows))
-            xy, owner = shapely.get_coordinates(found, return_index=True)
+            shapes = shapely.force_2d(geometries(self._database, layer, rows))
+            xy, owner = shapely.get_coordinates(shapes, return_index=True)
         forward = _transformer(layer.epsg, self.city.epsg)
         xy = np.column_stack(forward.transform(xy[:, 0], xy[:, 1]))
         far = ~(np.abs(xy - self._middle) <= self._reach).all(axis=1)  # NaN compares false
-        bad = np.bincount(owner[far], minlength=len(found)) > 0
-        bad |= np.bincount(owner, minlength=len(found)) == 0
+        bad = np.bincount(owner[far], minlength=len(shapes)) > 0
+        bad |= np.bincount(owner, minlength=len(shapes)) == 0
         self._damaged.update((name, int(row)) for row in rows[bad])
-        kept = np.asarray(found).copy()
+        kept = np.asarray(shapes).copy()
         kept[bad] = None
         shapely.set_coordinates(kept, xy[~bad[owner]])
         return kept
@@ -122,23 +115,14 @@ class _Around:
 
 @functools.lru_cache(maxsize=8)
 def _transformer(source: int, target: int) -> Any:
-    """Projection between two EPSG systems, x (east) first.
-
-    Raises:
-        DataError: One is unknown, or the target is not in metres.
-        UsageError: pyproj is not installed.
-    """
-    try:
-        import pyproj
-        from pyproj.exceptions import ProjError
-    except ImportError as error:
-        raise UsageError("nuPlan maps need pyproj", cure="pip install 'drivax[maps]'") from error
+    """Projection between two EPSG systems, x (east) first."""
+    pyproj = import_extra("pyproj")
     try:
         systems = pyproj.CRS.from_epsg(source), pyproj.CRS.from_epsg(target)
         if not systems[1].is_projected:
             raise DataError(f"EPSG:{target} is no projected coordinate system", cure=CURE)
         return pyproj.Transformer.from_crs(*systems, always_xy=True)
-    except ProjError as error:
+    except pyproj.exceptions.ProjError as error:
         raise DataError(
             f"a coordinate system (EPSG:{source}, EPSG:{target}) is unknown", cure=CURE
         ) from error

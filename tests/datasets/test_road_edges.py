@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivax.datasets.areas import GAP_M, road_edges
+from drivax.datasets.road_edges import GAP_M, road_edges
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import RoadKind
 
@@ -42,7 +42,7 @@ def drivable(areas, xy) -> np.ndarray:
 
 
 def assert_sides(areas, edges, off_m=0.5, rng=None):
-    """Left of every edge is drivable, right of it is not: random points beside every edge."""
+    """Left of every edge is drivable, right of it is not: random points next to every edge."""
     rng = rng or np.random.default_rng(1)
     for edge in edges:
         a, b = edge.points[:-1, :2], edge.points[1:, :2]
@@ -181,7 +181,7 @@ def test_random_stars_have_their_edges_on_the_right_side(seed):
     found = np.zeros(len(xy), int)
     for edge in edges:
         found += np.where(inside(edge.points, xy), 1 if turning(edge) > 0 else -1, 0)
-    # Notches narrower than a gap are filled: beside the edges of the input the answer is free.
+    # Notches narrower than a gap are filled: next to the edges of the input the answer is free.
     rings = [ring for exterior, holes in areas for ring in (exterior, *holes)]
     closed = [np.concatenate((ring, ring[:1])) for ring in rings]
     near = (

@@ -1,4 +1,4 @@
-"""The way back from a stored scenario: what it keeps exactly, what it keeps within tolerance, what it makes anew."""
+"""From a stored scenario back to a recording: fields kept exactly, kept within tolerance, or recomputed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from datasets.samples import gpudrive as sample
-from drivax.datasets.export.restore import restore
+from drivax.datasets.export.recording import restore
 from drivax.datasets.gpudrive import GpuDrive
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
@@ -87,7 +87,7 @@ def test_map_comes_back_within_the_tolerance_of_storage(scene):
     signs = [feature for feature in back.features if feature.kind == RoadKind.STOP_SIGN]
     (sign,) = signs
     np.testing.assert_allclose(sign.points[0, :2], (sample.X0 + 20.0, sample.Y0 - 3.0), atol=1e-5)
-    np.testing.assert_allclose(sign.points[0, 2], sample.Z0, atol=1e-5)  # of the map beside it
+    np.testing.assert_allclose(sign.points[0, 2], sample.Z0, atol=1e-5)  # of the map next to it
     ids = [feature.feature_id for feature in back.features]
     assert len(set(ids)) == len(ids) and {1, 2, 5, 7, 8, 9, 11, 12, 13} < set(ids)
 

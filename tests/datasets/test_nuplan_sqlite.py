@@ -13,7 +13,7 @@ import pytest
 import shapely
 
 from datasets.samples import nuplan as sample
-from drivax.datasets.nuplan.geopackage import geometries, open_database, read_layer
+from drivax.datasets.nuplan.sqlite import geometries, open_database, read_layer
 from drivax.errors import DataError
 
 SHAPES = (
@@ -121,7 +121,7 @@ def test_what_is_no_geometry_is_none_and_lies_nowhere(tmp_path, name):
 
 
 @pytest.mark.parametrize("envelope", [True, False])
-def test_coordinates_that_are_no_numbers_warn_nobody(tmp_path, envelope):
+def test_nan_coordinates_raise_no_warning(tmp_path, envelope):
     """A signalling NaN (its quiet bit is 0) makes the processor raise a flag that numpy would report."""
     body = b"\x01\x02\0\0\0\x02\0\0\0" + struct.pack("<Q", 0x7FF0000000000001) + struct.pack("<3d", 1, 2, 3)
 
@@ -182,7 +182,7 @@ def test_huge_cells_are_refused_before_they_are_read(tmp_path):
         database.rows("SELECT zeroblob(1000000000)")
 
 
-def test_nothing_is_written_beside_the_file(tmp_path):
+def test_nothing_is_written_next_to_the_file(tmp_path):
     path = package(tmp_path / "map.gpkg")
     execute(path, "PRAGMA journal_mode = WAL")
     before = path.read_bytes()

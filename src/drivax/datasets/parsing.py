@@ -1,24 +1,65 @@
-"""What readers share: lights by lane, checks, time bases, places and spacing of what was measured, JSON files."""
+"""Parsing that readers share: imports of extras, checks, time bases, lights by lane, city names, JSON files."""
 
 from __future__ import annotations
 
+import importlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from drivax.errors import DataError
+from drivax.errors import DataError, missing_package
 from drivax.scenario.arrays import differentiate as differentiate
 from drivax.scenario.recording import STRIDE, Light, MapFeature
 from drivax.scenario.schema import POLYGON_KINDS, STEPS, LightState, RoadKind
+
+#: Cities (the tag ``place``) and how data sets call them or their parts: nuScenes and nuPlan by the names of their
+#: maps, Argoverse 2 by name or by the code in the names of its sensor maps.
+PLACES: Mapping[str, tuple[str, ...]] = {
+    "austin": ("atx",),
+    "boston": ("boston-seaport", "us-ma-boston"),
+    "dearborn": ("dtw",),
+    "las-vegas": ("us-nv-las-vegas-strip",),
+    "miami": ("mia",),
+    "palo-alto": ("pao",),
+    "pittsburgh": ("pit", "us-pa-pittsburgh-hazelwood"),
+    "singapore": ("sg-one-north", "singapore-hollandvillage", "singapore-onenorth", "singapore-queenstown"),
+    "washington-dc": ("wdc",),
+}
+_CITY_OF = {name: city for city, names in PLACES.items() for name in (city, *names)}
+_LONGEST = 64
+
+
+def place_tags(location: str | None) -> dict[str, str]:
+    """The tags ``place`` (the city) and ``location`` (the source's own word, which may name a part of the city).
+
+    Args:
+        location: What the source calls the place; None or empty where it does not tell, which gives no tag.
+
+    Returns:
+        ``location`` alone where the city is not known: ``place`` never holds the private word of one data set.
+    """
+    if not location:
+        return {}
+    city = _CITY_OF.get(location.lower().replace("_", "-"))
+    return ({} if city is None else {"place": city}) | {"location": location[:_LONGEST]}
+
 
 #: Metres per second in a mile per hour.
 MPS_PER_MPH = 0.44704
 _UNOBSERVED, _UNKNOWN = int(LightState.UNOBSERVED), int(LightState.UNKNOWN)
 _LAST_STATE = int(max(LightState))
+
+
+def import_extra(package: str) -> Any:
+    """Return a package that an extra installs."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise missing_package(error) or error from error
 
 
 class Lights:
@@ -31,14 +72,14 @@ class Lights:
     def __init__(self, steps: int) -> None:
         self._steps = steps
         # Lists of plain numbers: a scenario has a thousand observations, and arrays are slow one by one.
-        self._found: dict[int, tuple[tuple[float, ...], list[int]]] = {}
+        self._lights: dict[int, tuple[tuple[float, ...], list[int]]] = {}
 
     def observe(self, step: int, lane: int, state: int, stop_point: Sequence[float]) -> None:
         """Note one observation. Of several for one lane and step the first that is not UNKNOWN counts."""
-        found = self._found.get(lane)
-        if found is None:
-            found = self._found[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
-        states = found[1]
+        light = self._lights.get(lane)
+        if light is None:
+            light = self._lights[lane] = tuple(stop_point), [_UNOBSERVED] * self._steps
+        states = light[1]
         if states[step] <= _UNKNOWN:
             states[step] = state if _UNKNOWN <= state <= _LAST_STATE else _UNKNOWN
 
@@ -46,16 +87,12 @@ class Lights:
         """The lights in order of first observation."""
         return tuple(
             Light(lane, np.array(point, np.float64), np.array(states, np.int8))
-            for lane, (point, states) in self._found.items()
+            for lane, (point, states) in self._lights.items()
         )
 
 
 def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
-    """Row numbers as ints.
-
-    Raises:
-        DataError: One is not a row of ``count`` tracks.
-    """
+    """Row numbers as ints."""
     for row in rows:
         if not 0 <= row < count:
             raise DataError(f"{what} names track {row}, there are {count}", cure="skip this record")
@@ -63,11 +100,7 @@ def rows_within(rows: Sequence[int], count: int, what: str) -> tuple[int, ...]:
 
 
 def check_finite(*measured: np.ndarray[Any, Any]) -> None:
-    """Refuse NaN and infinities among what is marked valid.
-
-    Raises:
-        DataError: There are some.
-    """
+    """Refuse NaN and infinities among what is marked valid."""
     if not all(np.isfinite(values).all() for values in measured):
         raise DataError("valid states hold numbers that are not finite", cure="skip this record")
 
@@ -100,11 +133,7 @@ def spacing_m(features: Sequence[MapFeature]) -> float | None:
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        DataError: It is missing or no JSON.
-    """
+    """The content of a JSON file."""
     try:
         return json.loads(path.read_bytes())
     except FileNotFoundError as error:
@@ -114,11 +143,11 @@ def load_json(path: Path) -> Any:
 
 
 def windows_of(steps: int) -> int:
-    """How many scenarios a recording of so many steps becomes (``scenario.recording.windows``)."""
+    """Number of scenarios that a recording of ``steps`` steps becomes (``scenario.recording.windows``)."""
     return 1 if steps <= STEPS else (steps - STEPS) // STRIDE + 1
 
 
-def counted(**counts: int) -> dict[str, int]:
+def nonzero(**counts: int) -> dict[str, int]:
     """Counts by name for ``Recording.lost``; only what is not zero."""
     return {name: int(count) for name, count in counts.items() if count}
 
@@ -129,10 +158,6 @@ def one_point_features(features: Sequence[MapFeature]) -> int:
 
 
 def check_within(most: float, *measured: np.ndarray[Any, Any]) -> None:
-    """Refuse numbers that nothing on a road has: NaN, infinities, and what is further from 0 than ``most``.
-
-    Raises:
-        DataError: There are some.
-    """
+    """Refuse numbers that nothing on a road has: NaN, infinities, and what is further from 0 than ``most``."""
     if not all((np.abs(values) <= most).all() for values in measured):  # NaN compares false
         raise DataError(f"holds numbers that are not finite or beyond {most:g}", cure="skip this record")
