@@ -1,8 +1,8 @@
 """The fixed splits of the built-in world that tables quote, together with the world's version.
 
 A map is drawn from (seed, number of the map), so sets of different seeds share no map. Each split has a seed of its
-own, from a range that ``generate`` refuses to users: nobody trains on a benchmark's maps by accident. Both domains
-have the same seeds, since the same draws make other roads there.
+own, from a range that ``generate`` refuses to users: training on a benchmark's maps by accident is impossible. Both
+domains have the same seeds, since the same draws make other roads there.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def generate_benchmark(
     progress: Progress | None = None,
     audit: Audit | None = None,
 ) -> dict[str, GeneratedSet]:
-    """Writes ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
+    """Write ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
 
     Args:
         out: A folder.

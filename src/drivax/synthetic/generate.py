@@ -35,8 +35,8 @@ _FEATURES = "NPY_DISABLE_CPU_FEATURES"
 
 @contextmanager
 def portable_workers() -> Iterator[None]:
-    """Processes that are started within compute alike on any x86-64 processor; this one is as it was."""
-    # What this process was told to leave alone it does not have any more, but they would.
+    """Start worker processes within that compute the same bits on any x86-64 processor."""
+    # Features disabled in this process are missing here, but workers would use them.
     disabled = os.environ.get(_FEATURES, "").split()
     newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
     settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
@@ -54,7 +54,7 @@ def portable_workers() -> Iterator[None]:
 
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
-#: Chunks per worker that may wait to be written: so many keep workers busy while the audit is compiled.
+#: Finished chunks per worker that may wait: enough to keep workers busy while the audit compiles.
 _AHEAD = 12
 _EVENT = "event"
 
@@ -85,7 +85,7 @@ class Generation:
     world: WorldConfig = field(default_factory=WorldConfig)
 
     def check(self) -> None:
-        """Refuses options that cannot be meant.
+        """Check the options.
 
         Raises:
             UsageError: The first of them.
@@ -101,12 +101,12 @@ class Generation:
 
 @dataclass(frozen=True)
 class FamilyCount:
-    """How the draws of one family went.
+    """Counts of one road family.
 
     Attributes:
         kept: Scenarios.
         rejected: Draws that were thrown away because of what ego or others did, by cause.
-        unsuited: Draws that gave no occasion for the event that was wanted.
+        unsuited: Draws in which the requested event could not happen.
         events: How many of the scenarios have which labelled event.
     """
 
@@ -176,7 +176,7 @@ def generate(
     progress: Progress | None = None,
     audit: Audit | None = None,
 ) -> GeneratedSet:
-    """Generates a scenario set.
+    """Generate a scenario set.
 
     Args:
         out: The scenario set to write; it appears when it is complete.

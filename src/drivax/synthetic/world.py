@@ -47,7 +47,7 @@ WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
-#: A recording of a critical moment begins so early or so much later, and at one of every so many steps.
+#: Candidate first steps of a critical recording: earliest, latest delay, stride.
 _EARLIEST, _LATER, _EVERY = 28, 16, 4
 #: Ego may act on an event this many steps before it begins.
 _FORESEEN = 8
@@ -55,23 +55,23 @@ _FORESEEN = 8
 _LIGHTS_M = 95.0
 #: Draws before a scenario is given up, draws on one map, and draws before a kind of event is given up.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
-#: Causes that say nothing against anybody's driving: the event that was wanted cannot happen, or comes to nothing.
+#: Causes that are no driving violation: the requested event cannot happen, or has no effect.
 UNSUITED = ("no_occasion", "no_threat")
 #: Events that are tried with the same roles.
 _STAGINGS = 3
-#: Of the others, so many that come nearest to ego are recorded.
+#: Number of recorded users, nearest to ego first.
 _RECORDED = 76
 
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """What the world is like.
+    """Settings of the world.
 
     Attributes:
         domain: Name of the domain (``grid`` or ``ring``), a tag of every scenario.
         rare_rate: Share of scenarios in which a rare event is staged.
-        critical_share: Share of the others in which ego's way leads it where it has to give way, if the roads have
-            such a place; they are recorded from when on somebody comes, if somebody does.
+        critical_share: Share of the others in which ego's route leads where it must give way, if the roads allow it;
+            the recording begins when another user approaches.
         lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
         signal_timing: Shares of what the light does for ego: green on arrival, turning green, turning red.
         scenarios_per_map: How many scenarios, one after the other, take place on the same roads; they share a segment.
@@ -89,7 +89,7 @@ class WorldConfig:
     sensor: SensorConfig = field(default_factory=SensorConfig)
 
     def check(self) -> Domain:
-        """Refuses what cannot be meant; returns the domain.
+        """Check the settings and return the domain.
 
         Raises:
             UsageError: The first wrong setting.
@@ -117,7 +117,7 @@ class WorldConfig:
 
 @dataclass(frozen=True)
 class Generated:
-    """A recording and how it came about.
+    """A recording with its origin.
 
     Attributes:
         recording: The log.
@@ -133,7 +133,7 @@ class Generated:
 
 
 def generate_recording(seed: int, index: int, config: WorldConfig | None = None) -> Recording:
-    """The recording of this seed and index.
+    """Generate the recording of a seed and index.
 
     Args:
         seed: Seed of the set, not negative.
@@ -144,7 +144,7 @@ def generate_recording(seed: int, index: int, config: WorldConfig | None = None)
 
 
 def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
-    """Like :func:`generate_recording`, and tells the family and what was rejected.
+    """Generate a recording with its family and rejected attempts.
 
     Whether a scenario is rare, and the kind of its event, are drawn first, so that no kind is rarer because its draws
     fail more often. A rare scenario has roads of its own, and others where those give no occasion for its event.
@@ -218,7 +218,7 @@ class _Draw:
 
 
 def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
-    """One draw: the recording, or why it was thrown away."""
+    """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
     roles = assign_roles(
@@ -250,14 +250,14 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
 
 
 def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
-    """With the errors of a perception system, and the mask of what ego's sensors see."""
+    """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
     visible = sight(tracks, ego, config.sensor)
     return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=visible)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
-    """Where a recording begins in which ego has to give way, if there is such a step."""
+    """Draw the first step of a recording in which ego has to give way, if there is one."""
     network = traffic.roles.network
     if not conflicts_on(network, motion.paths[0]):
         return None
@@ -311,7 +311,7 @@ def _recorded(roles: Roles, motion: Motion, first: int, staged: Staged | None) -
 
 
 def _route(motion: Motion) -> tuple[int, ...]:
-    """The lanes that ego drove and would go on to, each once."""
+    """Return the lanes of ego's path, each once."""
     return tuple(dict.fromkeys(span.lane for span in motion.paths[0].spans))
 
 
@@ -320,7 +320,7 @@ def _track_id(user: int) -> int:
 
 
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
-    """Ego, the actors of an event and the nearest others; zeros where they were not."""
+    """Return tracks of ego, an event's actors and the nearest others; zeros where invalid."""
     valid = motion.valid
     apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
     nearest = np.where(valid, apart, np.inf).min(axis=1)

@@ -1,4 +1,4 @@
-"""The expert who drives ego: the same stack as everyone, driven smoothly, and judged before it is accepted."""
+"""The expert that drives ego: the traffic model with a smooth driver, replanned where its motion is rejected."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, random_lanes
 from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, Staging
 
-#: Experts that brake harder than this are not shown, m/s2: comfort (-4.05) in common driving, the end of the
+#: Experts that brake harder than this are rejected, m/s2: comfort (-4.05) in common driving, the end of the
 #: common law's range where an event leaves no choice.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
-#: What no plan for ego can mend, and what a plan hardly ever mends unless something is staged.
+#: Causes that no ego plan can fix, and a cause that a plan rarely fixes unless an event is staged.
 _HOPELESS, _STUCK = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
 
-#: Moves everyone: what is staged, and ego's plan.
+#: Runs traffic with a staging and ego's plan.
 TrafficRun = Callable[[Staging, EgoPlan | None], Motion]
 
 
 def draw_expert(rng: np.random.Generator) -> Drivers:
-    """Draws ego's car and its driver: never above the limit, and well inside the limits of comfort."""
+    """Draw ego's car and driver: below the speed limit and well within comfort limits."""
 
     def uniform(low: float, high: float) -> Float64[np.ndarray, " 1"]:
         return rng.uniform(low, high, size=1)
@@ -54,9 +54,9 @@ def draw_expert(rng: np.random.Generator) -> Drivers:
 def expert_lanes(
     network: RoadNetwork, lane: int, change_share: float, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], LaneChange | None]:
-    """Draws ego's lanes from the lane on which it begins, and sometimes a lane change on the third or fourth lane.
+    """Draw ego's lanes from its first lane on, and sometimes a lane change on the third or fourth lane.
 
-    The lane before the first one is part of the way, so that a route has room behind ego.
+    A predecessor of the first lane is included: a route needs room behind ego.
     """
     lanes = random_lanes(network, lane, rng)
     before = network.lanes[lane].predecessors
@@ -72,7 +72,7 @@ def expert_lanes(
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Lanes beside this one that are about as long and long enough to change to."""
+    """Adjacent lanes that are long enough to change to."""
     this = network.lanes[lane]
     neighbour = [other for other in (this.left, this.right) if other >= 0]
     return [] if this.connector or not 70.0 < this.length_m < 100.0 else neighbour
@@ -81,7 +81,7 @@ def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
 def expert_path(
     network: RoadNetwork, lanes: tuple[int, ...], change: LaneChange | None, rng: np.random.Generator
 ) -> Path:
-    """Ego's path: close to the centre of its lanes."""
+    """Return ego's path, close to the centres of its lanes."""
     return lane_path(network, lanes, Sway.drawn(rng, 0.12), change)
 
 
@@ -94,21 +94,21 @@ def drive_ego(
     aware_step: int = 0,
     unplanned: Motion | None = None,
 ) -> tuple[Motion, str]:
-    """Lets ego drive well: as the common driver if that is good enough, else as planned with knowledge of the others.
+    """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
-    Everybody reacts to a plan, so it is run, judged and made again where that spoils it.
+    Other agents react to a plan, so each plan is simulated and checked, and replaced where it fails.
 
     Args:
-        roles: Everybody.
+        roles: All users.
         times_s: Times of all steps, on the clock of the lights.
         staging: What is staged.
         first_step: Where the recording begins; from here on ego may be planned.
-        traffic_run: Moves everyone: :meth:`drivax.synthetic.traffic.simulation.Traffic.run`.
-        aware_step: Ego does not act on what is staged before this step, if it can be mastered from then on.
+        traffic_run: Runs the traffic: :meth:`drivax.synthetic.traffic.simulation.Traffic.run`.
+        aware_step: Ego reacts to the event from this step on, if that is early enough.
         unplanned: What ``traffic_run`` gives without a plan, where that is known.
 
     Returns:
-        What everybody did, and why it must not be shown (empty: it is good).
+        The motion, and the cause of its rejection (empty: accepted).
     """
     hardest, hopeless = HARDEST_MPS2, (*_HOPELESS, _STUCK)
     if is_staged(staging):
@@ -124,7 +124,7 @@ def drive_ego(
     violation = find(motion)
     if (not violation.cause and pleasant(motion)) or violation.cause in hopeless:
         return motion, violation.cause
-    # What is safe but rough is kept, unless a plan does better.
+    # A safe but uncomfortable motion is the fallback.
     rough = None if violation.cause else motion
     unreactive: frozenset[int] = frozenset()
     for begin in _beginnings(roles, motion, violation, first_step, aware_step):
@@ -142,9 +142,9 @@ def drive_ego(
 def _beginnings(
     roles: Roles, motion: Motion, violation: Violation, first_step: int, aware_step: int
 ) -> tuple[int, int, int]:
-    """Where the first, second and last plan begin: each earlier than the one before.
+    """Return the first steps of three plans, each earlier than the previous.
 
-    Who stood at a stop sign before things go wrong has stood: only the last plan begins before that.
+    Only the last plan may begin before ego's last stop at a stop sign.
     """
     late = max(first_step, aware_step)
     stood = last_stop(roles, motion, first_step)

@@ -1,4 +1,4 @@
-"""Ego's drive planned with knowledge of what everybody will do: the best of a few ways, each at its best speeds."""
+"""Plan ego's motion with knowledge of all future motion: the cheapest of a few paths at their best speeds."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from drivax.synthetic.traffic.lateral import located
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
-#: A drive keeps to the first of these bounds that it can keep to: acceleration (m/s2) and jerk (m/s3).
+#: Bounds in the order in which they are tried: acceleration (m/s2) and jerk (m/s3).
 _BOUNDS: tuple[tuple[tuple[float, float], float], ...] = (
     ((-3.4, 2.0), 2.6),
     ((-4.0, 2.3), 4.1),
     ((-5.9, 2.3), 25.0),
 )
-#: A plan along the path that costs less than this needs no other way.
+#: A plan along the path that costs less than this needs no alternatives.
 _CHEAP = 12.0
-#: What a way beside the path costs: any, per m aside, per second against traffic.
+#: Costs of leaving the path: constant, per m of offset, per second against traffic.
 _LEAVING, _ASIDE, _AGAINST = 8.0, 2.0, 6.0
-#: How much a light that is about to turn red, or a duty to give way, keeps ego from passing a line.
+#: Cost of passing a line when the light is about to turn red or ego must give way.
 _LATE = 30.0
-#: How much worse it is to be close to somebody on foot or on a bicycle.
+#: Factor on proximity costs for pedestrians and cyclists.
 _PEOPLE = 12.0
-#: Others are expected to go on like this after the last step, so that ego does not end in trouble.
+#: Steps by which the others' motion is extrapolated beyond the last one.
 _BEYOND_STEPS = 20
 #: Room left between ego and what it passes, m, and the lateral acceleration of the quintic step aside, m/s2: as
 #: liked, and when there is neither room nor time.
@@ -55,14 +55,14 @@ _TOLERANCE = 0.03
 
 @dataclass(frozen=True)
 class _Scene:
-    """What does not depend on the way, all from the first step of the plan on.
+    """Planning input that all candidate paths share, from the first step of the plan on.
 
     Attributes:
         path: Ego's path.
         pose, from_m: Where ego is now, and where on the path that is.
         speed, acceleration: Ego's now; the acceleration is that of the step before.
         size_m: Ego's size.
-        others, valid: Boxes of everybody else, and when they exist.
+        others, valid: Boxes of the other users, and when they exist.
         passed_m: How far along the way ego came at each step in the last run.
         lines: Stop lines ahead.
         people: Rows of ``others`` on foot or on a bicycle.
@@ -85,18 +85,18 @@ class _Scene:
 
     @property
     def reach_m(self) -> float:
-        """How far ego can come at most."""
+        """Largest distance that ego can travel, m."""
         top = max(self.speed, 1.05 * float(np.max(self.path.limit_mps)))
         return top * DT_S * self.others.shape[1] + 15.0
 
     def candidate(self, shift: Shift) -> CandidatePath:
-        """Ego's way with a shift."""
+        """Return ego's path with a lateral shift."""
         return shifted_path(self.path, self.roles.drivers, self.pose, (self.from_m, self.reach_m), shift)
 
 
 @dataclass(frozen=True)
 class _Option:
-    """A way, what is taken on it, the best speeds on it, and what all that costs."""
+    """A candidate path with its occupancy, best speeds and cost."""
 
     candidate: CandidatePath
     occupancy: Occupancy
@@ -111,14 +111,14 @@ def plan_ego(
     first_step: int,
     unreactive: frozenset[int] = frozenset(),
 ) -> EgoPlan:
-    """Plans ego's drive.
+    """Plan ego's motion.
 
     Args:
-        roles: Everybody.
-        motion: What they did in the last run; row 0 is ego's drive then.
+        roles: All users.
+        motion: Their motion in the last run; row 0 is ego.
         times_s: Times of the motion's steps, on the clock of the lights.
         first_step: Step from which ego drives as planned.
-        unreactive: Users who must not be expected to react: those that ran into ego in an earlier run.
+        unreactive: Users that are not expected to react: they hit ego in an earlier run.
     """
     scene = _scene(roles, motion, times_s, first_step, unreactive)
     candidate, drive = _best_candidate(scene)
@@ -173,7 +173,7 @@ def _scene(
 def _continued(
     motion: Motion, first_step: int
 ) -> tuple[Float64[np.ndarray, "user time 6"], Bool[np.ndarray, "user time"]]:
-    """Boxes of the others from a step on, and a while longer at constant velocity."""
+    """Boxes of the others from a step on, extrapolated at constant velocity."""
     box, valid = user_boxes(motion)[1:, first_step:], motion.valid[1:, first_step:]
     longer = np.repeat(box[:, -1:], _BEYOND_STEPS, axis=1)
     travelled = motion.speed[1:, -1:] * DT_S * np.arange(1, _BEYOND_STEPS + 1)
@@ -203,7 +203,7 @@ def _lines(
 
 
 def _best_candidate(scene: _Scene) -> tuple[CandidatePath, SpeedProfile]:
-    """The cheapest way that can be driven smoothly without touching anything, or what comes nearest to it."""
+    """Return the cheapest smooth collision-free candidate, else the one that violates its bounds least."""
     candidate = scene.candidate(Shift())
     conflicts = _conflicts(scene, candidate)
     options = [_option(scene, candidate, conflicts)]
@@ -223,7 +223,7 @@ def _best_candidate(scene: _Scene) -> tuple[CandidatePath, SpeedProfile]:
 
 
 def _conflicts(scene: _Scene, candidate: CandidatePath) -> Conflicts:
-    """Whom ego could meet on a way, without those who follow it and will react."""
+    """Return conflicts along a path, without vehicles that follow ego and will react."""
     conflicts = find_conflicts(candidate, scene.size_m, scene.others, scene.valid, scene.people)
     follows = np.zeros(len(scene.others), bool)
     order = np.lexsort((-conflicts.point, conflicts.step, conflicts.user))
@@ -253,7 +253,7 @@ def _option(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> _O
 
 
 def _occupancy(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> Occupancy:
-    """What is taken on a way by others, by lines that must not be passed, and by the end of the map."""
+    """Return the occupancy of a path by others, closed stop lines, and the end of the map."""
     shape = (scene.others.shape[1], len(candidate.xy))
     hard, near = np.zeros(shape, bool), np.zeros(shape)
     np.maximum.at(
@@ -272,7 +272,7 @@ def _occupancy(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) ->
 
 
 def _smooth(scene: _Scene, option: _Option) -> SpeedProfile:
-    """The option's drive, gentle if that is possible."""
+    """Smooth an option's speeds within the tightest feasible bounds."""
     at, speed = option.speeds.fine(scene.others.shape[1])
     speed[0] = scene.speed
     hard = option.occupancy.hard[1:]
@@ -297,7 +297,7 @@ def _smooth(scene: _Scene, option: _Option) -> SpeedProfile:
 
 
 def _passing_options(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> list[_Option]:
-    """Ways that pass what is in the way of a drive at liked speed; none when nothing is."""
+    """Return options that pass the first obstacle at the preferred speed; none without an obstacle."""
     hit = _first_hit(scene, candidate, conflicts)
     if hit is None:
         return []
@@ -319,7 +319,7 @@ def _passing_options(scene: _Scene, candidate: CandidatePath, conflicts: Conflic
 
 
 def _first_hit(scene: _Scene, candidate: CandidatePath, conflicts: Conflicts) -> tuple[int, int, int] | None:
-    """User, step and sample of the way of the first touch of a drive that heeds nobody."""
+    """Return user, step and path sample of the first collision of a drive that ignores all users."""
     at, speed, places = 0.0, scene.speed, []
     for _ in range(scene.others.shape[1]):
         places.append(at)
@@ -344,7 +344,7 @@ def _shift(
     room_m: float,
     step_mps2: float,
 ) -> Shift | None:
-    """How to pass a user on one side, and whoever stands close behind it."""
+    """Return the shift that passes a user, and standing users close behind it, on one side."""
     begin, end, edge = _extent(scene, candidate, hit, side)
     half_l, half_w = scene.size_m[0] / 2 + 1.0, scene.size_m[1] / 2
     seen = {hit[0]}
@@ -369,7 +369,7 @@ def _shift(
 
 
 def _stands(scene: _Scene, user: int) -> bool:
-    """Whether a user hardly moves while it is there."""
+    """Whether a user stays within half a metre."""
     xy = scene.others[user, scene.valid[user], :2]
     return bool(np.ptp(xy, axis=0).max() < 0.5)
 
@@ -377,7 +377,7 @@ def _stands(scene: _Scene, user: int) -> bool:
 def _extent(
     scene: _Scene, candidate: CandidatePath, hit: tuple[int, int, int], side: float
 ) -> tuple[float, float, float]:
-    """From where to where along the way a user is when it is met, and how far it reaches to one side of the path."""
+    """Return a user's longitudinal range and its lateral extent on one side of the path at the conflict."""
     user, step, point = hit
     box = scene.others[user, step]
     c, s = float(np.cos(candidate.heading[point])), float(np.sin(candidate.heading[point]))

@@ -1,4 +1,4 @@
-"""Which places of ego's way are taken at which time: by other road users, and by lights and rules at stop lines."""
+"""When ego's path is occupied by other users, and when lights and rules close its stop lines."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import LaneSpan, Path
 
-#: Kept free around ego: at its bumpers and at its sides, m; what is checked in the end is 0.1 m.
+#: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
 HARD_M = (0.35, 0.2)
-#: Liked free around ego, m; and where somebody is on foot or on a bicycle.
+#: Preferred margin, m, for vehicles and for pedestrians and cyclists.
 NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
-#: Every so many samples of the way are looked at first.
+#: Stride of the coarse pass over path samples.
 _STRIDE = 4
-#: Nobody likes to pass a light that turns red sooner than this, s.
+#: Ego avoids passing a light that turns red sooner than this, s.
 _LATE_YELLOW_S = 1.0
-#: Where ego has to give way, nobody who goes first may be nearer than this, s.
+#: Smallest time gap to users with priority where ego gives way, s.
 _YIELD_S = 2.0
 #: Where ego rests before a line, m from it.
 _SHORT_M = 0.5
@@ -29,7 +29,7 @@ _SHORT_M = 0.5
 
 @dataclass(frozen=True)
 class Conflicts:
-    """Where ego's box on its way would meet other users: one entry for each (user, step, sample of the way).
+    """Overlaps of ego's box along its path with other users, one entry per (user, step, path sample).
 
     Attributes:
         hard: True where they would touch, else they would only be close.
@@ -41,13 +41,13 @@ class Conflicts:
     hard: Bool[np.ndarray, " meeting"]
 
     def only(self, keep: Bool[np.ndarray, " meeting"]) -> Conflicts:
-        """Some of the meetings."""
+        """Return a subset."""
         return Conflicts(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
 
 
 @dataclass(frozen=True)
 class StopLine:
-    """A line that ego's centre may not pass for a while.
+    """A line that ego's centre must not pass at some steps.
 
     Attributes:
         base_m: Where it is, m ahead of ego along the path.
@@ -67,7 +67,7 @@ def find_conflicts(
     valid: Bool[np.ndarray, "user time"],
     people: Bool[np.ndarray, " user"],
 ) -> Conflicts:
-    """All meetings of ego's box along a way with the boxes of others.
+    """Find conflicts of ego's box along a path with other boxes.
 
     Args:
         candidate: Ego's way.
@@ -80,7 +80,7 @@ def find_conflicts(
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
     ego = candidate_boxes(candidate, size_m)
     moving = _box_conflicts(ego, others, valid & ~still[:, None], liked)
-    # Who never moves is looked at once.
+    # Static users are tested at one step only.
     once = _box_conflicts(ego, others[:, :1], still[:, None], liked)
     steps = others.shape[1]
     return Conflicts(
@@ -97,7 +97,7 @@ def _box_conflicts(
     valid: Bool[np.ndarray, "user time"],
     margin_m: Float64[np.ndarray, "user 2"],
 ) -> Conflicts:
-    """Meetings of boxes: first of circles around them at every fourth sample, then exactly."""
+    """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
     reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
     reach += _STRIDE * SPACING_M / 2
     user, step = np.nonzero(valid & _around(others, ego, reach))
@@ -117,7 +117,7 @@ def _box_conflicts(
 
 
 def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
-    """Boxes with this much more at each end and at each side."""
+    """Grow boxes at each end and each side."""
     size = box[:, 4:] + 2 * by_m
     return np.concatenate([box[:, :4], size], axis=1)
 
@@ -127,7 +127,7 @@ def _around(
     ego: Float64[np.ndarray, "point 6"],
     reach: Float64[np.ndarray, " user"],
 ) -> Bool[np.ndarray, "user time"]:
-    """Who is near the rectangle around the way at all."""
+    """Mask of users near the bounding rectangle of the path."""
     low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
     outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)
     return outside < reach[:, None]
@@ -141,7 +141,7 @@ def stop_lines(
     passed: Float64[np.ndarray, " time"],
     arrivals: dict[int, Bool[np.ndarray, " time"]],
 ) -> list[StopLine]:
-    """The stop lines ahead.
+    """Return the stop lines ahead.
 
     Args:
         network: The roads.
@@ -149,7 +149,7 @@ def stop_lines(
         ego_m: Where on it ego's centre is now, and half of ego's length.
         times_s: Times, on the clock of the lights.
         passed: Where on the path ego's centre was at these times in the last run: it tells when its turn came.
-        arrivals: For connectors, when somebody who goes first is on them or about to be.
+        arrivals: Per connector, when a user with priority is on it or about to be.
     """
     from_m, half_m = ego_m
     result = []

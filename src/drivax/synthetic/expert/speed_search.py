@@ -1,4 +1,4 @@
-"""The best speeds along a way by dynamic programming over place, speed and time.
+"""Speed search along a path by dynamic programming over position, speed and time.
 
 Steps of 0.5 s, speeds on a grid that holds the present speed, and a grid of places on which every step ends exactly:
 with speeds ``i dv`` a step covers ``(i + j) dv dt / 2``. One step is one gather over (acceleration, speed, place).
@@ -32,7 +32,7 @@ TOUCH = 1e5
 
 @dataclass(frozen=True)
 class Occupancy:
-    """What is taken on a way: at a step (axis 0) and at a distance from ego (axis 1, even spacing).
+    """Occupancy of a path by step (axis 0) and distance from ego (axis 1, even spacing).
 
     Attributes:
         spacing_m: Distance between places.
@@ -101,7 +101,7 @@ def search(
     limit_mps: Float64[np.ndarray, " place"],
     speed_mps: float,
 ) -> SpeedPlan:
-    """The cheapest speeds.
+    """Return the cheapest speeds.
 
     Args:
         occupancy: What is taken, from the present step on.
@@ -132,7 +132,7 @@ def search(
 
 
 def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Taken) -> SpeedPlan:
-    """Goes back from the cheapest end."""
+    """Trace back from the cheapest final state."""
     places = len(grid.place)
     state = int(np.argmin(layers[-1]))
     cost = float(layers[-1, state])
@@ -164,16 +164,16 @@ class _Taken:
         self._ahead = _free_ahead(occupancy)
         self._column = np.clip(np.rint(grid.place / occupancy.spacing_m).astype(int), 0, places - 1)
         pace = np.minimum(grid.speed[:, None] / 5.0, 2.0)
-        # Even who stands must not be touched.
+        # Contact costs at standstill, too.
         self._pace, self._following = pace + 0.02, (_CLOSE_BEHIND * _STEP_S) * np.minimum(pace, 1.0)
-        self._wanted = _HEADWAY_S * grid.speed[:, None] + 0.5
+        self._preferred_gap = _HEADWAY_S * grid.speed[:, None] + 0.5
 
     def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
         """Cost of all states around a step."""
         first = (step - COARSE // 2) * self._places
         around = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
         free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
-        close = np.maximum(1.0 - (free - 1.0) / self._wanted, 0.0) ** 2
+        close = np.maximum(1.0 - (free - 1.0) / self._preferred_gap, 0.0) ** 2
         return around * self._pace + close * self._following
 
     def touched(self, step: int, v: int, s: int) -> bool:

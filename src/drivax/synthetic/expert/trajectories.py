@@ -1,4 +1,4 @@
-"""Where ego may drive from now on: along its path, or shifted aside for a while to pass something in the way."""
+"""Candidate paths for ego: its own path, or a shifted one that passes an obstacle."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RETURN_M = 30.0
 
 @dataclass(frozen=True)
 class Shift:
-    """Aside and back by quintic steps.
+    """Lateral offset with quintic transitions.
 
     Attributes:
         aside_m: How far to the left (right where negative).
@@ -47,7 +47,7 @@ class CandidatePath:
 
     Attributes:
         xy, heading: Samples every ``SPACING_M``.
-        base_m: Where each sample is beside the path, m ahead of ego along the path.
+        base_m: Position of each sample along the original path, m ahead of ego.
         preferred_mps: The speed that the driver likes.
         limit_mps: The speed that bends allow at most.
     """
@@ -81,7 +81,7 @@ class CandidatePath:
 def shifted_path(
     path: Path, drivers: Drivers, pose: Pose, span_m: tuple[float, float], shift: Shift
 ) -> CandidatePath:
-    """A way that leaves the path and comes back.
+    """Return a path that leaves the original one and returns to it.
 
     Args:
         path: Ego's path.
@@ -119,7 +119,7 @@ def _with_speeds(
     base_m: tuple[float, Float64[np.ndarray, " point"]],
     shift: Shift,
 ) -> CandidatePath:
-    """Adds the speeds that limits and bends allow."""
+    """Add the speeds that limits and bends allow."""
     curvature = smoothed_curvature(curve, SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
@@ -135,7 +135,7 @@ def _with_speeds(
 def candidate_boxes(
     candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"], every: int = 1
 ) -> Float64[np.ndarray, "point 6"]:
-    """Ego's box at the samples of a way."""
+    """Return ego's box at the samples of a path."""
     heading = candidate.heading[::every]
     size = np.broadcast_to(size_m[:2], (len(heading), 2))
     return np.concatenate(
@@ -146,7 +146,7 @@ def candidate_boxes(
 def candidate_corners(
     candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, "corner 2"]:
-    """Corners of ego's box every metre of the part of a way that is not on the path."""
+    """Return corners of ego's box every metre where a candidate leaves the original path."""
     away = (candidate.base_m >= candidate.shift.begin_m - 2.0) & (
         candidate.base_m <= candidate.shift.end_m + 2.0
     )

@@ -1,4 +1,4 @@
-"""Why a scenario must not be shown: ego is no expert in it, or somebody does what nobody does."""
+"""Violations that reject a generated scenario: collisions, broken rules, harsh braking, leaving the road."""
 
 from __future__ import annotations
 
@@ -15,24 +15,23 @@ from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 
-#: Ego is tested for overlap with so much around it, m: its replay in float32, beside others who are recorded with
-#: noise, must not touch either.
+#: Margin around ego in overlap tests, m: covers replay in float32 and the noise of recorded tracks.
 EGO_SKIN_M = 0.1
 #: An ego that moves less than this shows nothing, m.
 _LEAST_M = 10.0
-#: A car stands below this, within so many metres before a stop line, in the last seconds before it passes.
+#: A stop at a line: below this speed, within this distance, this long before passing.
 _STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
 #: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.
 _WRONG_WAY_M = 2.0
-#: Further than this from the lanes of its way ego is beside it, m; the metric says 2.
-_BESIDE_M = 1.9
+#: Ego is off its route beyond this distance from the route's lanes, m; the metric uses 2.
+_OFF_ROUTE_M = 1.9
 #: Lanes of both directions that are as near as this, to each other, tell nothing, m.
 _DOUBT_M = 0.5
 
 
 @dataclass(frozen=True)
 class Violation:
-    """Why a scenario must not be shown.
+    """Why a scenario is rejected.
 
     Attributes:
         cause: A word for it, or empty.
@@ -46,7 +45,7 @@ class Violation:
 
 
 def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
-    """Everybody's boxes in the order of :mod:`drivax.geometry.boxes`."""
+    """Return all users' boxes in the layout of :mod:`drivax.geometry.boxes`."""
     size = np.broadcast_to(motion.size_m[:, None, :2], (*motion.heading.shape, 2))
     heading = motion.heading[..., None]
     return np.concatenate([motion.xy, np.cos(heading), np.sin(heading), size], axis=-1)
@@ -60,14 +59,14 @@ def find_violation(
     staging: Staging,
     hardest_mps2: float,
 ) -> Violation:
-    """Judges a motion from a step on.
+    """Find the first violation of a motion from a step on.
 
     Args:
-        roles: Everybody.
-        motion: What they did.
+        roles: All users.
+        motion: Their motion.
         times_s: Times of its steps, on the clock of the lights.
         first_step: Where the recording begins.
-        staging: What is staged: it excuses who acts in it.
+        staging: The staged event, which excuses driving against traffic.
         hardest_mps2: Ego must not brake harder than this.
     """
     now = slice(first_step, None)
@@ -100,7 +99,7 @@ def is_staged(staging: Staging) -> bool:
 
 
 def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
-    """Which pairs must not touch: people pass each other as they like, and who never moves was put there."""
+    """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
     person = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
     return (moves[:, None] | moves) & ~(person[:, None] & person)
@@ -111,7 +110,7 @@ def touching(
     valid: Bool[np.ndarray, "user time"],
     tested: Bool[np.ndarray, "user user"],
 ) -> Int64[np.ndarray, "user user"]:
-    """When pairs of users first overlap; row 0 (ego) is tested with a skin of 10 cm around it.
+    """Return when pairs of users first overlap; row 0 (ego) has a margin of 10 cm.
 
     Args:
         box: Boxes.
@@ -189,7 +188,7 @@ def _rules_broken(
     times_s: Float64[np.ndarray, " time"],
     first_step: int,
 ) -> str:
-    """Whether somebody runs a red light, or ego passes a stop sign without standing."""
+    """Return whether a vehicle runs a red light or ego a stop sign."""
     network, now = roles.network, slice(first_step, None)
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
     if network.signals is not None:
@@ -209,12 +208,12 @@ def _rules_broken(
                 return "ego_runs_red" if i == 0 else "other_runs_red"
             if stop and not _stood(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
-        if i == 0 and _passes_beside(network, path, motion.xy[0, now], front, heading, red_steps):
+        if i == 0 and _passes_red_off_route(network, path, motion.xy[0, now], front, heading, red_steps):
             return "ego_runs_red"
     return ""
 
 
-def _passes_beside(
+def _passes_red_off_route(
     network: RoadNetwork,
     path: Path,
     xy: Float64[np.ndarray, "time 2"],
@@ -222,22 +221,19 @@ def _passes_beside(
     heading: Float64[np.ndarray, " time"],
     red_steps: Bool[np.ndarray, "step lane"],
 ) -> bool:
-    """Whether ego goes around something over the line of a lane that is not its own and has red.
-
-    As the metric has it: beside the way the lights of other lanes count, too.
-    """
+    """Whether ego, off its route, passes the line of another lane at red, as the metric counts it."""
     own = {span.lane for span in path.spans}
     others = [k for k in np.flatnonzero(red_steps.any(axis=0)) if network.lanes[k].connector and k not in own]
     passed = [passes(network.lanes[k], front, heading) & red_steps[:, k] for k in others]
     if not np.any(passed):
         return False
     route_xy = np.concatenate([network.lanes[k].curve.xy for k in own])
-    off = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _BESIDE_M
+    off = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _OFF_ROUTE_M
     return bool((np.any(passed, axis=0) & off[1:]).any())
 
 
 def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
-    """When ego last stands before a stop sign that it then passes; the first step where it never does so."""
+    """Return the step of ego's last stop at a stop sign that it then passes, else the first step."""
     heading = motion.heading[0]
     front = motion.xy[0] + np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[0, 0] / 2
     result = first_step
