@@ -1,4 +1,4 @@
-"""Everyone's paths as arrays of one shape, so that one step of traffic is a few operations over all vehicles."""
+"""All paths as arrays of one shape: a traffic step is a few operations over all vehicles."""
 
 from __future__ import annotations
 

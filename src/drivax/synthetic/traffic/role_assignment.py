@@ -50,29 +50,28 @@ def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
         network: The roads.
         path: Ego's.
     """
-    lanes_found: set[int] = set()
+    result: set[int] = set()
     for before, span in pairwise((path.spans[0], *path.spans)):
         lane, previous = network.lanes[span.lane], network.lanes[before.lane]
         if span.lane in (previous.left, previous.right):
-            lanes_found.add(span.lane)
+            result.add(span.lane)
         if lane.control == Control.ALL_WAY_STOP:
-            lanes_found.update(np.flatnonzero(network.conflicts[span.lane]).tolist())
-        # Who has to wait for others comes when they let it.
-        lanes_found.update(rival for rival in lane.yields_to if not network.lanes[rival].yields_to)
-    return frozenset(lanes_found)
+            result.update(np.flatnonzero(network.conflicts[span.lane]).tolist())
+        result.update(rival for rival in lane.yields_to if not network.lanes[rival].yields_to)
+    return frozenset(result)
 
 
 def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
     """Lanes, and those from which they are reached within 160 m."""
-    lanes_found: set[int] = set()
+    result: set[int] = set()
     ahead = [(lane, 0.0) for lane in sorted(lanes)]
     while ahead:
         lane, away = ahead.pop()
-        if lane not in lanes_found and away < _BACK_M:
-            lanes_found.add(lane)
+        if lane not in result and away < _BACK_M:
+            result.add(lane)
             this = network.lanes[lane]
             ahead += [(before, away + this.length_m) for before in this.predecessors]
-    return frozenset(lanes_found)
+    return frozenset(result)
 
 
 #: Shares of what the light does for ego: green on arrival, turning green, turning red.
@@ -211,7 +210,7 @@ def _first_speeds(
     distance: Float64[np.ndarray, " vehicle"],
     rng: np.random.Generator,
 ) -> Float64[np.ndarray, " vehicle"]:
-    """Speeds from which everybody can still stop at the next stop line, whatever the light will do."""
+    """Draw speeds from which each vehicle can stop at the next stop line, whatever the light will do."""
     speeds = []
     for i, path in enumerate(paths):
         fastest = speed_profile(
