@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -9,10 +10,103 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.roads.network import Lane, RoadNetwork
+from drivax.synthetic.roads.curves import Pose
+from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
 from drivax.synthetic.traffic.roles import Scripted
+
+#: Who passes a double-parked car without leaving the road needs this width, m.
+_PASSAGE_M = 2.3
+#: Room that is left in a bay before and behind the car, m.
+_MANOEUVRE_M = 0.6
+#: Double-parked cars keep so far from the ends of lanes, m.
+_FROM_ENDS_M = 15.0
+
+
+def parked_cars(
+    network: RoadNetwork, share: float, double_share: float, rng: np.random.Generator, steps: int
+) -> tuple[Scripted, ...]:
+    """Draws which bays are taken, and whether somebody stands beside one.
+
+    Args:
+        network: The roads.
+        share: Share of bays that are taken.
+        double_share: Chance that somebody stands in the lane beside a bay, where others can pass: on a lane of the
+            same direction, on the oncoming lane, or because 2.3 m are left.
+        rng: Source of chance.
+        steps: Length of the result, time steps.
+    """
+    result = []
+    for bay in network.bays:
+        # Everything is drawn for every bay: a change of one share moves nobody else.
+        size = _size(rng, bay.length_m)
+        along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
+        turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
+        occupied = rng.random() < share
+        if occupied and size[0] < bay.length_m:
+            play = (bay.length_m - size[0]) / 2
+            pose = _moved(bay.pose, float(np.clip(along, -play, play)), float(np.clip(aside, -0.15, 0.15)))
+            pose = Pose(pose.x, pose.y, pose.heading + turn)
+            result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+    doubled, beside_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
+    for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
+        bay, size = network.bays[place], _size(rng, network.bays[place].length_m)
+        if _passable(network, bay, size[1], beside_m):
+            pose = _beside(network, bay, size[1], beside_m)
+            return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+    return tuple(result)
+
+
+def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
+    """A car or, in one case of eight, a van, that fits the bay."""
+    length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
+    van = rng.random() < 0.125 and room_m > 6.2
+    if van:
+        return min(length + 0.8, room_m - _MANOEUVRE_M), 2.0, 2.3
+    return min(length, room_m - _MANOEUVRE_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
+
+
+def _moved(pose: Pose, ahead_m: float, left_m: float) -> Pose:
+    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+    return Pose(pose.x + ahead_m * cos - left_m * sin, pose.y + ahead_m * sin + left_m * cos, pose.heading)
+
+
+def _beside(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
+    """In the lane beside the bay, as near to it as the lane's border allows."""
+    lane = network.lanes[bay.lane]
+    centre = _pose_at(lane, bay.along_m)
+    dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
+    side = math.copysign(1.0, dy * math.cos(centre.heading) - dx * math.sin(centre.heading))
+    return _moved(centre, 0.0, side * ((lane.width_m - width_m) / 2 - gap_m))
+
+
+def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
+    lane = network.lanes[bay.lane]
+    if lane.connector or not _FROM_ENDS_M < bay.along_m < lane.length_m - _FROM_ENDS_M:
+        return False
+    if lane.left >= 0 or lane.right >= 0 or lane.width_m - width_m - gap_m >= _PASSAGE_M:
+        return True
+    return _oncoming(network, lane, bay.along_m)
+
+
+def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
+    """Whether a lane of the other direction lies right beside this place."""
+    here = _pose_at(lane, along_m)
+    for other in network.lanes:
+        gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
+        place = int(np.argmin(gap))
+        apart = (lane.width_m + other.width_m) / 2 + 0.5
+        if gap[place] < apart and math.cos(other.curve.heading[place] - here.heading) < -0.9:
+            return True
+    return False
+
+
+def _pose_at(lane: Lane, along_m: float) -> Pose:
+    arc = lane.curve.arc_m
+    x, y = (float(np.interp(along_m, arc, lane.curve.xy[:, axis])) for axis in (0, 1))
+    return Pose(x, y, float(np.interp(along_m, arc, lane.curve.heading)))
+
 
 #: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time added per m/s.
 _GAP_M, _GAP_S = 5.0, 0.9
@@ -93,40 +187,40 @@ def placed(
         busy: Lanes that are as full as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
-    found: list[tuple[int, float]] = []
+    vehicles: list[tuple[int, float]] = []
     if rng.random() < density.leader_share:
         ahead = ego_along_m + rng.uniform(18.0, 45.0)
         if ahead < network.lanes[ego_lane].length_m - 6.0:
-            found.append((ego_lane, ahead))
+            vehicles.append((ego_lane, ahead))
     for index, lane in enumerate(network.lanes):
         if lane.connector:
             continue
         least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
-        taken = [along for where, along in found if where == index]
-        taken += [ego_along_m] if index == ego_lane else []
+        occupied = [along for where, along in vehicles if where == index]
+        occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
         at = rng.uniform(6.0, 6.0 + mean)
         while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
-            if all(abs(at - other) > least for other in taken):
-                found.append((index, float(at)))
-                taken.append(float(at))
+            if all(abs(at - other) > least for other in occupied):
+                vehicles.append((index, float(at)))
+                occupied.append(float(at))
             at += least + rng.exponential(mean)
-    found = [place for place in found if not _blocked(network, *place, parked)]
-    found = _apart_at_joints(network, found, ego_lane, ego_along_m)
+    vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
+    vehicles = _apart_at_joints(network, vehicles, ego_lane, ego_along_m)
     here = network.lanes[ego_lane].curve
     ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
-    found.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
-    found = _apart_in_space(network, found, (ego_lane, ego_along_m))[: density.vehicles]
-    return Placement(tuple(lane for lane, _ in found), tuple(along for _, along in found))
+    vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
+    vehicles = _apart_in_space(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
+    return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
 def _apart_in_space(
-    network: RoadNetwork, found: list[tuple[int, float]], ego: tuple[int, float]
+    network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
 ) -> list[tuple[int, float]]:
     """Drops who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
     kept: list[tuple[float, float]] = []
     result = []
-    for place in [ego, *found]:
+    for place in [ego, *vehicles]:
         lane, along = network.lanes[place[0]], place[1]
         x, y = _point(network, *place)
         heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
@@ -155,17 +249,17 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
 
 
 def _apart_at_joints(
-    network: RoadNetwork, found: list[tuple[int, float]], ego_lane: int, ego_along_m: float
+    network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
 ) -> list[tuple[int, float]]:
     """Drops who stands too close behind the first vehicle of a following lane."""
     kept = []
     first: dict[int, float] = {}
-    for lane, along in [*found, (ego_lane, ego_along_m)]:
+    for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
         first[lane] = min(along, first.get(lane, np.inf))
     last: dict[int, float] = {ego_lane: ego_along_m}
-    for lane, along in found:
+    for lane, along in vehicles:
         last[lane] = max(along, last.get(lane, 0.0))
-    for lane, along in found:
+    for lane, along in vehicles:
         this = network.lanes[lane]
         least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
         after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
@@ -182,7 +276,7 @@ def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray,
     return curve.xy[min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)]
 
 
-def drawn_drivers(
+def draw_drivers(
     count: int, density: Density, rng: np.random.Generator, lanes: Sequence[Lane] | None = None
 ) -> Drivers:
     """Draws vehicles and drivers: hurried and patient, close and careful.
@@ -233,7 +327,7 @@ def driven_path(
     return lane_path(network, lanes, Sway.drawn(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
 
 
-def joined_drivers(first: Drivers, rest: Drivers) -> Drivers:
+def join_drivers(first: Drivers, rest: Drivers) -> Drivers:
     """One table of both."""
     return Drivers(
         **{name: np.concatenate([value, getattr(rest, name)]) for name, value in vars(first).items()}
