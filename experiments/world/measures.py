@@ -11,7 +11,7 @@ from scipy.stats import beta
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.synthetic.expert.comfort import broken_limits
-from drivax.synthetic.sensing import NoiseConfig, farthest_m
+from drivax.synthetic.sensing import NoiseConfig, largest_shift_m
 
 Array = np.ndarray[Any, Any]
 
@@ -139,4 +139,4 @@ def against(wanted: float, successes: int, trials: int, comparisons: int) -> dic
 def largest_noise_m(scenario: Scenario, config: NoiseConfig) -> float:
     """How far perception noise can have moved a corner of any agent in a scenario, at most."""
     sizes = scenario.agent_size[1:][scenario.agent_valid[:, 1:].any(axis=0), :2]
-    return max((farthest_m(config, float(length), float(width)) for length, width in sizes), default=0.0)
+    return max((largest_shift_m(config, float(length), float(width)) for length, width in sizes), default=0.0)

@@ -115,7 +115,7 @@ def evaluate(
     Args:
         planner: Name, run folder of a training (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
         data: Folder of a scenario set, or scenarios from :func:`load`.
-        task: Action space and observation of a planner object.
+        task: Action space, observation and reward; a trained policy has its own.
         traffic: As for :func:`make_simulator`; it is prepared here.
         start: How episodes start: as logged by default, or ``simulator.starts.NoisyStart()``.
         sample: Whether a policy given by name samples its actions instead of taking the mode.
@@ -124,9 +124,7 @@ def evaluate(
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
-        if task is not None:
-            raise UsageError("a planner by name brings its own task", cure="leave out task=")
-        planner, task = find_planner(str(planner), loaded.bank, sample)
+        planner, task = find_planner(str(planner), loaded.bank, sample, task)
     elif sample:
         raise UsageError("only a policy by name can sample", cure="leave out sample=")
     return runner.evaluate(
@@ -140,18 +138,28 @@ def evaluate(
     )
 
 
-def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
+def find_planner(
+    name: str, bank: ScenarioBank, sample: bool = False, task: Task | None = None
+) -> tuple[Planner, Task]:
     """Return the planner of a name, run folder or zoo policy, and its task.
 
+    Args:
+        name: Name, ``module:name``, run folder (``RUN`` or ``RUN@STEP``) or ``zoo:NAME``.
+        bank: Scenarios of the evaluation; a policy's shapes follow from it.
+        sample: Whether a trained policy samples its actions.
+        task: Task of a named planner; None: the default task, with the planner's own action space.
+
     Raises:
-        UsageError: There is no such planner, folder or policy.
+        UsageError: There is no such planner, folder or policy, or a policy was given another task.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
-        return make_planner(name), Task()
+        return make_planner(name, task and task.actions), task or Task()
     folder, step = run_and_step(name)
     if not is_policy(folder):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
         raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
+    if task is not None:
+        raise UsageError(f"trained policy {name!r} has its own task", cure="leave out --task (task=)")
     return load_policy(folder, bank, step=step, samples=sample)
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.expert.driver import drawn_expert
+from drivax.synthetic.expert.driver import draw_expert
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Lane, Line, RoadNetwork
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion
+from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
 WIDTH, LENGTH, LIMIT = 3.5, 400.0, 14.0
 CAR = (4.6, 1.9, 1.5)
@@ -58,10 +58,10 @@ def user(xy, heading=0.0, size=CAR, kind=AgentKind.VEHICLE, velocity=(0.0, 0.0),
 
 
 def scene(network, speed, users=(), at=30.0, lanes=(0,)):
-    """Ego on a lane at constant speed among users who do not care: the cast and the motion."""
-    driver = replace(drawn_expert(np.random.default_rng(0)), size_m=np.array([CAR]))
+    """Ego on a lane at constant speed among users who do not care: the roles and the motion."""
+    driver = replace(draw_expert(np.random.default_rng(0)), size_m=np.array([CAR]))
     path = lane_path(network, lanes, Sway())
-    cast = Cast(network, [path], driver, np.array([at]), np.array([speed]), lanes)
+    roles = Roles(network, [path], driver, np.array([at]), np.array([speed]), lanes)
     distance = at + speed * TIMES
     grid = path.step_m * np.arange(len(path.curve.xy))
     xy = np.stack([np.interp(distance, grid, path.curve.xy[:, k]) for k in (0, 1)], axis=-1)
@@ -79,7 +79,7 @@ def scene(network, speed, users=(), at=30.0, lanes=(0,)):
         acceleration=np.zeros((1, len(TIMES))),
         paths=[path],
     )
-    return cast, motion
+    return roles, motion
 
 
 def driven(motion, plan: EgoPlan):

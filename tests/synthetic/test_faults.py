@@ -10,7 +10,7 @@ from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.violations import (
     against_traffic,
-    fault,
+    find_violation,
     goes_against_traffic,
     inside,
     last_stop,
@@ -33,8 +33,8 @@ from .staged_scenes import CAR, TIMES, WIDTH, crossed, road, scene, user
 PERSON = (0.6, 0.6, 1.75)
 
 
-def cause(cast, motion, staging=None, hardest=4.0, first_step=0):
-    return fault(cast, motion, TIMES, first_step, staging or Staging(), hardest).cause
+def cause(roles, motion, staging=None, hardest=4.0, first_step=0):
+    return find_violation(roles, motion, TIMES, first_step, staging or Staging(), hardest).cause
 
 
 def with_speed(motion, speed, at=30.0):
@@ -87,15 +87,15 @@ def test_touching_agrees_with_clipped_polygons():
 
 
 def test_a_box_that_cuts_the_kerb_leaves_the_road():
-    cast, motion = scene(road(), 12.0)
+    roles, motion = scene(road(), 12.0)
     box = user_boxes(motion)[0]
-    assert not leaves_road(cast.network, box)
+    assert not leaves_road(roles.network, box)
     # The kerb is 0.8 m beyond the lane's edge; the car is 1.9 m wide in a lane of 3.5 m.
     room = 0.8 + WIDTH / 2 - CAR[1] / 2
     for aside, out in ((room - 0.01, False), (room + 0.01, True)):
         moved = box.copy()
         moved[40:, 1] -= aside
-        assert leaves_road(cast.network, moved) == out
+        assert leaves_road(roles.network, moved) == out
 
 
 def test_a_line_is_passed_once_and_only_in_its_direction():
@@ -115,7 +115,7 @@ def test_running_red_means_red_before_and_after():
     line = path.spans[1].begin_m
     times = np.arange(0.0, network.signals.cycle_s, 0.1)
     colour = network.signals.colours(times, len(network.lanes))[0][:, way]
-    cast, motion = scene(network, 1.2, lanes=(first, way, *network.lanes[way].successors))
+    roles, motion = scene(network, 1.2, lanes=(first, way, *network.lanes[way].successors))
     seen = set()
     for step in range(0, len(times) - 92, 7):
         window = times[step : step + 91]
@@ -126,15 +126,15 @@ def test_running_red_means_red_before_and_after():
         heading = np.interp(at, grid, path.curve.heading)[None]
         moved = replace(motion, xy=xy, heading=heading, distance_m=at[None], paths=[path])
         red = colour[step + 45] == Colour.RED and colour[step + 46] == Colour.RED
-        found = fault(cast, moved, window, 0, Staging(), 4.0).cause
-        assert (found == "ego_runs_red") == red
+        violation = find_violation(roles, moved, window, 0, Staging(), 4.0).cause
+        assert (violation == "ego_runs_red") == red
         seen.add(red)
     assert seen == {True, False}
 
 
 def test_a_stop_sign_wants_standing():
-    cast, motion = scene(crossed(100.0, Control.STOP), 10.0, lanes=(0, 1, 2))
-    assert cause(cast, motion) == "ego_runs_stop_sign"
+    roles, motion = scene(crossed(100.0, Control.STOP), 10.0, lanes=(0, 1, 2))
+    assert cause(roles, motion) == "ego_runs_stop_sign"
     # Braking with 2 m/s2 from 10 m/s takes 25 m; the front begins at 32.3 m.
     rolling, standing = np.full(91, 10.0), np.full(91, 10.0)
     falling = 10.0 - 0.2 * np.arange(51)
@@ -144,44 +144,44 @@ def test_a_stop_sign_wants_standing():
     rolling[:] = np.maximum(standing, 0.8)
     at = 100.0 - 1.5 - CAR[0] / 2 - distance
     stopped = with_speed(motion, standing, at)
-    assert cause(cast, stopped) == ""
-    assert cause(cast, with_speed(motion, rolling, at - 4.0)) == "ego_runs_stop_sign"
-    assert last_stop(cast, stopped, 0) == 58  # 1.5 m/s2 reaches 0.5 m/s after three steps
-    assert last_stop(cast, motion, 7) == 7
+    assert cause(roles, stopped) == ""
+    assert cause(roles, with_speed(motion, rolling, at - 4.0)) == "ego_runs_stop_sign"
+    assert last_stop(roles, stopped, 0) == 58  # 1.5 m/s2 reaches 0.5 m/s after three steps
+    assert last_stop(roles, motion, 7) == 7
 
 
 def test_what_ego_must_not_do():
-    cast, motion = scene(road(), 12.0)
-    assert cause(cast, motion) == ""
-    assert cause(cast, with_speed(motion, np.full(91, 0.5))) == "ego_hardly_moves"
+    roles, motion = scene(road(), 12.0)
+    assert cause(roles, motion) == ""
+    assert cause(roles, with_speed(motion, np.full(91, 0.5))) == "ego_hardly_moves"
     gone = motion.valid.copy()
     gone[0, -1] = False
-    assert cause(cast, replace(motion, valid=gone)) == "ego_leaves_map"
+    assert cause(roles, replace(motion, valid=gone)) == "ego_leaves_map"
     braking = np.maximum(12.0 - 0.5 * np.arange(91), 0.0)
-    assert cause(cast, with_speed(motion, braking)) == "ego_brakes_hard"
-    assert cause(cast, with_speed(motion, braking), hardest=5.0) == ""
+    assert cause(roles, with_speed(motion, braking)) == "ego_brakes_hard"
+    assert cause(roles, with_speed(motion, braking), hardest=5.0) == ""
     opposite = replace(motion, xy=motion.xy + np.array([0.0, 2 * WIDTH]))
-    assert cause(cast, opposite) == "ego_wrong_way"
-    assert cause(cast, replace(motion, xy=motion.xy - np.array([0.0, 4.0]))) == "ego_leaves_road"
+    assert cause(roles, opposite) == "ego_wrong_way"
+    assert cause(roles, replace(motion, xy=motion.xy - np.array([0.0, 4.0]))) == "ego_leaves_road"
 
 
 def test_collisions_of_ego_and_of_others():
     lane_left = [user((60.0, WIDTH)), user((40.0, WIDTH), velocity=(5.0, 0.0))]
-    cast, motion = scene(road(), 12.0, lane_left)
-    assert cause(cast, motion) == "others_collide"
-    cast, motion = scene(road(), 12.0, [user((60.0, WIDTH)), user((62.0, WIDTH))])
-    assert cause(cast, motion) == ""  # both were put there and never move
+    roles, motion = scene(road(), 12.0, lane_left)
+    assert cause(roles, motion) == "others_collide"
+    roles, motion = scene(road(), 12.0, [user((60.0, WIDTH)), user((62.0, WIDTH))])
+    assert cause(roles, motion) == ""  # both were put there and never move
     people = [
         user((60.0, WIDTH), size=PERSON, kind=AgentKind.PEDESTRIAN, velocity=(1.0, 0.0)),
         user((61.0, WIDTH), size=PERSON, kind=AgentKind.PEDESTRIAN),
     ]
-    cast, motion = scene(road(), 12.0, people)
-    assert cause(cast, motion) == ""
-    cast, motion = scene(road(), 12.0, [user((80.0, 0.0))])
-    found = fault(cast, motion, TIMES, 0, Staging(), 4.0)
-    assert (found.cause, found.users) == ("ego_collides", (1,))
+    roles, motion = scene(road(), 12.0, people)
+    assert cause(roles, motion) == ""
+    roles, motion = scene(road(), 12.0, [user((80.0, 0.0))])
+    violation = find_violation(roles, motion, TIMES, 0, Staging(), 4.0)
+    assert (violation.cause, violation.users) == ("ego_collides", (1,))
     # Bumpers meet when 30 + 2.3 + 0.1 + 12 t > 80 - 2.3: during the 38th step.
-    assert found.step == int(np.ceil((80.0 - 4.6 - 0.1 - 30.0) / 1.2))
+    assert violation.step == int(np.ceil((80.0 - 4.6 - 0.1 - 30.0) / 1.2))
 
 
 def test_wrong_way_is_more_than_two_metres_in_a_second():
@@ -202,10 +202,10 @@ def test_lights_of_one_lane_do_not_hold_for_another():
         crossed(100.0, Control.SIGNAL),
         signals=SignalPlan((LightGroup((1,), False),), ((0,),), (5.0,), offset_s=-40.0),
     )
-    cast, motion = scene(network, 10.0, lanes=(0, 1, 2))
+    roles, motion = scene(network, 10.0, lanes=(0, 1, 2))
     red = network.signals.colours(TIMES, 3)[0][:, 1] == Colour.RED
     step = int((100.0 - 32.3) / 1.0)
-    assert (cause(cast, motion) == "ego_runs_red") == bool(red[step] and red[step + 1])
+    assert (cause(roles, motion) == "ego_runs_red") == bool(red[step] and red[step + 1])
 
 
 @pytest.mark.parametrize(
@@ -228,17 +228,17 @@ def test_beside_its_way_the_light_of_another_lane_counts(aside_m, counts):
         lanes=(*one, *beside),
         signals=SignalPlan((LightGroup((4,), False),), ((0,),), (5.0,), offset_s=-40.0),
     )
-    cast, motion = scene(network, 10.0, lanes=(0, 1, 2))
+    roles, motion = scene(network, 10.0, lanes=(0, 1, 2))
     step = int((100.0 - 32.3) / 1.0)
     seen = set()
     for offset_s in np.arange(0.0, 40.0, 4.0):
         plan = replace(network.signals, offset_s=float(-offset_s))
         red = plan.colours(TIMES, 6)[0][:, 4] == Colour.RED
         moved = replace(motion, xy=motion.xy + np.array([0.0, aside_m]))
-        cast = replace(cast, network=replace(network, signals=plan))
+        roles = replace(roles, network=replace(network, signals=plan))
         seen.add(bool(red[step] and red[step + 1]))
-        found = cause(cast, moved) == "ego_runs_red"
-        assert found == (counts and bool(red[step] and red[step + 1])), (offset_s, cause(cast, moved))
+        violation = cause(roles, moved) == "ego_runs_red"
+        assert violation == (counts and bool(red[step] and red[step + 1])), (offset_s, cause(roles, moved))
     assert seen == {True, False}
 
 

@@ -16,9 +16,15 @@ from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import dump
 from drivax.synthetic import generate as generation
-from drivax.synthetic import portable
-from drivax.synthetic.generate import RESERVED_SEED, FamilyCount, GeneratedSet, Generation, generate
-from drivax.synthetic.portable import portable_workers
+from drivax.synthetic import generate as portable
+from drivax.synthetic.generate import (
+    RESERVED_SEED,
+    FamilyCount,
+    GeneratedSet,
+    Generation,
+    generate,
+    portable_workers,
+)
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 
 SCENARIOS = 7

@@ -8,8 +8,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from drivax.synthetic.roads.families import FAMILIES
 from drivax.synthetic.roads.network import Control
-from drivax.synthetic.traffic.conflicts import giving_way, met_on, with_feeders
 from drivax.synthetic.traffic.paths import LaneChange, Sway, lane_path
+from drivax.synthetic.traffic.role_assignment import conflicts_on, giving_way, with_feeders
 
 from .traffic_scenes import crossroads, road
 
@@ -24,25 +24,25 @@ def test_who_gives_way_meets_those_it_yields_to_unless_they_wait_themselves():
     lanes = list(network.lanes)
     lanes[1] = dataclasses.replace(lanes[1], yields_to=(4,), control=Control.YIELD)
     yielding = dataclasses.replace(network, lanes=tuple(lanes))
-    assert met_on(yielding, lane_path(yielding, (0, 1, 2), Sway())) == {4}
-    assert met_on(yielding, lane_path(yielding, (3, 4, 5), Sway())) == frozenset()
+    assert conflicts_on(yielding, lane_path(yielding, (0, 1, 2), Sway())) == {4}
+    assert conflicts_on(yielding, lane_path(yielding, (3, 4, 5), Sway())) == frozenset()
     assert [aim.lane for aim in giving_way(yielding)] == [1]
     lanes[4] = dataclasses.replace(lanes[4], yields_to=(1,))
     both = dataclasses.replace(network, lanes=tuple(lanes))
-    assert met_on(both, lane_path(both, (0, 1, 2), Sway())) == frozenset()
+    assert conflicts_on(both, lane_path(both, (0, 1, 2), Sway())) == frozenset()
     assert giving_way(both) == ()
 
 
 def test_at_an_all_way_stop_all_that_cross_are_met():
     network = crossroads(control=[Control.ALL_WAY_STOP] * 2)
-    assert met_on(network, lane_path(network, (0, 1, 2), Sway())) == {4}
+    assert conflicts_on(network, lane_path(network, (0, 1, 2), Sway())) == {4}
     assert sorted(aim.lane for aim in giving_way(network)) == [1, 4]
 
 
 def test_the_lane_that_is_changed_to_is_met():
     network, columns = road(lanes=2)
     path = lane_path(network, (columns[0][0], columns[1][0]), Sway(), LaneChange(0, 20.0, 60.0))
-    assert met_on(network, path) == {columns[1][0]}
+    assert conflicts_on(network, path) == {columns[1][0]}
 
 
 def test_feeders_are_the_lanes_within_reach_against_shortest_paths():

@@ -14,7 +14,7 @@ from drivax.synthetic.traffic.obstacles import Boxes, Standing, extents
 from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Scripted, Staging
-from drivax.synthetic.traffic.scripted import boxes_at
+from drivax.synthetic.traffic.simulation import boxes_at
 
 from .oracles import box_corners, distance_to_polyline, shared_area
 from .traffic_scenes import drivers, road, run

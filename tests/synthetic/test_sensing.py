@@ -7,7 +7,7 @@ import shapely
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
 from drivax.synthetic.expert.violations import touching
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, visible
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, visible
 
 SENSOR = SensorConfig()
 
@@ -189,10 +189,10 @@ def test_no_corner_moves_farther_than_the_bound(length, width):
         return corners(np.concatenate(box, axis=-1))[:, 3:]
 
     shift = np.hypot(*np.moveaxis(points(moved) - points(plain), -1, 0)).max()
-    bound = farthest_m(NoiseConfig(), length, width)
+    bound = largest_shift_m(NoiseConfig(), length, width)
     assert 0.99 * bound < shift <= bound + 1e-4
-    assert farthest_m(NoiseConfig(level=2.0), length, width) == pytest.approx(2 * bound)
-    assert farthest_m(NoiseConfig(level=0.0), length, width) == 0.0
+    assert largest_shift_m(NoiseConfig(level=2.0), length, width) == pytest.approx(2 * bound)
+    assert largest_shift_m(NoiseConfig(level=0.0), length, width) == 0.0
 
 
 @pytest.mark.parametrize(("length", "width"), LARGEST)

@@ -13,13 +13,13 @@ from drivax.synthetic.roads.network import Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.population import Density, drawn_drivers, driven_path, placed
-from drivax.synthetic.traffic.roles import Cast, EgoPlan, Override, Scripted, Staging, Walker
+from drivax.synthetic.traffic.population import Density, draw_drivers, driven_path, placed
+from drivax.synthetic.traffic.roles import EgoPlan, Override, Roles, Scripted, Staging, Walker
 from drivax.synthetic.traffic.simulation import Traffic
 
 from . import traffic_scenes
 from .oracles import box_corners, shared_area
-from .traffic_scenes import cast, crossroads, drivers, road
+from .traffic_scenes import crossroads, drivers, road, roles
 
 
 def line_with_light(signals=None):
@@ -189,7 +189,7 @@ def test_cyclists_are_followed_on_narrow_lanes_and_passed_on_wide_ones():
         table.kind[1] = AgentKind.CYCLIST
         table.size_m[1] = (1.8, 0.65, 1.75)
         table.top_speed_mps[1] = 5.0
-        scene = cast(network, [(0,)] * 2, table, [60.0, 90.0], [10.0, 5.0])
+        scene = roles(network, [(0,)] * 2, table, [60.0, 90.0], [10.0, 5.0])
         scene.paths[1] = lane_path(network, (0,), Sway((0.55 - width / 2,), (0.0,), (math.pi / 2,)))
         motion = Traffic(scene, np.arange(200) / 10).run()
         assert (motion.xy[0, -1, 0] > motion.xy[1, -1, 0]) == passes
@@ -238,7 +238,7 @@ def test_the_order_of_users_and_the_same_run_twice():
     stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
     comes = Scripted.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
     people = (Walker(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
-    scene = cast(network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, walkers=people, parked=(stands,))
+    scene = roles(network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, walkers=people, parked=(stands,))
     traffic = Traffic(scene, np.arange(steps) / 10)
     staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(comes,))
     first, calm, again = traffic.run(staging), traffic.run(), traffic.run(staging)
@@ -260,7 +260,7 @@ def test_in_dense_traffic_nobody_touches_anybody(family, seed):
     along = float(rng.uniform(start.low_m, start.high_m))
     where = placed(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
     first = [start.lane, *where.lane]
-    table = drawn_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
+    table = draw_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
     paths = [
         driven_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
         for lane, cyclist in zip(first, table.cyclist, strict=True)
@@ -274,7 +274,7 @@ def test_in_dense_traffic_nobody_touches_anybody(family, seed):
         lines = [span.begin_m - at[i] - 8.0 for span in path.spans if network.lanes[span.lane].connector]
         room = max(min((line for line in lines if line > -8.0), default=math.inf), 0.0)
         speed.append(min(0.8 * fastest[int(at[i] / path.step_m)], math.sqrt(3.0 * room)))
-    traffic = Traffic(Cast(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
+    traffic = Traffic(Roles(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
     motion = traffic.run()
     assert len(first) > 8
     for t in range(0, 150, 3):

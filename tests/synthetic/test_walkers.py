@@ -10,7 +10,7 @@ from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
 from drivax.synthetic.traffic.obstacles import Boxes
-from drivax.synthetic.traffic.pedestrians import Walkers, placed_walkers
+from drivax.synthetic.traffic.pedestrians import Walkers, place_walkers
 from drivax.synthetic.traffic.roles import Walker
 
 TIMES = (np.arange(151) - 60) * 0.1
@@ -144,26 +144,26 @@ def test_placed_walkers_are_on_their_ways_and_some_cross_during_the_recording():
     network = street()
     crossing, count = 0, 0
     for seed in range(40):
-        people = placed_walkers(network, 3.0, np.random.default_rng(seed), TIMES)
+        people = place_walkers(network, 3.0, np.random.default_rng(seed), TIMES)
         count += len(people)
         for one in people:
-            length = float(one.way.arc_m[-1])
+            length = float(one.curve.arc_m[-1])
             assert 0.0 <= one.start_m <= length
             assert 0.7 <= one.speed_mps <= 2.0
             if one.crossing >= 0:
-                kerb = [np.interp(one.kerb_m, one.way.arc_m, one.way.xy[:, k]) for k in (0, 1)]
-                other = [np.interp(one.across_m, one.way.arc_m, one.way.xy[:, k]) for k in (0, 1)]
+                kerb = [np.interp(one.kerb_m, one.curve.arc_m, one.curve.xy[:, k]) for k in (0, 1)]
+                other = [np.interp(one.across_m, one.curve.arc_m, one.curve.xy[:, k]) for k in (0, 1)]
                 assert abs(kerb[1]) == pytest.approx(4.0, abs=0.3) and kerb[0] == pytest.approx(50.0, abs=1.2)
                 assert other[1] == pytest.approx(-kerb[1], abs=0.5)
             else:
-                assert np.abs(one.way.xy[:, 1]).min() > 4.5
+                assert np.abs(one.curve.xy[:, 1]).min() > 4.5
         xy = play(network, people)[0] if people else np.zeros((151, 0, 2))
         crossing += int(np.sum((np.abs(xy[60:, :, 1]) < 3.0).any(axis=0)))
     # Poisson means: 3 per 100 m of two sidewalks of 100 m, and 1.5 at the crossing.
     assert count / 40 == pytest.approx(7.5, abs=1.5)
     assert crossing / 40 > 0.7
-    again = placed_walkers(network, 3.0, np.random.default_rng(7), TIMES)
-    same = placed_walkers(network, 3.0, np.random.default_rng(7), TIMES)
+    again = place_walkers(network, 3.0, np.random.default_rng(7), TIMES)
+    same = place_walkers(network, 3.0, np.random.default_rng(7), TIMES)
     assert [(w.start_m, w.speed_mps) for w in again] == [(w.start_m, w.speed_mps) for w in same]
 
 

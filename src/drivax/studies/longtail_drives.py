@@ -220,7 +220,7 @@ def evaluate_arm(out: Path, arm: str, seed: int) -> None:
             step = step_by_mean_q(run) if name == BY_MEAN_Q else None
             planner, task = load_policy(run, bank, step=step)
             planner_name = str(run) if step is None else f"{run}@{step}"
-            run_evaluation(EvaluationConfig(planner_name), planner, test, folder, task=task)
+            run_evaluation(EvaluationConfig(planner_name, task=task), planner, test, folder)
 
 
 def is_evaluated(out: Path, arm: str, seed: int) -> bool:
