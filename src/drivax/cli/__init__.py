@@ -146,7 +146,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
-        raise UsageError(f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS))
+        raise UsageError(
+            f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS, otherwise="see drivax --help")
+        )
     return _run(name, COMMANDS[name], rest)
 
 
