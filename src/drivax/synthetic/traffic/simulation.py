@@ -123,7 +123,7 @@ class Leaders:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and that vehicle.
 
         Args:
-            tables: Everyone's paths.
+            tables: All paths.
             at_m: Where they are on them.
             active: Which of them are there.
         """
