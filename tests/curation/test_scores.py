@@ -279,7 +279,7 @@ def test_the_command(data, tmp_path, capsys):
             main([*command, "--out", str(tmp_path / "x"), "--export", str(tmp_path / "y"), out_of_range]) == 2
         )
         assert "most critical of 2 scenarios; ask for 1 to 2" in capsys.readouterr().err
-    for taken, words in ((data.path, "is the set that is read"), (top, "exists already")):
+    for taken, words in ((data.path, "is the set that is read"), (top, "already exists")):
         assert main([*command, "--out", str(tmp_path / "x"), "--export", str(taken), "1"]) == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import math
 
@@ -241,15 +240,8 @@ def test_describe(sample):
     assert "110 steps in austin" in found.flavour and "5 tracks" in found.notes
 
 
-def test_missing_pyarrow_names_the_extra(sample, monkeypatch):
-    found = builtins.__import__
-
-    def blocked(name, *args, **kwargs):
-        if name.startswith("pyarrow"):
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", blocked)
+def test_missing_pyarrow_names_the_extra(sample, hide_packages):
+    hide_packages("pyarrow")
     with pytest.raises(UsageError, match=r"pip install 'drivax\[av2\]'"):
         list(READER.read(sample))
 

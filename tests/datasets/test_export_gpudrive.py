@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datasets.samples import womd_scenario
-from datasets.test_restore import assert_same_map
+from datasets.test_export_recording import assert_same_map
 from drivax.datasets import gpudrive
 from drivax.datasets.export.gpudrive import file_name, gpudrive_scene
 from drivax.datasets.export.recording import restore

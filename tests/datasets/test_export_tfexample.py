@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datasets.samples import womd_scenario
-from datasets.test_restore import assert_same_map
+from datasets.test_export_recording import assert_same_map
 from drivax.datasets.export.recording import restore
 from drivax.datasets.export.tfexample import PATHS, tf_example
 from drivax.datasets.womd import example_reader as womd_example

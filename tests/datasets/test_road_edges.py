@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import math
 
 import numpy as np
@@ -207,14 +206,7 @@ def test_points_that_are_nowhere_are_refused(bad):
         road_edges([(ring, [])], FIRST)
 
 
-def test_missing_shapely_names_the_extra(monkeypatch):
-    found = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith("shapely"):
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+def test_missing_shapely_names_the_extra(hide_packages):
+    hide_packages("shapely")
     with pytest.raises(UsageError, match=r"pip install 'drivax\[maps\]'"):
         road_edges([(box(0, 0, 10, 10), [])], FIRST)

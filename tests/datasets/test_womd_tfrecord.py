@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import gzip
 import struct
 import zlib
@@ -142,14 +141,7 @@ def test_missing_file(tmp_path):
         next(read_records(tmp_path / "none"))
 
 
-def test_missing_package_names_the_extra(good, read, monkeypatch):
-    found = builtins.__import__
-
-    def without_crc(name, *args, **kwargs):
-        if name == "google_crc32c":
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_crc)
+def test_missing_package_names_the_extra(good, read, hide_packages):
+    hide_packages("google_crc32c")
     with pytest.raises(UsageError, match=r"drivax\[womd\]"):
         read(good)

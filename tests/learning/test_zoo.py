@@ -82,7 +82,7 @@ def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank)
     with pytest.raises(UsageError, match="packed and without steps; leave out @4"):
         find_planner(f"{packed.path}@4", bank)
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         export_policy(run.path, packed.path, bank)
     wider = {**TINY, "algorithm": {**TINY["algorithm"], "network": {"encoder": {"rows": [4], "hidden": [9]}}}}
     (packed.path / "config.yaml").write_text(settings.dump(settings.load(TrainConfig, wider)))

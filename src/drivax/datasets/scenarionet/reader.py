@@ -191,7 +191,7 @@ def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
     row = rows.get("ego" if named is None else named)
     if row is not None:
         return row
-    raise DataError(f"the ego {(named or 'is not named')[:40]!r} is none of {len(rows)} tracks", cure=SKIP)
+    raise DataError(f"the ego {(named or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
 
 
 def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int) -> tuple[Tracks, Flag]:

@@ -30,9 +30,9 @@ _LEAVE_M, _LEAVE_S = 120.0, 9.0
 _DURATION_S, _SHORTEST_M, _LEAST_MPS = 4.2, 14.0, 3.0
 #: Bumper-to-bumper room that must be left ahead and behind, m and s.
 _ROOM_M, _ROOM_S = 2.0, 0.25
-#: After a change a driver stays for this long, s; nobody changes right behind a junction or right before one, m.
+#: After a change a driver stays for this long, s; no changes this close behind or before a junction, m.
 _REST_S, _AFTER_M, _BEFORE_M = 4.0, 12.0, 25.0
-#: Those who make room brake at most like this, m/s2.
+#: Largest braking to make room for others, m/s2.
 HELP_MPS2 = 1.8
 
 
@@ -111,12 +111,12 @@ class Helped:
 
 @dataclass(frozen=True)
 class Situation:
-    """Where everyone is when lane changes are considered.
+    """State of all vehicles when lane changes are decided.
 
     Attributes:
-        free: Who may change for pleasure or need (not ego, nobody who is changing, no bicycle).
+        free: Mask of vehicles that may change (not ego, cyclists, or vehicles that are changing).
         fastest: Fastest speed on the own path here.
-        acceleration: Wanted acceleration on the own path, everything considered.
+        acceleration: Preferred acceleration on the own path.
     """
 
     at_m: Float64[np.ndarray, " v"]
@@ -142,7 +142,7 @@ def _rows(parameters: IdmParameters, rows: Int64[np.ndarray, " k"]) -> IdmParame
 
 
 class LaneChanges:
-    """Decides about lane changes of all vehicles at once.
+    """Lane-change decisions of all vehicles.
 
     Args:
         network: The roads.
@@ -157,7 +157,7 @@ class LaneChanges:
         self._thing_half = np.full(len(self._thing_chain), 2.4)
 
     def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
-        """The changes that begin now, and who helps whom that has to change."""
+        """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
         rows = np.arange(len(now.at_m))
         lane, along = tables.on(now.at_m, rows)
         own = lane[:, 0]
@@ -215,7 +215,7 @@ class LaneChanges:
         options: _Options,
         lines: tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]],
     ) -> _Weighed:
-        """What changing would bring."""
+        """Evaluate the incentive and safety of each option."""
         o, vehicles, mandatory = options, options.vehicles, options.mandatory
         speed = now.speed[vehicles]
         new_lead, new = self._next(now, vehicles, o.there, lines)
@@ -240,7 +240,7 @@ class LaneChanges:
     def _followed(
         self, now: Situation, vehicles: Int64[np.ndarray, " k"], behind: _Next, ahead: _Next
     ) -> _Pair:
-        """Accelerations of followers who have a vehicle ahead of them, and the one ahead of that; 0 without any."""
+        """Return followers' accelerations behind the vehicle and behind its leader; 0 without a follower."""
         row, gap, _ = behind
         there, row = row >= 0, np.maximum(row, 0)
         gaps = np.stack([gap, gap + 2 * self._half[vehicles] + ahead[1]])

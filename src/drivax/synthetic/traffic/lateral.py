@@ -1,4 +1,4 @@
-"""Paths that leave their lanes' centres: changes to another way from wherever a vehicle is, and ways around things."""
+"""Paths that leave lane centres: lane changes, and detours around obstacles."""
 
 from __future__ import annotations
 
@@ -19,43 +19,43 @@ from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, smoothed_curva
 LOOK_M, _ROOM_M = 45.0, 0.55
 #: What comes so near to the side of a vehicle on its path is in its way, m.
 DETOUR_MARGIN_M = 0.3
-#: Nobody swings out further than this, m, nor more steeply than one metre in this many.
+#: Largest offset of a detour, m, and its steepest slope, m forward per m aside.
 _FURTHEST_M, _STEEPEST = 4.3, 2.2
-#: So far ahead a swerver takes up the lanes beside, m.
-_BESIDE_M = 60.0
+#: Distance ahead over which a detour occupies adjacent lanes, m.
+_ADJACENT_M = 60.0
 #: Room kept to the road's edge, m, and speed at which things are passed, m/s.
 _EDGE_M, _PASS_MPS = 0.2, 6.0
 
 
 @dataclass(frozen=True)
 class DetourRequest:
-    """Who wants to pass: where it is on its path, how fast, how long and how wide, and lanes of its direction."""
+    """A vehicle that looks for a detour: path position, speed, size, and adjacent lanes of its direction."""
 
     path: Path
     at_m: float
     speed: float
     size_m: tuple[float, float]
-    beside: tuple[Occupied, ...] = ()
+    adjacent: tuple[Occupied, ...] = ()
 
 
 def detour_request(
     network: RoadNetwork, tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
 ) -> DetourRequest:
-    """A vehicle (at a path position with a speed) with the lanes of its own direction beside it."""
+    """Build the request of a vehicle at a path position and speed."""
     at = float(now[0])
     lane, along = tables.on(np.array([at]), np.array([row]))
-    beside = []
+    adjacent = []
     if lane[0, 0] >= 0:
         here = network.lanes[lane[0, 0]]
         for other in (here.left, here.right):
             if other >= 0:
                 scale = here.length_m / network.lanes[other].length_m
-                beside.append(Occupied(other, at - float(along[0, 0]), scale, at, at + _BESIDE_M))
-    return DetourRequest(tables.paths[row], at, float(now[1]), size_m, tuple(beside))
+                adjacent.append(Occupied(other, at - float(along[0, 0]), scale, at, at + _ADJACENT_M))
+    return DetourRequest(tables.paths[row], at, float(now[1]), size_m, tuple(adjacent))
 
 
 class Detours:
-    """Finds ways around standing things.
+    """Finds detours around standing obstacles.
 
     Args:
         network: The roads.
@@ -94,7 +94,7 @@ class Detours:
         for aside in sorted(sides, key=abs):
             plan = self._plan(request, first, last, aside)
             if plan is not None and self._is_free(request, plan, aside, seen, moving):
-                return around(path, plan, aside, request.beside), plan[3]
+                return around(path, plan, aside, request.adjacent), plan[3]
         return None
 
     @staticmethod
@@ -122,12 +122,12 @@ class Detours:
         seen: Extents,
         moving: Boxes,
     ) -> bool:
-        """Whether the band that is driven through holds no edge, nothing that stands, and nobody who comes."""
+        """Whether the detour is free of road edges, standing obstacles and oncoming or overtaking users."""
         begin, out, back, end = plan
         half = request.size_m[1] / 2
         low, high = aside - half - _EDGE_M, aside + half + _EDGE_M
-        beside = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
-        if beside.any():
+        adjacent = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
+        if adjacent.any():
             return False
         edge = self._edge.chosen(_close(self._edge, request.path, (out + back) / 2, (end - begin) / 2 + 15.0))
         edges, _ = extents(request.path, edge)
@@ -148,7 +148,7 @@ class Detours:
         meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
         ahead = (others.far_m > request.at_m) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
         behind = (others.far_m <= request.at_m) & (others.far_m + speed * 3.0 > request.at_m - 6.0)
-        # Who drives ahead of the swerver in its own lane is met by nobody: it is a leader.
+        # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
         ahead &= ~((speed > 1.0) & (others.near_m > back))
         return not bool(np.any(meets & (ahead | behind)))
 
@@ -168,7 +168,7 @@ def _close(boxes: Boxes, path: Path, at_m: float, within_m: float) -> np.ndarray
 
 #: Share of a lane change after which a vehicle has left the old lane.
 _LEFT_SHARE = 0.75
-#: From this lateral offset on a vehicle takes up room in the lane beside, m.
+#: From this lateral offset on a vehicle occupies the adjacent lane, m.
 _INTRUDES_M = 0.7
 
 
@@ -268,7 +268,7 @@ def _take_up(
     lane: np.ndarray,
     lane_m: Float64[np.ndarray, "point slot"],
 ) -> None:
-    """Enters a lane into the first free slot of the samples on which it is taken up."""
+    """Enter a lane into the first free slot of the samples on which it is taken up."""
     here = (at >= other.from_m) & (at <= other.until_m) & ~(lane == other.lane).any(axis=1)
     for slot in range(SLOTS):
         free = here & (lane[:, slot] < 0)
@@ -300,7 +300,7 @@ def quintic_step(
 def located(
     path: Path, xy: Float64[np.ndarray, " 2"], near_m: float | None = None
 ) -> tuple[float, float, float]:
-    """Where a point is beside a path: position along it, offset to the left (m), and the path's heading there.
+    """Locate a point relative to a path: position along it, offset to the left (m), and the path's heading there.
 
     Args:
         path: The path.
@@ -337,7 +337,7 @@ def change_onto(
     """A path that leaves another where a vehicle is and swings onto a third, as a lane change does.
 
     Args:
-        target: The path to get onto; it runs beside the present one here.
+        target: The path to get onto; it runs parallel to the present one here.
         present: The path that the vehicle is on.
         at_m: Where on it, m.
         length_m: Distance along the target over which to change, m.
@@ -367,7 +367,7 @@ def change_onto(
 
 
 def around(
-    path: Path, at_m: tuple[float, float, float, float], aside_m: float, beside: tuple[Occupied, ...] = ()
+    path: Path, at_m: tuple[float, float, float, float], aside_m: float, adjacent: tuple[Occupied, ...] = ()
 ) -> Path:
     """A path with a bulge to one side: out from the first to the second position, back from the third to the last.
 
@@ -375,9 +375,9 @@ def around(
         path: The path.
         at_m: The four positions, rising.
         aside_m: Offset in between, positive to the left.
-        beside: Lanes into which the bulge reaches.
+        adjacent: Lanes into which the bulge reaches.
     """
     old = path.step_m * np.arange(len(path.curve.xy))
     out = 1.0 - quintic_step(old, (at_m[0], 1.0, 0.0), at_m[1] - at_m[0])
     back = quintic_step(old, (at_m[2], 1.0, 0.0), at_m[3] - at_m[2])
-    return displaced(path, aside_m * out * back, beside if abs(aside_m) > _INTRUDES_M else ())[0]
+    return displaced(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]

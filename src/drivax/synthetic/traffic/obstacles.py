@@ -1,4 +1,4 @@
-"""What stands or moves in the way of a vehicle without being on a lane: parked cars, people, whoever swerves."""
+"""Obstacles in a vehicle's corridor that are on no lane: parked cars, pedestrians, swerving vehicles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MIDDLE_M = 1.3
 _AHEAD_M, _EVERY_M, _ASIDE_M = 50.0, 2.0, 16.0
 #: How far ahead other vehicles are looked at, m.
 _NEAR_M = 25.0
-#: Who crosses ahead is not braked for when it will have left so long before, s.
+#: Crossing users are ignored when they leave the corridor this long before arrival, s.
 _WELL_S = 0.8
 #: Sideways motion is foreseen for this long, s.
 _FORESEEN_S = 0.7
@@ -131,7 +131,7 @@ class Standing:
 
     Args:
         boxes: The things.
-        tables: Everyone's paths.
+        tables: All paths.
         width_m: Widths of the vehicles.
     """
 
@@ -187,11 +187,11 @@ def nearest_obstacles(
     """Gap from each front bumper to the nearest thing in the corridor of the own path, and its speed along it.
 
     Args:
-        tables: Everyone's paths.
+        tables: All paths.
         vehicles: The vehicles.
         at_m: Where they are on their paths.
         active: Which of them are there.
-        others: What may be in the way beside vehicles: things in motion, those that stand for once too.
+        others: Other possible obstacles: moving users, including those that stand for now.
     """
     count, things = len(vehicles), vehicles.joined(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
@@ -210,7 +210,7 @@ def nearest_obstacles(
     size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
     inside = (np.minimum(left, soon) - width < half) & (np.maximum(left, soon) + width > -half)
-    # Beyond the last sample of the path, or beside the vehicle rather than ahead of it: not in the way.
+    # Beyond the last sample of the path, or next to the vehicle: no obstacle.
     inside &= (at > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
     k = inside.nonzero()[0]
     if not len(k):
@@ -279,6 +279,6 @@ def _gone(
     reach: Float64[np.ndarray, " k"],
     seconds: Float64[np.ndarray, " k"],
 ) -> Bool[np.ndarray, " k"]:
-    """Who crosses the corridor will have left it well before the vehicle comes."""
+    """Mask of crossing users that leave the corridor well before the vehicle arrives."""
     then = left + drift * np.maximum(seconds - _WELL_S, 0.0)
     return (seconds > 2 * _WELL_S) & (np.abs(then) > reach) & (then * drift > 0)

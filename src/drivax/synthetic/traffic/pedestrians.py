@@ -17,7 +17,7 @@ from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.roles import Walker
 
-#: Where people wait, m before the kerb, how near to it they claim the crossing, and from where on they look.
+#: Where people wait, m before the kerb, how near to it they occupy the crossing, and from where on they look.
 _WAIT_M, _CLAIM_M, _LOOK_M = 0.4, 1.0, 1.8
 #: How fast a walker gains and loses speed, m/s2.
 _ACCELERATION_MPS2 = 1.5
@@ -25,13 +25,14 @@ _ACCELERATION_MPS2 = 1.5
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
 #: Slower vehicles count as standing, m/s.
 _STANDING_MPS = 0.3
-#: Time beyond the crossing time that is wanted to the next vehicle, s: where drivers yield, and where they need not.
+#: Safety margin of the time to the next vehicle beyond the crossing time, s: where drivers yield, and where they need
+#: not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
 #: Vehicles that see the crossing under a larger angle or head another way do not come to it.
 _BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
 #: People keep this distance from the side of a vehicle, m.
 _BERTH_M = 0.4
-#: They look at vehicles every so many steps.
+#: Steps between looks at vehicles.
 _LOOK_STEPS = 2
 #: Lanes that begin or end so near to a crossing have the lights of their neighbours, m.
 _NEAR_JUNCTION_M = 25.0
@@ -42,8 +43,8 @@ class _CrossingConflicts:
     """Where crossings meet lanes, one row per meeting, and what the lights say there.
 
     Attributes:
-        red: Per crossing the connectors whose lights must be red while people cross: everybody's but those who
-            turn into the crossed road at green, who must yield.
+        red: Per crossing the connectors whose lights must be red while people cross: all but those that turn
+            into the crossed road at green and must yield.
     """
 
     xy: Float64[np.ndarray, "meeting 2"]
@@ -139,7 +140,7 @@ class Walkers:
         self._across = np.array([walker.across_m for walker in walkers], float)
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
-        # At lights and where nobody has to yield only those count who are on their way over.
+        # At lights and unmarked crossings only users on the crossing count.
         asking = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
         self._asking = asking[self._crossing] if len(asking) else np.zeros(len(curves), bool)
         self._released, self._into = np.zeros((2, len(curves)), bool)
@@ -151,17 +152,17 @@ class Walkers:
         active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Tells where everybody is at step ``t``, and moves them on to the next one.
+        """Return all walkers at step ``t``, then advance them.
 
         Args:
             t: The step; steps come in order.
-            vehicles: Everybody to be careful of.
+            vehicles: All vehicles.
             active: Which of them are there.
             colour_row: What every lane's light shows now.
 
         Returns:
-            The walkers, and which crossings drivers have to leave free: somebody is on it or, where drivers must
-            yield, about to step on it.
+            The walkers, and which crossings drivers must keep free: a walker is on it or, where drivers must yield,
+            about to step on it.
         """
         place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(place.astype(int), self._last - 1)
@@ -190,7 +191,7 @@ class Walkers:
         active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
     ) -> None:
-        """Lets those go who are at the kerb of a crossing that is safe for as long as they need."""
+        """Release walkers at the kerb of a crossing that is safe for long enough."""
         before = self._kerb - self._at
         asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
         if not np.count_nonzero(asks):
@@ -201,7 +202,7 @@ class Walkers:
         # Who stands first has to gain speed, which takes v / (2 a) longer.
         start_s = self._free_speed / (2 * _ACCELERATION_MPS2)
         needed = ((self._across - self._at) / self._free_speed + start_s)[asks]
-        # Nobody squeezes through a queue.
+        # A standing queue blocks the crossing.
         free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
         red = ~(conflicts.red & (colour_row != Colour.RED)).any(axis=1)
         yielded = conflicts.marked | conflicts.red.any(axis=1)
@@ -214,7 +215,7 @@ class Walkers:
         self._released[asks] = gap & free[crossing] & red[crossing] & lasting
 
     def _advance(self) -> None:
-        """One step on; who is not released stops at the kerb, and nobody walks into a vehicle."""
+        """Advance by one step; unreleased walkers stop at the kerb, and none walks into a vehicle."""
         room = self._last * self._step_m - self._at
         if self._any_crosses:
             waits = self._crosses & ~self._released & (self._at <= self._kerb)
@@ -275,7 +276,7 @@ def _arrivals(
 def _walks_into(
     pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, " w"]:
-    """Who would come too near to a vehicle right ahead, and is not near one already."""
+    """Mask of walkers about to come too near to a vehicle, and not near one already."""
     x, y, angle = pose.T
     into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
     if np.count_nonzero(into):
@@ -304,7 +305,7 @@ def _within(
 def place_walkers(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
 ) -> tuple[Walker, ...]:
-    """Draws who walks: along the sidewalks in both directions, and over the crossings.
+    """Draw walkers: along the sidewalks in both directions, and over the crossings.
 
     Args:
         network: The roads.
@@ -335,7 +336,7 @@ def _pace(rng: np.random.Generator) -> float:
 def _crosser(
     network: RoadNetwork, index: int, crossing: Crossing, begin_s: float, rng: np.random.Generator
 ) -> Walker:
-    """Somebody who comes along the sidewalk, crosses, and walks on on the other side."""
+    """Draw a walker that comes along the sidewalk, crosses, and continues on the other side."""
     near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
     aside = rng.uniform(-0.3, 0.3) * crossing.width_m
     ahead = (far - near) / np.hypot(*(far - near))
@@ -369,13 +370,13 @@ def _along_walk(
         return kerb + np.outer([2.0, 20.0], out)
     _, walk, place = best
     pieces = [piece for piece in (walk.xy[place:], walk.xy[place::-1]) if len(piece) > 4]
-    # The crossing's axis is met at a right angle, some way beside the kerb.
+    # The crossing's axis is met at a right angle, some way from the kerb.
     piece = pieces[int(rng.integers(len(pieces)))]
     return piece[1:81]
 
 
 def _polyline(points: Float64[np.ndarray, "point 2"]) -> Curve:
-    """A way through points; the heading turns at the corners."""
+    """Return a curve through points; the heading turns at the corners."""
     steps = np.diff(points, axis=0)
     kept = np.concatenate([[True], np.hypot(*steps.T) > 1e-6])
     points = points[kept]

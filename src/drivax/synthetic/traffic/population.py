@@ -1,4 +1,4 @@
-"""Who is on the road: vehicles of many sizes with drivers of many tempers, placed with safe gaps."""
+"""Vehicles, drivers and parked cars, placed with safe gaps."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _FROM_ENDS_M = 15.0
 def parked_cars(
     network: RoadNetwork, share: float, double_share: float, rng: np.random.Generator, steps: int
 ) -> tuple[Scripted, ...]:
-    """Draws which bays are taken, and whether somebody stands beside one.
+    """Draw parked cars in bays, and sometimes a double-parked one.
 
     Args:
         network: The roads.
         share: Share of bays that are taken.
-        double_share: Chance that somebody stands in the lane beside a bay, where others can pass: on a lane of the
+        double_share: Chance of a double-parked car next to a bay, where others can pass: on a lane of the
             same direction, on the oncoming lane, or because 2.3 m are left.
         rng: Source of chance.
         steps: Length of the result, time steps.
     """
     result = []
     for bay in network.bays:
-        # Everything is drawn for every bay: a change of one share moves nobody else.
+        # All values are drawn for every bay: the share must not change other cars.
         size = _size(rng, bay.length_m)
         along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
         turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
@@ -49,11 +49,11 @@ def parked_cars(
             pose = _moved(bay.pose, float(np.clip(along, -play, play)), float(np.clip(aside, -0.15, 0.15)))
             pose = Pose(pose.x, pose.y, pose.heading + turn)
             result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
-    doubled, beside_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
+    doubled, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
     for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
         bay, size = network.bays[place], _size(rng, network.bays[place].length_m)
-        if _passable(network, bay, size[1], beside_m):
-            pose = _beside(network, bay, size[1], beside_m)
+        if _passable(network, bay, size[1], gap_m):
+            pose = _double_parked_pose(network, bay, size[1], gap_m)
             return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
     return tuple(result)
 
@@ -72,8 +72,8 @@ def _moved(pose: Pose, ahead_m: float, left_m: float) -> Pose:
     return Pose(pose.x + ahead_m * cos - left_m * sin, pose.y + ahead_m * sin + left_m * cos, pose.heading)
 
 
-def _beside(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
-    """In the lane beside the bay, as near to it as the lane's border allows."""
+def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
+    """Return the pose in the lane next to a bay, as near to it as the lane's border allows."""
     lane = network.lanes[bay.lane]
     centre = _pose_at(lane, bay.along_m)
     dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
@@ -91,7 +91,7 @@ def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> b
 
 
 def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
-    """Whether a lane of the other direction lies right beside this place."""
+    """Whether a lane of the other direction is adjacent here."""
     here = _pose_at(lane, along_m)
     for other in network.lanes:
         gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
@@ -112,13 +112,13 @@ def _pose_at(lane: Lane, along_m: float) -> Pose:
 _GAP_M, _GAP_S = 5.0, 0.9
 #: Free gaps on busy lanes as a share of those elsewhere.
 _BUSY = 0.4
-#: Nobody cycles where cars may go faster, m/s.
+#: No cyclists where the speed limit is higher, m/s.
 _CYCLED_MPS = 16.0
 #: How far from the lane's right side cyclists ride, m.
 _KERB_M = 0.55
-#: Nobody is placed so little time before a lane ends although the road goes on, s.
+#: No vehicle is placed within this time of a lane's end, s.
 _MERGE_S = 5.0
-#: From where ahead of a standing thing to where behind it nobody is placed in its lane, m, and the widest vehicle.
+#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
 _BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
 #: Vehicles on different lanes that take up the same strip are this far apart, centre to centre, m.
 _APART_M = 15.0
@@ -143,10 +143,10 @@ class Density:
 
     Attributes:
         spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
-        vehicles: Most vehicles beside ego; the nearest to ego are kept.
+        vehicles: Most vehicles besides ego; the nearest to ego are kept.
         van_share, truck_share, bus_share: Shares of these among all; the rest are cars.
         cyclist_share: Share of cyclists among those who are placed on streets.
-        leader_share: Share of scenarios in which somebody is placed right ahead of ego.
+        leader_share: Share of scenarios in which a vehicle is placed right ahead of ego.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)
@@ -175,7 +175,7 @@ def placed(
     parked: tuple[Scripted, ...] = (),
     busy: Collection[int] = (),
 ) -> Placement:
-    """Draws where the others begin: nobody on a connector, and nobody too close to ego or to another.
+    """Draw initial positions: none on a connector, none too close to ego or another vehicle.
 
     Args:
         network: The roads.
@@ -183,7 +183,7 @@ def placed(
         ego_along_m: Distance of ego along that lane, m.
         density: How full the roads are.
         rng: Source of chance.
-        parked: Who stands somewhere all the time: nobody begins in it or right behind it.
+        parked: Parked cars; no vehicle begins in or right behind one.
         busy: Lanes that are as full as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
@@ -217,7 +217,7 @@ def placed(
 def _apart_in_space(
     network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
 ) -> list[tuple[int, float]]:
-    """Drops who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
+    """Drop who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
     kept: list[tuple[float, float]] = []
     result = []
     for place in [ego, *vehicles]:
@@ -236,7 +236,7 @@ def _apart_in_space(
 
 
 def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
-    """Whether somebody stands in the lane here or so near ahead that it could not be passed."""
+    """Whether a parked car is in the lane here or too near ahead to be passed."""
     curve = network.lanes[lane].curve
     place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
     cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
@@ -251,7 +251,7 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
 def _apart_at_joints(
     network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
 ) -> list[tuple[int, float]]:
-    """Drops who stands too close behind the first vehicle of a following lane."""
+    """Drop who stands too close behind the first vehicle of a following lane."""
     kept = []
     first: dict[int, float] = {}
     for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
@@ -279,17 +279,17 @@ def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray,
 def draw_drivers(
     count: int, density: Density, rng: np.random.Generator, lanes: Sequence[Lane] | None = None
 ) -> Drivers:
-    """Draws vehicles and drivers: hurried and patient, close and careful.
+    """Draw vehicles and drivers.
 
     Args:
         count: How many.
         density: Shares of the types.
         rng: Source of chance.
-        lanes: Where each begins: nobody cycles on fast roads, and only cyclists are on bicycle lanes.
+        lanes: First lane of each: no cyclists on fast roads, only cyclists on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
     drawn = np.searchsorted(shares, rng.random(count), side="right")
-    # The types in the order of the shares; whoever is left drives a car.
+    # The types in the order of the shares; the rest are cars.
     kind = (drawn + 1) % (len(shares) + 1)
     if lanes is not None:
         fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
@@ -320,7 +320,7 @@ def draw_drivers(
 def driven_path(
     network: RoadNetwork, lanes: tuple[int, ...], cyclist: bool, rng: np.random.Generator
 ) -> Path:
-    """The path of somebody along lanes: cars near the middle, cyclists near the right side."""
+    """Draw a path along lanes: cars near the centre, cyclists near the right side."""
     if not cyclist:
         return lane_path(network, lanes, Sway.drawn(rng, 0.2))
     narrowest = min(network.lanes[lane].width_m for lane in lanes)
@@ -328,7 +328,7 @@ def driven_path(
 
 
 def join_drivers(first: Drivers, rest: Drivers) -> Drivers:
-    """One table of both."""
+    """Concatenate two sets of drivers."""
     return Drivers(
         **{name: np.concatenate([value, getattr(rest, name)]) for name, value in vars(first).items()}
     )

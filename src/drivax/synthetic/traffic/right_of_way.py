@@ -1,7 +1,7 @@
-"""Who may enter a connector, and when: lights, signs, priority, and room to leave it again.
+"""Right of way at connectors: lights, signs, priority, and room to leave.
 
 A driver asks for a connector when it comes so near that it would have to begin to brake for its line. Once granted,
-the connector is held until the tail has left what others need of it; nobody is granted what conflicts with it.
+the connector is held until the tail has left what others need of it; conflicting connectors are not granted.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from drivax.synthetic.traffic.path_arrays import PathTables
 
 #: A driver asks for the way when it would brake this gently for the line, m/s2, with this much time and room to spare.
 _ASK_MPS2, _ASK_S, _ASK_M = 2.0, 0.7, 3.5
-#: Whoever expects another to clear the way in time waits no longer with braking than for this, m/s2; speed of turns.
+#: A driver that expects a blocker to clear in time brakes at this deceleration at the latest, m/s2; turning speed.
 _LATEST_MPS2, _TURNING_MPS = 3.4, 7.0
-#: Nobody stops for others who would have to brake harder, m/s2.
+#: A driver that would have to brake harder than this does not stop for others, m/s2.
 _HARDEST_MPS2 = 6.5
 #: Standing at a stop sign: slower than this, and nearer to the line.
 _STANDS_MPS, _STANDS_M = 0.2, 4.5
@@ -43,14 +43,14 @@ _RED, _YELLOW = int(Colour.RED), int(Colour.YELLOW)
 
 @dataclass(frozen=True)
 class TrafficState:
-    """Where everyone is when drivers decide.
+    """State of all vehicles when drivers decide.
 
     Attributes:
         step, colour, to_red: The step, and what each lane's light shows and how long until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
         promised: Number of connectors on the path that a vehicle will enter whatever others do (-1: it asks).
-        promises: Whether anybody has promised.
+        promises: Whether any vehicle has promised.
     """
 
     step: int
@@ -134,7 +134,7 @@ class RightOfWay:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything: a new run begins."""
+        """Reset for a new run."""
         count = len(self._length)
         self._granted = np.zeros(count, int)
         self._stood = np.full(count, np.inf)
@@ -201,7 +201,7 @@ class RightOfWay:
         place: Int64[np.ndarray, " v"],
         stop: Float64[np.ndarray, " v"],
     ) -> None:
-        """Grants or denies what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
+        """Grant or deny what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
         index = np.arange(tables.connector.shape[1])
         held = (
             (index < self._granted[:, None])
@@ -256,7 +256,7 @@ class RightOfWay:
         stood = self._stood[asking]
         key = np.where(all_way, 1e3 + np.minimum(stood, 1e6), arrival)
         for k in np.flatnonzero(all_way & np.isfinite(stood)):
-            # Of those who came together the one with nobody to its right goes first.
+            # Of those who came together the vehicle without another to its right goes first.
             tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
             here = self._lanes[connectors[k]].curve.heading[0]
             turned = np.array([wrap(self._lanes[w].curve.heading[0] - here) for w in connectors[tied]])
@@ -332,7 +332,7 @@ class RightOfWay:
     def _gap_is_accepted(
         self, state: TrafficState, tables: PathTables, request: tuple[int, int, int]
     ) -> bool:
-        """Whether nobody with priority would arrive too soon."""
+        """Whether the gap to users with priority is accepted."""
         i, connector, place = request
         others = self._yields[connector]
         begin = tables.begin[:, others]

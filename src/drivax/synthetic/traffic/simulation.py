@@ -1,10 +1,9 @@
-"""Traffic at 10 Hz: many vehicles on lane paths who follow, stop, give way, change lanes and go around things.
+"""Traffic at 10 Hz: vehicles on paths follow, stop, give way, change lanes and avoid obstacles.
 
 The law of following is the simulator's own (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a
 few dozen array operations over vehicles, whatever their number. Who may enter a junction is decided in
-:mod:`drivax.synthetic.traffic.right_of_way`, who changes lanes in :mod:`drivax.synthetic.traffic.lane_changes`, what
-is in the way in
-:mod:`drivax.synthetic.traffic.obstacles`.
+:mod:`drivax.synthetic.traffic.right_of_way`, who changes lanes in :mod:`drivax.synthetic.traffic.lane_changes`,
+obstacles in :mod:`drivax.synthetic.traffic.obstacles`.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def boxes_at(scripted: tuple[Scripted, ...], step: int) -> Boxes:
 
 
 def standing_and_moving(extras: tuple[Scripted, ...]) -> tuple[tuple[Scripted, ...], tuple[Scripted, ...]]:
-    """Those who stand in one place all the time, and the others."""
+    """Split scripted users into static and moving ones."""
     fixed = [bool(e.valid.all() and not e.speed.any() and not np.ptp(e.xy, axis=0).any()) for e in extras]
     return (
         tuple(e for e, still in zip(extras, fixed, strict=True) if still),
@@ -124,7 +123,7 @@ class Leaders:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and that vehicle.
 
         Args:
-            tables: Everyone's paths.
+            tables: All paths.
             at_m: Where they are on them.
             active: Which of them are there.
         """
@@ -161,7 +160,7 @@ _KEEP_M, _END_M = 5.0, 10.0
 _SPEED_TIME_S = 0.6
 #: Jerk beyond a driver's own is used when braking harder than this, m/s2.
 _EMERGENCY_MPS2, _EMERGENCY_JERK = 3.6, 25.0
-#: Lane changes and ways around things are considered every so many steps.
+#: Steps between decisions about lane changes and detours.
 _DECIDE_EVERY = 5
 #: A driver stays in its lane for this long after a change, s.
 _REST_S = 4.0
@@ -177,10 +176,10 @@ _NO_BOXES = boxes_at((), 0)
 
 
 class Traffic:
-    """Everybody, moved step by step.
+    """Traffic of all users, advanced step by step.
 
     Args:
-        roles: Who there is.
+        roles: All users.
         times_s: Times of all steps to come, on the clock of the signals.
     """
 
@@ -197,17 +196,17 @@ class Traffic:
             self.colour, self.to_red = roles.network.signals.colours(times_s, shape[1])
 
     def until(self, steps: int) -> Traffic:
-        """The same, ending earlier."""
+        """Return the traffic with fewer steps."""
         shorter = copy.copy(self)
         shorter.times_s = self.times_s[:steps]
         return shorter
 
     def run(self, staging: Staging | None = None, ego: EgoPlan | None = None) -> Motion:
-        """Moves everyone through all steps.
+        """Run all steps.
 
         Args:
             staging: What an event changes.
-            ego: How ego drives from a step on; None: like everybody.
+            ego: Ego's plan from a step on; None: ego drives like the others.
         """
         return _Run(self, staging or Staging(), ego).finished()
 
@@ -238,7 +237,7 @@ class _Run:
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
         self._walkers = Walkers(self._network, roles.walkers, traffic.times_s) if roles.walkers else None
         self._occupied_crossings = np.zeros(len(self._network.crossings), bool)
-        self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path: who stops for people
+        self._halting = np.zeros((0, 0), bool)  # [vehicle, crossing on its path]: stops for walkers
         self._delay = np.rint(roles.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
         self._at, self._speed = roles.distance_m.copy(), roles.speed_mps.copy()
         for row in staging.removed:  # it has left before anything begins
@@ -256,7 +255,7 @@ class _Run:
         self._people = self._vehicles = _NO_BOXES
 
     def finished(self) -> Motion:
-        """Goes through all steps and collects what happened."""
+        """Run all steps and collect the motion."""
         count, steps = len(self._rows), len(self._fixed.times_s)
         pose, walked = np.zeros((count, steps, 3)), np.zeros((len(self._fixed.roles.walkers), steps, 4))
         speed, at, acceleration = (np.zeros((count, steps)) for _ in range(3))
@@ -292,7 +291,7 @@ class _Run:
         self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
 
     def _put_ego(self, t: int) -> bool:
-        """Puts ego where its plan says; whether there is a plan for this step."""
+        """Put ego where its plan says; whether there is a plan for this step."""
         if self._ego is None or t < self._ego.first_step:
             return False
         k = t - self._ego.first_step
@@ -302,7 +301,7 @@ class _Run:
     def _walk(
         self, t: int, active: Bool[np.ndarray, " v"], walked: Float64[np.ndarray, "walker time 4"]
     ) -> None:
-        """Moves the walkers and gathers everybody who moves as told."""
+        """Advance the walkers and gather scripted users."""
         self._people = _NO_BOXES
         if self._walkers is not None:
             people, self._occupied_crossings = self._walkers.step(
@@ -339,7 +338,7 @@ class _Run:
             )
         else:
             gaps[2] += (leads[2] - self._speed) * DT_S
-        # Speeds below zero are those of a told ego that reverses: to the law it stands.
+        # Only a planned ego reverses; the IDM treats it as standing.
         speed = np.maximum(self._speed, 0.0)
         following = idm_acceleration(speed, fastest, gaps, np.maximum(leads, 0.0), self._idm)
         # What stands still is not braked for harder than it takes to stop there, and a little more.
@@ -352,14 +351,14 @@ class _Run:
     def _helping(
         self, preferred: Float64[np.ndarray, " v"], fastest: Float64[np.ndarray, " v"]
     ) -> Float64[np.ndarray, " v"]:
-        """Makes room for those who must change lanes, and lets these fall in behind whom they will follow."""
+        """Open gaps for mandatory lane changes on both lanes."""
         h = self._helped
         if len(h.behind):
             gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
             idm = self._drivers.chosen(h.behind).idm
             speed = self._speed[h.behind]
             helpful = idm_acceleration(speed, fastest[h.behind], gap, self._speed[h.ahead], idm)
-            # Nobody who is past can be let in; nobody is helped by a standstill.
+            # Vehicles already past need no room, and a standstill does not help.
             helpful = np.where((gap > -2.0) & (speed > 1.5), np.maximum(helpful, -HELP_MPS2), np.inf)
             np.minimum.at(preferred, h.behind, helpful)
         return preferred
@@ -397,7 +396,7 @@ class _Run:
         return room
 
     def _crossings(self, front: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """Distance to the next crossing that people claim; who cannot stop with ease when they come goes on."""
+        """Distance to the next occupied crossing at which a vehicle can stop comfortably."""
         away = self._tables.crossing_m - front[:, None]
         needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._occupied_crossings[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)
@@ -407,7 +406,7 @@ class _Run:
         return np.where(self._halting, away, np.inf).min(axis=1)
 
     def _acted(self, t: int, preferred: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """What drivers do: what they wanted a reaction time ago, or what the event makes them do."""
+        """Return applied accelerations: the preferred ones a reaction time ago, bounded by overrides."""
         depth = len(self._memory)
         if t == 0:
             self._memory[:] = preferred
@@ -422,7 +421,7 @@ class _Run:
     def _advance(
         self, preferred: Float64[np.ndarray, " v"], active: Bool[np.ndarray, " v"]
     ) -> Float64[np.ndarray, " v"]:
-        """Moves everyone by one step and returns the accelerations; speeds never fall below zero."""
+        """Advance by one step and return accelerations; speeds stay non-negative."""
         jerk = np.where(preferred < -_EMERGENCY_MPS2, _EMERGENCY_JERK, self._drivers.jerk_mps3) * DT_S
         a = np.clip(preferred, self._last - jerk, self._last + self._drivers.jerk_mps3 * DT_S)
         after = self._speed + a * DT_S
@@ -443,7 +442,7 @@ class _Run:
         fastest: Float64[np.ndarray, " v"],
         active: Bool[np.ndarray, " v"],
     ) -> None:
-        """Lane changes and ways around things that begin now."""
+        """Start lane changes and detours."""
         calm = (self._at > self._busy_m) & (self._rest <= t) & active
         calm &= ~self._staged(t)
         free = calm.copy()
@@ -458,7 +457,7 @@ class _Run:
         self._pass(t, calm)
 
     def _staged(self, t: int) -> Bool[np.ndarray, " v"]:
-        """Who does not decide because an event has decided for it."""
+        """Mask of vehicles under an override."""
         result = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
             result[override.vehicle] |= t >= override.first_step
@@ -470,9 +469,9 @@ class _Run:
         ahead = {span.lane for span in present.spans}
         while self._network.lanes[lanes[-1]].successors:
             after = onward(self._network, lanes)
-            beside = [k for k in after if k in ahead]
+            on_present_path = [k for k in after if k in ahead]
             # The old way where it is open, else one of the ways by turns: no chance is needed here.
-            lanes.append(beside[0] if beside else after[(row + len(lanes)) % len(after)])
+            lanes.append(on_present_path[0] if on_present_path else after[(row + len(lanes)) % len(after)])
         sway = Sway((0.08,), (0.07,), (float(row),))
         path, at = change_onto(
             lane_path(self._network, tuple(lanes), sway), present, self._at[row], change.length_m
@@ -481,7 +480,7 @@ class _Run:
         self._busy_m[row], self._rest[row] = at + change.length_m, t + round(_REST_S / DT_S)
 
     def _pass(self, t: int, calm: Bool[np.ndarray, " v"]) -> None:
-        """Ways around what stands in the lane, for those who are near it and cannot change lanes in time."""
+        """Start detours of vehicles near a standing obstacle."""
         halted = self._people.chosen(np.abs(self._people.speed) < 0.05)
         stuck = np.zeros(len(self._rows), bool)
         for override in self._staging.overrides:
@@ -505,7 +504,7 @@ class _Run:
                 self._pass_by(t, row, standing, stuck)
 
     def _pass_by(self, t: int, row: int, standing: Boxes, stuck: Bool[np.ndarray, " v"]) -> None:
-        """A way around what stands ahead of a vehicle, if there is one."""
+        """Start a detour around an obstacle ahead, if there is one."""
         others = self._vehicles.chosen((self._rows != row) & ~stuck & (self._at > 0.0))
         moving = others.joined(self._people.chosen(np.abs(self._people.speed) >= 0.05))
         size = (float(2 * self._half_m[row]), float(self._width_m[row]))
