@@ -1,4 +1,4 @@
-"""The frame of the command line: what is listed, how errors are told, which status comes back."""
+"""The command line: list of commands, error messages, exit status."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def drivers(count):
 
 
 def scene(network, routes, at, speed, parked=()):
-    """Everybody drives along a sequence of lanes at constant speed; the first is ego."""
+    """All users drive along a sequence of lanes at constant speed; the first is ego."""
     paths = [lane_path(network, route, Sway()) for route in routes]
     times = np.arange(STEPS) * 0.1
     distance = np.array(at, float)[:, None] + np.array(speed, float)[:, None] * times
@@ -106,7 +106,7 @@ def junction(turning):
 
 
 def parked_row():
-    """Cars beside the road every 9 m, 2.6 m to the right of ego's way."""
+    """Cars next to the road every 9 m, 2.6 m to the right of ego's way."""
     poses = [Pose(60.0 + 9.0 * k, -2.7, 0.0) for k in range(30)]
     return [Scripted.standing(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
 

@@ -51,7 +51,7 @@ def crossed(lines_at, control, network=None):
 
 
 def user(xy, heading=0.0, size=CAR, kind=AgentKind.VEHICLE, velocity=(0.0, 0.0), from_s=0.0):
-    """Somebody who moves at constant velocity from a time on: (kind, size, xy, heading, speed)."""
+    """A user that moves at constant velocity from a time on: (kind, size, xy, heading, speed)."""
     moved = np.maximum(TIMES - from_s, 0.0)[:, None] * np.array(velocity)
     speed = np.where(from_s <= TIMES, math.hypot(*velocity), 0.0)
     return kind, size, np.array(xy) + moved, np.full(len(TIMES), float(heading)), speed
@@ -83,7 +83,7 @@ def scene(network, speed, users=(), at=30.0, lanes=(0,)):
 
 
 def driven(motion, plan: EgoPlan):
-    """The motion with ego where its plan says; nobody reacts."""
+    """The motion with ego where its plan says; no user reacts."""
     xy, heading, speed = motion.xy.copy(), motion.heading.copy(), motion.speed.copy()
     xy[0, plan.first_step :], heading[0, plan.first_step :] = plan.xy, plan.heading
     speed[0, plan.first_step :] = plan.speed

@@ -20,7 +20,7 @@ BARRIER = (1.0, 20.0, 1.5)
 
 
 class Runs:
-    """Traffic in which nobody reacts; it remembers the plans."""
+    """Traffic in which no user reacts; it remembers the plans."""
 
     def __init__(self, motion, reaction=None):
         self.motion, self.plans, self.reaction = motion, [], reaction
@@ -60,7 +60,7 @@ def test_ego_acts_late_if_that_is_early_enough(aware, begins):
     assert [plan.first_step for plan in runs.plans] == begins
 
 
-def test_what_cannot_be_avoided_is_rejected_by_its_cause():
+def test_unavoidable_collisions_are_rejected_by_cause():
     roles, motion = scene(road((1,)), 14.0, [user((40.0, 0.0), size=BARRIER)])
     runs = Runs(motion)
     _, cause = drive_ego(roles, TIMES, EVENT, 0, runs)

@@ -35,7 +35,7 @@ def braking(plan):
 
 
 def walker(ahead_m, side_m, speed, from_s=0.0):
-    """Somebody who walks across the road, so far ahead of ego's front."""
+    """A user that walks across the road, so far ahead of ego's front."""
     x = 30.0 + CAR[0] / 2 + ahead_m + PERSON[0] / 2
     return user((x, side_m), np.pi / 2, PERSON, AgentKind.PEDESTRIAN, (0.0, speed), from_s)
 
@@ -183,7 +183,7 @@ def test_a_plan_begins_with_the_pose_of_its_first_step():
     assert plan.speed[0] == motion.speed[0, 30]
 
 
-def test_ego_beside_its_path_is_taken_where_it_is():
+def test_plans_start_at_the_offset_of_ego_from_its_path():
     roles, motion = scene(road(), 12.0)
     xy, heading = motion.xy.copy(), motion.heading.copy()
     xy[0, :, 1] += 0.7

@@ -53,6 +53,6 @@ def test_a_cyclist_is_followed_only_where_the_lane_is_too_narrow_to_pass(width, 
     assert gap[0] == (pytest.approx(20.0 - 3.2, abs=1e-6) if follows else np.inf)
 
 
-def test_nobody_there_leads_nobody():
+def test_an_empty_road_has_no_leaders():
     gap, _ = leaders([(0,), (0,)], [20.0, 40.0], drivers(2), [False, False])
     assert np.all(gap == np.inf)

@@ -30,7 +30,7 @@ def test_placed_vehicles_keep_their_distance(seed):
                 assert network.lanes[lane].length_m - along + there > 15.0
 
 
-def test_nobody_begins_in_or_right_behind_what_stands_in_a_lane_or_where_a_lane_ends():
+def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
     network, _ = road(600.0, lanes=2)
     lanes = (network.lanes[0], dataclasses.replace(network.lanes[1], ends=True))
     network = dataclasses.replace(network, lanes=lanes)
@@ -63,7 +63,7 @@ def test_shares_of_types_are_those_asked_for():
     assert table.critical_gap_s.min() >= 3.5 and table.critical_gap_s.max() <= 6.0
 
 
-def test_nobody_cycles_on_fast_roads_and_only_cyclists_use_their_lanes():
+def test_no_cyclists_on_fast_roads_and_only_cyclists_on_bicycle_lanes():
     lane = road()[0].lanes[0]
     fast, bike = dataclasses.replace(lane, limit_mps=25.0), dataclasses.replace(lane, kind=RoadKind.LANE_BIKE)
     lanes = [fast] * 300 + [bike] * 10 + [lane] * 300

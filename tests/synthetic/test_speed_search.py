@@ -103,7 +103,7 @@ def test_bends_bound_the_speed():
     assert speed[at > 41.0].max() <= 6.2
 
 
-def test_who_stands_can_start():
+def test_a_standing_ego_can_start():
     plan = run(occupancy(), 0.0)
     assert plan.speed[0] == 0.0
     assert np.diff(plan.speed)[:4].min() > 0.0

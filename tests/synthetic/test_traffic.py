@@ -55,7 +55,7 @@ def test_the_speed_profile_is_the_slowest_that_is_needed():
     assert got.min() < top.max()
 
 
-def test_a_free_driver_reaches_and_holds_the_wanted_speed():
+def test_a_free_driver_reaches_and_holds_the_preferred_speed():
     motion = run(line_with_light(), drivers(1, speed_factor=0.9), [10.0], [5.0], 20.0)
     assert motion.speed[0, -1] == pytest.approx(0.9 * 15.0, rel=0.02)
     assert motion.speed[0].max() <= 0.9 * 15.0 + 0.05
@@ -63,7 +63,7 @@ def test_a_free_driver_reaches_and_holds_the_wanted_speed():
 
 @pytest.mark.parametrize("speed", [6.0, 10.0, 14.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_at_red_everybody_stops_behind_the_line(speed, seed):
+def test_all_vehicles_stop_behind_the_line_at_red(speed, seed):
     table = drivers(3, seed, speed_factor=0.95)
     motion = run(line_with_light(light(1.0, -10.0)), table, [140.0, 110.0, 70.0], [speed] * 3, 30.0)
     front = motion.distance_m[0] + table.size_m[0, 0] / 2
@@ -97,7 +97,7 @@ def test_yellow_is_stopped_for_or_passed_but_red_never_run(at):
     assert motion.acceleration.min() > -5.5
 
 
-def test_nobody_touches_a_leader_who_brakes_to_a_halt():
+def test_no_follower_touches_a_leader_that_brakes_to_a_halt():
     table = drivers(4, seed=2)
     stop = Override(vehicle=0, first_step=20, last_step=120, acceleration_mps2=-4.0)
     motion = run(line_with_light(), table, [150.0, 120.0, 92.0, 60.0], [12.0] * 4, 16.0, (stop,))
@@ -122,7 +122,7 @@ def test_positions_are_the_integral_of_speeds_and_stops_are_exact():
 
 
 @pytest.mark.parametrize("crossing", [True, False])
-def test_nobody_enters_while_somebody_still_crosses(crossing):
+def test_no_vehicle_enters_while_another_still_crosses(crossing):
     network = crossroads()
     assert np.argwhere(network.conflicts).tolist() == [[1, 4], [4, 1]]
     table = drivers(2, speed_factor=0.9)
@@ -165,7 +165,7 @@ def test_a_platoon_settles_at_the_gap_of_the_closed_form():
         assert gap == pytest.approx(wanted, rel=0.02)
 
 
-def test_drivers_act_on_what_they_wanted_a_reaction_time_ago():
+def test_drivers_apply_decisions_after_their_reaction_time():
     network, _ = road(1000.0)
     stop = Staging(overrides=(Override(0, 30, 100, -3.0),))
     begins = []
@@ -253,7 +253,7 @@ def test_the_order_of_users_and_the_same_run_twice():
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
 @pytest.mark.parametrize("seed", range(2))
-def test_in_dense_traffic_nobody_touches_anybody(family, seed):
+def test_dense_traffic_has_no_overlaps(family, seed):
     rng = np.random.default_rng(seed)
     network = family.build(rng)
     start = network.starts[int(rng.integers(len(network.starts)))]

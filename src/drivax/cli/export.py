@@ -33,7 +33,7 @@ class Export:
     ids: Path | None = None
     """Only scenarios that this file names: one id per line, or data set, tabulator and id (a split file)."""
     limit: int | None = None
-    """At most so many scenarios."""
+    """At most N scenarios."""
     paths: Literal["vmax", "published"] = "vmax"
     """Routes in tf.Examples: 10 of 300 points at 1 m, or 10 of 500 points at 0.5 m."""
     shard_size: int = 500

@@ -39,16 +39,16 @@ class Conversion:
     """How to convert.
 
     Attributes:
-        format: Name of a format, or ``auto``: each file by its content.
-        capacity: Name of the padded sizes (``scenario.schema.CAPACITIES``).
-        limit: Stop when the set holds this many scenarios; None: all.
-        filters: Keep only scenarios that satisfy all of them (``scenario.select.selection``).
-        routes: How routes are found (``scenario.build.assemble.assemble``).
-        stride: Steps between the starts of two windows of a long recording.
-        split: Percentages of recordings for train/validation/test, as ``80/10/10``; None: no split files.
-        workers: Processes; with 1 everything happens in this one.
-        strict: Fail at the first record that cannot be read instead of skipping it.
-        overwrite: Replace an existing scenario set, and discard an unfinished conversion with other options.
+        format: Format of the files; auto detects it file by file.
+        capacity: Padded sizes; large for scenarios with more than 80 moving agents or very dense maps.
+        limit: Stop when the set holds N scenarios; all by default.
+        filters: Only scenarios that meet this condition (NAME=A|B, NAME!=A, NAME>=N); repeat it to combine several.
+        routes: How to find routes: our generator, or the published breadth-first search.
+        stride: Steps between the starts of two windows of a recording longer than 91 steps.
+        split: Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10.
+        workers: Processes that read; 1 reads in the main process.
+        strict: Stop at the first unreadable record instead of skipping it.
+        overwrite: Replace an existing scenario set, or start again after another, interrupted conversion.
         shard_size: Scenarios per shard of the set, the unit of resume.
     """
 

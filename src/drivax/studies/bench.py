@@ -50,14 +50,14 @@ _Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """What is timed.
+    """Settings of a benchmark.
 
     Attributes:
-        batch: Environments side by side, a multiple of the number of devices.
+        batch: Parallel environments, a multiple of the number of devices.
         steps: Steps per timed call.
-        repeats: Timed calls; the median counts.
+        repeats: Timed calls; the median is reported.
         task: Observation, reward, metrics.
-        traffic: How the others move.
+        traffic: Traffic model: log, idm, package.module:name, a run folder or zoo:NAME.
     """
 
     batch: int = 256

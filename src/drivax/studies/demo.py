@@ -41,10 +41,11 @@ class DemoConfig:
     """Sizes of the demo.
 
     Attributes:
-        training, held_out: Numbers of scenarios.
+        training: Scenarios to train on.
+        held_out: Scenarios to evaluate on.
         preset: Training configuration.
         overrides: Changes to it, as on the command line.
-        workers: Processes that generate.
+        workers: Processes that generate; one per CPU core by default.
     """
 
     training: int = 256

@@ -70,7 +70,7 @@ def find_conflicts(
     """Find conflicts of ego's box along a path with other boxes.
 
     Args:
-        candidate: Ego's way.
+        candidate: Ego's path.
         size_m: Ego's length, width, height.
         others: Boxes of the others.
         valid: When they exist.

@@ -124,7 +124,7 @@ def _least(
     low: Float64[np.ndarray, " m"],
     high: Float64[np.ndarray, " m"],
 ) -> Float64[np.ndarray, " n"]:
-    """Minimises ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
+    """Minimise ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
     a = np.linalg.solve(base, target)
     value = _times(rows, a)
     for _ in range(_NEWTON_STEPS):

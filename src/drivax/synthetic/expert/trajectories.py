@@ -16,7 +16,7 @@ from drivax.synthetic.traffic.lateral import located, quintic_step
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path, smoothed_curvature
 
-#: Distance between the samples of a way, m.
+#: Distance between the samples of a path, m.
 SPACING_M = 0.5
 #: Lateral acceleration and yaw rate beyond which no plan goes: nuPlan's limits of comfort with a reserve.
 _LATERAL_MPS2, _YAW_RATE_RPS = 4.2, 0.8
@@ -87,7 +87,7 @@ def shifted_path(
         path: Ego's path.
         drivers: Row 0 is ego's driver.
         pose: Where ego is now.
-        span_m: About where on the path ego is, and how far the way reaches, m; it ends where the path does.
+        span_m: About where on the path ego is, and how far the path reaches, m; it ends where the path does.
         shift: How it leaves the path.
     """
     begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])

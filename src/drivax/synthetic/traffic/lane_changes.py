@@ -32,7 +32,7 @@ _DURATION_S, _SHORTEST_M, _LEAST_MPS = 4.2, 14.0, 3.0
 _ROOM_M, _ROOM_S = 2.0, 0.25
 #: After a change a driver stays for this long, s; no changes this close behind or before a junction, m.
 _REST_S, _AFTER_M, _BEFORE_M = 4.0, 12.0, 25.0
-#: Those who make room brake at most like this, m/s2.
+#: Largest braking to make room for others, m/s2.
 HELP_MPS2 = 1.8
 
 
@@ -157,7 +157,7 @@ class LaneChanges:
         self._thing_half = np.full(len(self._thing_chain), 2.4)
 
     def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
-        """The changes that begin now, and who helps whom that has to change."""
+        """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
         rows = np.arange(len(now.at_m))
         lane, along = tables.on(now.at_m, rows)
         own = lane[:, 0]
@@ -240,7 +240,7 @@ class LaneChanges:
     def _followed(
         self, now: Situation, vehicles: Int64[np.ndarray, " k"], behind: _Next, ahead: _Next
     ) -> _Pair:
-        """Accelerations of followers who have a vehicle ahead of them, and the one ahead of that; 0 without any."""
+        """Return followers' accelerations behind the vehicle and behind its leader; 0 without a follower."""
         row, gap, _ = behind
         there, row = row >= 0, np.maximum(row, 0)
         gaps = np.stack([gap, gap + 2 * self._half[vehicles] + ahead[1]])

@@ -268,7 +268,7 @@ def _take_up(
     lane: np.ndarray,
     lane_m: Float64[np.ndarray, "point slot"],
 ) -> None:
-    """Enters a lane into the first free slot of the samples on which it is taken up."""
+    """Enter a lane into the first free slot of the samples on which it is taken up."""
     here = (at >= other.from_m) & (at <= other.until_m) & ~(lane == other.lane).any(axis=1)
     for slot in range(SLOTS):
         free = here & (lane[:, slot] < 0)

@@ -32,7 +32,8 @@ class PathTables:
         lane, lane_m: Lanes taken up at each sample, and where on them.
         begin, scale, since, until: Per lane of the network: where it begins on the path (nan: it does not), and the
             range of own positions in which others on it matter.
-        way, connector_begin, connector_end: Connectors on the path in order (-1: none), and where they begin and end.
+        connector, connector_begin, connector_end: Connectors on the path in order (-1: none), and where they begin and
+            end.
         crossing, crossing_m: Crossings on the path in order of travel (-1: none), and where their near side is.
         stop_m: Where the last lane ends although the road goes on, m (infinite: it does not).
     """
@@ -66,7 +67,7 @@ class PathTables:
             self.replace(row, path)
 
     def replace(self, row: int, path: Path) -> None:
-        """Enters the path of one vehicle."""
+        """Enter the path of one vehicle."""
         self.paths[row] = path
         d, n = self._drivers, len(path.curve.xy)
         self._grow(n)

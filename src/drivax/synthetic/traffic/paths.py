@@ -168,7 +168,7 @@ def _turned(angle: Float64[np.ndarray, " point"]) -> Float64[np.ndarray, " point
 
 
 def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
-    """Adds curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
+    """Add curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretched(stretch) for span in spans]

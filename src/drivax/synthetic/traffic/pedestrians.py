@@ -191,7 +191,7 @@ class Walkers:
         active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
     ) -> None:
-        """Lets those go who are at the kerb of a crossing that is safe for as long as they need."""
+        """Release walkers at the kerb of a crossing that is safe for long enough."""
         before = self._kerb - self._at
         asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
         if not np.count_nonzero(asks):
@@ -305,7 +305,7 @@ def _within(
 def place_walkers(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
 ) -> tuple[Walker, ...]:
-    """Draws who walks: along the sidewalks in both directions, and over the crossings.
+    """Draw walkers: along the sidewalks in both directions, and over the crossings.
 
     Args:
         network: The roads.
@@ -376,7 +376,7 @@ def _along_walk(
 
 
 def _polyline(points: Float64[np.ndarray, "point 2"]) -> Curve:
-    """A way through points; the heading turns at the corners."""
+    """Return a curve through points; the heading turns at the corners."""
     steps = np.diff(points, axis=0)
     kept = np.concatenate([[True], np.hypot(*steps.T) > 1e-6])
     points = points[kept]

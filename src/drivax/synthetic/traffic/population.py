@@ -217,7 +217,7 @@ def placed(
 def _apart_in_space(
     network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
 ) -> list[tuple[int, float]]:
-    """Drops who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
+    """Drop who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
     kept: list[tuple[float, float]] = []
     result = []
     for place in [ego, *vehicles]:
@@ -251,7 +251,7 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
 def _apart_at_joints(
     network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
 ) -> list[tuple[int, float]]:
-    """Drops who stands too close behind the first vehicle of a following lane."""
+    """Drop who stands too close behind the first vehicle of a following lane."""
     kept = []
     first: dict[int, float] = {}
     for lane, along in [*vehicles, (ego_lane, ego_along_m)]:

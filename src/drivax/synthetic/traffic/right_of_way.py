@@ -201,7 +201,7 @@ class RightOfWay:
         place: Int64[np.ndarray, " v"],
         stop: Float64[np.ndarray, " v"],
     ) -> None:
-        """Grants or denies what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
+        """Grant or deny what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
         index = np.arange(tables.connector.shape[1])
         held = (
             (index < self._granted[:, None])

@@ -1,4 +1,4 @@
-"""Who takes part in a scenario: ego on its way, the others with their drivers, people on foot, parked cars, lights."""
+"""Assign the roles of a scenario: ego's route, other vehicles and drivers, walkers, parked cars, lights."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _WHEN_S = (0.4, 4.0)
 
 
 def giving_way(network: RoadNetwork) -> tuple[Aim, ...]:
-    """Connectors whose users give way to others who need not wait themselves."""
+    """Return destinations on connectors that yield to users with unconditional priority."""
     return tuple(
         Aim(index, (0.0, min(3.0, lane.length_m)), _WHEN_S)
         for index, lane in enumerate(network.lanes)
@@ -44,7 +44,7 @@ def giving_way(network: RoadNetwork) -> tuple[Aim, ...]:
 
 
 def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
-    """Connectors that a path gives way to, and lanes that it changes to; of those that give way themselves none.
+    """Return connectors that a path yields to (unless they yield themselves) and lanes it changes to.
 
     Args:
         network: The roads.
@@ -76,9 +76,9 @@ def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
 
 #: Shares of what the light does for ego: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]
-#: Ego begins at least this far along its way, m.
+#: Ego begins at least this far along its path, m.
 _LEAST_M = 12.0
-#: Further ways that are drawn for ego in the hope that it has to give way.
+#: Further routes drawn for ego until it has to give way.
 _ROUTES = 4
 
 
@@ -92,17 +92,17 @@ def assign_roles(
     destinations: Sequence[Aim] = (),
     critical: bool = False,
 ) -> Roles:
-    """Draws ego, its way and lights, then the others and theirs.
+    """Draw ego, its route and lights, then the others.
 
     Args:
         network: The roads.
-        domain: How full they are, and of whom.
+        domain: Traffic density and composition.
         times_s: Times of all steps; the recording begins at time 0, before it traffic warms up.
         lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
         timing: Shares of what the light does for ego.
         rng: Source of chance.
         destinations: Places of which ego should pass one unhindered; without any it begins and goes where it likes.
-        critical: Ego takes a way on which it has to give way to others if there is one, and these are many.
+        critical: Ego's route leads where it must give way to dense traffic, if the roads allow it.
     """
     driver = expert.draw_expert(rng)
     aimed = drawn_aimed_way(network, giving_way(network) if critical else destinations, rng)
@@ -191,7 +191,7 @@ def _lights(
 def _timed(
     plan: SignalPlan, route: int, shares: tuple[float, float, float], rng: np.random.Generator
 ) -> SignalPlan:
-    """Sets the plan's clock so that ego's light does something of interest during the recording (time 0 on)."""
+    """Set the plan's clock so that ego's light does something of interest during the recording (time 0 on)."""
     phase = plan.phase_of(route)
     what = int(rng.choice(3, p=shares))
     if what == 0:  # green for a while before ego comes

@@ -20,10 +20,10 @@ class Walker:
 
     Attributes:
         curve: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
-        start_m: Position along the way when traffic begins, before the warm-up.
+        start_m: Position along the curve when traffic begins, before the warm-up.
         speed_mps: Free walking speed.
-        crossing: Index of the crossing that the way leads over, -1 none.
-        kerb_m, across_m: Where on the way the kerbs are: where to wait, and where the road is left again.
+        crossing: Index of the crossing that the curve leads over, -1 none.
+        kerb_m, across_m: Where on the curve the kerbs are: where to wait, and where the road is left again.
         size_m: Length, width, height.
     """
 

@@ -1,4 +1,4 @@
-"""Traffic at 10 Hz: many vehicles on lane paths who follow, stop, give way, change lanes and go around things.
+"""Traffic at 10 Hz: vehicles on paths follow, stop, give way, change lanes and avoid obstacles.
 
 The law of following is the simulator's own (:mod:`drivax.simulator.idm`). All vehicles move at once: one step is a
 few dozen array operations over vehicles, whatever their number. Who may enter a junction is decided in
@@ -123,7 +123,7 @@ class Leaders:
         """Gap to the nearest vehicle ahead on the own lanes (infinite: none), and that vehicle.
 
         Args:
-            tables: Everyone's paths.
+            tables: All paths.
             at_m: Where they are on them.
             active: Which of them are there.
         """
@@ -237,7 +237,7 @@ class _Run:
         self._changes = LaneChanges(self._network, roles.drivers, boxes)
         self._walkers = Walkers(self._network, roles.walkers, traffic.times_s) if roles.walkers else None
         self._occupied_crossings = np.zeros(len(self._network.crossings), bool)
-        self._halting = np.zeros((0, 0), bool)  # per vehicle and crossing on its path: who stops for people
+        self._halting = np.zeros((0, 0), bool)  # [vehicle, crossing on its path]: stops for walkers
         self._delay = np.rint(roles.drivers.reaction_s / DT_S).astype(int).clip(0, _SLOWEST)
         self._at, self._speed = roles.distance_m.copy(), roles.speed_mps.copy()
         for row in staging.removed:  # it has left before anything begins
@@ -291,7 +291,7 @@ class _Run:
         self._right_of_way.swapped(row, self._tables, at + self._half_m[row])
 
     def _put_ego(self, t: int) -> bool:
-        """Puts ego where its plan says; whether there is a plan for this step."""
+        """Put ego where its plan says; whether there is a plan for this step."""
         if self._ego is None or t < self._ego.first_step:
             return False
         k = t - self._ego.first_step
@@ -351,7 +351,7 @@ class _Run:
     def _helping(
         self, preferred: Float64[np.ndarray, " v"], fastest: Float64[np.ndarray, " v"]
     ) -> Float64[np.ndarray, " v"]:
-        """Makes room for those who must change lanes, and lets these fall in behind whom they will follow."""
+        """Open gaps for mandatory lane changes on both lanes."""
         h = self._helped
         if len(h.behind):
             gap = h.gap_m + self._at[h.ahead] - self._at[h.behind]
@@ -396,7 +396,7 @@ class _Run:
         return room
 
     def _crossings(self, front: Float64[np.ndarray, " v"]) -> Float64[np.ndarray, " v"]:
-        """Distance to the next crossing that people claim; who cannot stop with ease when they come goes on."""
+        """Distance to the next occupied crossing at which a vehicle can stop comfortably."""
         away = self._tables.crossing_m - front[:, None]
         needed = self._speed[:, None] ** 2 / (2 * np.maximum(away, 0.05))
         halt = self._occupied_crossings[self._tables.crossing] & (self._tables.crossing >= 0) & (away > -0.5)

@@ -28,7 +28,7 @@ def way_of(roles, shift=None, reach=60.0):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_meetings_agree_with_clipped_polygons(seed):
+def test_conflicts_agree_with_clipped_polygons(seed):
     rng = np.random.default_rng(seed)
     others = [
         user(
@@ -65,7 +65,7 @@ def test_meetings_agree_with_clipped_polygons(seed):
     assert len(brute) > 20
 
 
-def test_who_never_moves_is_met_at_all_steps():
+def test_static_users_conflict_at_all_steps():
     roles, motion = scene(road(), 10.0, [user((60.0, 0.0))])
     got = find_conflicts(
         way_of(roles), motion.size_m[0], user_boxes(motion)[1:], motion.valid[1:], np.zeros(1, dtype=bool)
@@ -76,7 +76,7 @@ def test_who_never_moves_is_met_at_all_steps():
     assert (np.bincount(got.step[got.hard]) == len(places)).all()
 
 
-def test_a_red_light_is_a_wall_and_late_yellow_is_avoided():
+def test_red_lights_close_the_stop_line_and_late_yellow_is_avoided():
     plan = SignalPlan((LightGroup((1,), False),), ((0,),), (5.0,), offset_s=-3.0)
     network = crossed(100.0, Control.SIGNAL)
     network = type(network)(**{**vars(network), "signals": plan})

@@ -19,7 +19,7 @@ def built(name, seed):
     return family.build(np.random.default_rng(seed))
 
 
-def test_who_gives_way_meets_those_it_yields_to_unless_they_wait_themselves():
+def test_conflicts_are_connectors_with_priority_that_need_not_wait():
     network = crossroads()
     lanes = list(network.lanes)
     lanes[1] = dataclasses.replace(lanes[1], yields_to=(4,), control=Control.YIELD)
@@ -33,13 +33,13 @@ def test_who_gives_way_meets_those_it_yields_to_unless_they_wait_themselves():
     assert giving_way(both) == ()
 
 
-def test_at_an_all_way_stop_all_that_cross_are_met():
+def test_all_crossing_connectors_conflict_at_an_all_way_stop():
     network = crossroads(control=[Control.ALL_WAY_STOP] * 2)
     assert conflicts_on(network, lane_path(network, (0, 1, 2), Sway())) == {4}
     assert sorted(aim.lane for aim in giving_way(network)) == [1, 4]
 
 
-def test_the_lane_that_is_changed_to_is_met():
+def test_the_target_lane_of_a_lane_change_conflicts():
     network, columns = road(lanes=2)
     path = lane_path(network, (columns[0][0], columns[1][0]), Sway(), LaneChange(0, 20.0, 60.0))
     assert conflicts_on(network, path) == {columns[1][0]}

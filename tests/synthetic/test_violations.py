@@ -132,7 +132,7 @@ def test_running_red_means_red_before_and_after():
     assert seen == {True, False}
 
 
-def test_a_stop_sign_wants_standing():
+def test_a_stop_sign_requires_standing():
     roles, motion = scene(crossed(100.0, Control.STOP), 10.0, lanes=(0, 1, 2))
     assert cause(roles, motion) == "ego_runs_stop_sign"
     # Braking with 2 m/s2 from 10 m/s takes 25 m; the front begins at 32.3 m.
@@ -150,7 +150,7 @@ def test_a_stop_sign_wants_standing():
     assert last_stop(roles, motion, 7) == 7
 
 
-def test_what_ego_must_not_do():
+def test_violations_of_ego():
     roles, motion = scene(road(), 12.0)
     assert cause(roles, motion) == ""
     assert cause(roles, with_speed(motion, np.full(91, 0.5))) == "ego_hardly_moves"
@@ -211,7 +211,7 @@ def test_lights_of_one_lane_do_not_hold_for_another():
 @pytest.mark.parametrize(
     ("aside_m", "counts"), [(0.0, False), (1.8, False), (2.5, True), (WIDTH, True), (6.0, False)]
 )
-def test_beside_its_way_the_light_of_another_lane_counts(aside_m, counts):
+def test_the_light_of_another_lane_counts_off_the_route(aside_m, counts):
     # Two lanes side by side, lights only for the left one; ego goes along the right one, or aside of it.
     one = crossed(100.0, Control.SIGNAL).lanes
     beside = [
@@ -244,6 +244,6 @@ def test_beside_its_way_the_light_of_another_lane_counts(aside_m, counts):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("domain", "index"), [("grid", 657), ("ring", 154)])
-def test_nobody_goes_around_a_broken_car_over_the_line_of_a_red_light(domain, index):
+def test_no_expert_passes_a_stalled_car_over_the_line_of_a_red_light(domain, index):
     made = assemble(generate_recording(1, index, WorldConfig(domain=domain, rare_rate=1.0)))
     assert audit([made])[0]["log_runs_red"] is False

@@ -120,7 +120,7 @@ def test_at_a_light_people_wait_for_red_and_for_enough_of_it():
     assert np.all(colour[on, 1] == Colour.RED)
 
 
-def test_nobody_walks_into_a_standing_queue():
+def test_no_walker_enters_a_standing_queue():
     standing = lambda t: (np.array([[50.0, -1.75]]), np.zeros(1), np.zeros(1))  # noqa: E731
     xy, _, speed, _ = play(street(), (over(),), standing)
     assert xy[:, 0, 1].max() < -4.0 and speed[-1, 0] == pytest.approx(0.0, abs=0.05)
@@ -140,7 +140,7 @@ def test_many_walkers_move_as_each_would_alone():
 
 
 @pytest.mark.slow
-def test_placed_walkers_are_on_their_ways_and_some_cross_during_the_recording():
+def test_placed_walkers_are_on_their_paths_and_some_cross_during_the_recording():
     network = street()
     crossing, count = 0, 0
     for seed in range(40):
