@@ -15,9 +15,17 @@ _PACKAGE = _DOCS.parent / "src" / "drivax"
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
-    index = ["# API reference", "", _docstring(_PACKAGE / "__init__.py"), "", "| package | content |", "|---|---|"]
+    index = [
+        "# API reference",
+        "",
+        _docstring(_PACKAGE / "__init__.py"),
+        "",
+        "| package | content |",
+        "|---|---|",
+    ]
     exports = {
-        ".".join(stub.parent.relative_to(_PACKAGE.parent).parts): stub for stub in _PACKAGE.rglob("__init__.pyi")
+        ".".join(stub.parent.relative_to(_PACKAGE.parent).parts): stub
+        for stub in _PACKAGE.rglob("__init__.pyi")
     }
     names = {package: public_names(stub, package) for package, stub in sorted(exports.items())}
     # A name that several packages export is documented in the innermost one; the others link to it.
