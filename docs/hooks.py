@@ -23,13 +23,19 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "| package | content |",
         "|---|---|",
     ]
-    for stub in sorted(_PACKAGE.rglob("__init__.pyi")):
-        package = ".".join(stub.parent.relative_to(_PACKAGE.parent).parts)
-        uri = f"reference/{package}.md"
-        summary = _docstring(stub.with_suffix(".py"))
-        names = [f"::: {name}" for name in public_names(stub, package)]
-        page = "\n\n".join([f"# {package}", summary, *names]) + "\n"
-        files.append(File.generated(config, uri, content=page))
+    exports = {
+        ".".join(stub.parent.relative_to(_PACKAGE.parent).parts): stub
+        for stub in _PACKAGE.rglob("__init__.pyi")
+    }
+    names = {package: public_names(stub, package) for package, stub in sorted(exports.items())}
+    # A name that several packages export is documented in the innermost one; the others link to it.
+    home = {name: package for package in sorted(names, key=len) for name in names[package]}
+    for package, exported in names.items():
+        summary = _docstring(exports[package].with_suffix(".py"))
+        own = [f"::: {name}" for name in exported if home[name] == package]
+        links = [f"[`{name.rpartition('.')[2]}`][{name}]" for name in exported if home[name] != package]
+        parts = [f"# {package}", summary, *([f"Also exported: {', '.join(links)}."] if links else []), *own]
+        files.append(File.generated(config, f"reference/{package}.md", content="\n\n".join(parts) + "\n"))
         index.append(f"| [`{package}`]({package}.md) | {summary.splitlines()[0]} |")
     files.append(File.generated(config, "reference/index.md", content="\n".join(index) + "\n"))
     for name, folder, title in (("decisions", "decisions", "Decisions"), ("log", "log", "Experiment log")):

@@ -6,9 +6,9 @@ python -m experiments.longtail restore --out STUDY   (what was kept, into a new 
 python -m experiments.longtail finish --out STUDY    (its results, into experiments/results/longtail.json)
 python -m experiments.longtail table                 (the results that were kept, into the page)
 
-Of every agent the run without its checkpoints and the episodes are kept, and so are the scores, without what they are
+Of every arm the run without its checkpoints and the episodes are kept, and so are the scores, without what they are
 made of: another processor rounds otherwise, and what was trained with other weights belongs to another study.
-BENCHMARK is what `drivax generate BENCHMARK --benchmark` made.
+BENCHMARK is what `drivax generate BENCHMARK --benchmark` tested.
 """
 
 from __future__ import annotations
@@ -25,11 +25,19 @@ from typing import Any, get_args
 
 import numpy as np
 
+from drivax.curation.arms import ClaimGroup
 from drivax.evaluation.episode_table import EpisodeTable
 from drivax.studies import longtail_page
-from drivax.studies.longtail_drives import has_driven, names
-from drivax.studies.longtail_plan import DRIVES, REFERENCES, RUNS, SCORES, drive_of, run_of
-from drivax.studies.longtail_results import ClaimGroup
+from drivax.studies.longtail_drives import (
+    DRIVES,
+    REFERENCES,
+    RUNS,
+    SCORES,
+    evaluation_of,
+    is_evaluated,
+    names,
+    run_of,
+)
 from experiments.learning.tables import table
 from experiments.repository import DOCS, RESULTS, STATE, fetched
 
@@ -41,16 +49,16 @@ FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
 
 
 def keep(study: Path) -> None:
-    """Keeps every agent that has driven and is not kept yet, the study's own files, its scores and its results."""
+    """Keeps every arm that has episodes and is not kept yet, the study's own files, its scores and its results."""
     KEPT.mkdir(parents=True, exist_ok=True)
     _pack([study], study, KEPT / "study.tar.xz")
     for name in REFERENCES:
         if (study / DRIVES / name).is_dir():
             _pack([study / DRIVES / name], study, KEPT / f"{name}.tar.xz")
-    for agent, seed in _agents(study):
-        file = KEPT / f"{agent}-{seed}.tar.xz"
-        if not file.exists() and has_driven(study, agent, seed):
-            folders = [run_of(study, agent, seed), *(drive_of(study, name, seed) for name in names(agent))]
+    for arm, seed in _agents(study):
+        file = KEPT / f"{arm}-{seed}.tar.xz"
+        if not file.exists() and is_evaluated(study, arm, seed):
+            folders = [run_of(study, arm, seed), *(evaluation_of(study, name, seed) for name in names(arm))]
             _pack(folders, study, file)
     (KEPT / SCORES).mkdir(exist_ok=True)
     for file in (study / SCORES).glob("*.npz"):
@@ -126,11 +134,11 @@ def _pack(folders: list[Path], study: Path, out: Path) -> None:
 def _without_paths(file: Path) -> bytes:
     """What a file says, with data and runs by name: where they lie is the machine's own affair."""
     if file.name == "run.json":
-        told = json.loads(file.read_bytes())
-        told.pop("command", None)  # a restored study tells none
-        for entry in (*told["data"], *told.get("trained_on", ())):
+        planner_name = json.loads(file.read_bytes())
+        planner_name.pop("command", None)  # a restored study tells none
+        for entry in (*planner_name["data"], *planner_name.get("trained_on", ())):
             entry["path"] = Path(entry["path"]).name
-        return json.dumps(told).encode()
+        return json.dumps(planner_name).encode()
     if file.name == "config.yaml":
         return re.sub(rf"(?m)^(planner: ).*/({RUNS}/)", r"\1\2", file.read_text()).encode()
     return file.read_bytes()

@@ -26,7 +26,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Told(Pendulum):
+class Logged(Pendulum):
     """An environment that is only told of; its observations are three numbers."""
 
     def expert_steps(self, data: Table) -> ExpertSteps:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivax.stats.significance import holm
-from drivax.studies.longtail_plan import REFERENCES
+from drivax.studies.longtail_drives import REFERENCES
 from experiment_scripts import load_script
 
 
@@ -73,7 +73,8 @@ def test_progress_until_failure(script):
     motion = np.zeros((3, 6, 4))
     motion[:, :, 0] = np.arange(6)
     events = {"collision": np.array([13, -1, -1]), "offroad": np.array([14, -1, 10])}
-    results = types.SimpleNamespace(events=events, motion=motion, start=10)
+    trajectories = types.SimpleNamespace(events=events, ego=motion, start=10)
+    results = types.SimpleNamespace(trajectories=trajectories)
     found = script("learning.benchmark").until_failure(results)
     np.testing.assert_array_equal(found["steps_until_failure"], [3, 5, 0])
     np.testing.assert_array_equal(found["metres_until_failure"], [3, 5, 0])

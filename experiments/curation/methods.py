@@ -8,10 +8,10 @@
 
 ``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
 ``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
-nobody had seen (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
+that were new (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
 as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
-``test`` alone says; scouts are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
+``test`` alone says; ensembles are trained on ``train``. With ``--method`` only these are scored, and the rest stays.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str,
 
 
 def events(bench: Path, only: list[str], stored: dict[str, Any]) -> dict[str, Any]:
-    """Methods, or all of them, on both test sets, beside those that are known."""
+    """Methods, or all of them, on both test sets, next to those that are stored."""
     sets = [ScenarioSet.open(bench / name) for name in ("test", "test-rare")]
     hashes = {data.path.name: data.hash for data in sets}
     if only and stored.get("sets") != hashes:
@@ -152,10 +152,10 @@ def scored(
             yield name, tables[0], joined(tables)
     for name in ("ensemble", "ensemble_mixture"):
         if name in names:
-            scouts = train_ensemble(ENSEMBLES[name], ScenarioSet.open(train))
-            first = ensemble_table(scouts, sets[0])
-            rest = [ensemble_table(scouts, data, scale=first.config["scale"]) for data in sets[1:]]
-            interval = {"error_rank_interval": error_interval(scouts, first, sets[0])}
+            ensemble = train_ensemble(ENSEMBLES[name], ScenarioSet.open(train))
+            first = ensemble_table(ensemble, sets[0])
+            rest = [ensemble_table(ensemble, data, scale=first.config["scale"]) for data in sets[1:]]
+            interval = {"error_rank_interval": error_interval(ensemble, first, sets[0])}
             yield name, replace(first, config={**first.config, **interval}), joined([first, *rest])
     rarities = {"action_rarity": KernelRarity(), "action_rarity_published": PublishedRarity()}
     if not rarities.keys() & set(names):
@@ -189,10 +189,10 @@ def checked(paths: list[Path]) -> dict[str, Any]:
     return {"checks": found}
 
 
-def error_interval(scouts: Ensemble, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
+def error_interval(ensemble: Ensemble, table: ScoreTable, data: ScenarioSet) -> tuple[float, float]:
     """Of the rank correlation of scores and errors of steps: 95 %, from scenarios drawn with replacement."""
-    predictions = scouts.predictions(data)
-    error, known = predictions.error(scouts.deviation, None), predictions.known
+    predictions = ensemble.predictions(data)
+    error, known = predictions.error(ensemble.deviation, None), predictions.known
     return correlation_interval(table.steps[known], error[known], np.nonzero(known)[0])
 
 
@@ -226,7 +226,7 @@ def draws(table: ScoreTable) -> dict[str, Any]:
 
 
 def speed(paths: list[Path], count: int) -> dict[str, Any]:
-    """By set: seconds to score so many scenarios, reading and stacking included, compiling not; few are taken again."""
+    """Seconds to score ``count`` scenarios of each set, including reading and stacking, without compilation."""
     found: dict[str, Any] = {}
     for path in paths:
         known = list(ScenarioSet.open(path)[:count])
@@ -263,20 +263,20 @@ def events_table(stored: dict[str, Any]) -> str:
         for group, words in (("forced", "that force a reaction"), ("mild", "that do not"), ("all", "all")):
             one = found["events"][group]
             measures = (("auc", 3), ("precision", 2), ("step_auc", 3), ("step_precision", 2))
-            cells = " | ".join(told(one, *measure) for measure in measures)
+            cells = " | ".join(cell(one, *measure) for measure in measures)
             lines.append(f"| `{method}` | {words} ({one['scenarios']}) | {cells} |")
     return "\n".join(lines)
 
 
-def told(one: dict[str, Any], measure: str, digits: int) -> str:
+def cell(one: dict[str, Any], measure: str, digits: int) -> str:
     """A measure with its interval."""
     low, high = one[f"{measure}_interval"]
     return f"{one[measure]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def ensemble_checks_table(stored: dict[str, Any]) -> str:
-    """How far scouts disagree where they err."""
-    lines = ["| scouts | rank correlation of scores and errors, by step |", "|---|---|"]
+    """How far members disagree where they err."""
+    lines = ["| ensemble | rank correlation of scores and errors, by step |", "|---|---|"]
     for name in ENSEMBLES:
         one = stored["methods"][name]
         low, high = one["error_rank_interval"]
@@ -288,7 +288,7 @@ def checks_table(stored: dict[str, Any]) -> str:
     """What ``kinematic`` finds in other sets."""
     lines = ["| set | scenarios | of them with an event that forces a reaction | AUC |", "|---|---|---|---|"]
     for name, one in stored["checks"].items():
-        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {told(one, 'auc', 3)} |")
+        lines.append(f"| `{name}` | {one['scenarios']} | {one['events']} | {cell(one, 'auc', 3)} |")
     return "\n".join(lines)
 
 
@@ -300,7 +300,7 @@ def kinds_table(stored: dict[str, Any], measure: str, digits: int) -> str:
     lines.append("|---|---|" + "---|" * len(methods))
     for kind in kinds:
         ones = [found["events"][kind] for found in methods.values()]
-        cells = " | ".join(told(one, measure, digits) for one in ones)
+        cells = " | ".join(cell(one, measure, digits) for one in ones)
         lines.append(f"| `{kind}` | {ones[0]['scenarios']} | {cells} |")
     return "\n".join(lines)
 
@@ -344,7 +344,7 @@ def filled(text: str, stored: dict[str, Any]) -> str:
         "scenario precision": kinds_table(stored, "precision", 2),
         "step auc": kinds_table(stored, "step_auc", 3),
         "step precision": kinds_table(stored, "step_precision", 2),
-        "scouts": ensemble_checks_table(stored),
+        "ensembles": ensemble_checks_table(stored),
         "checks": checks_table(stored),
         "draws": draws_table(stored),
         "speed": speed_table(stored),

@@ -30,12 +30,12 @@ mpl.use("Agg")
 
 #: Width, height, inches; dots per inch; half the side of the scene, m.
 SIZE, DPI, REACH_M = (11.0, 4.4), 100, 40.0
-#: DrawStatistics what stands beside the scene: of a row of the table, at a step.
-Beside = Callable[[list[Axes], int, int], None]
+#: Draws the plots next to the scene, for a scenario of the table at a step.
+DrawPlots = Callable[[list[Axes], int, int], None]
 
 
-def picture(data: ScenarioSet, table: ScoreTable, plots: int, beside: Beside, out: Path) -> None:
-    """The most critical scenario at its most critical step, and plots beside it."""
+def picture(data: ScenarioSet, table: ScoreTable, plots: int, draw_plots: DrawPlots, out: Path) -> None:
+    """The most critical scenario at its most critical step, and plots next to it."""
     row = int(table.order[0])
     step = int(table.steps[row].argmax())
     page = Figure(figsize=SIZE, dpi=DPI, facecolor="white", layout="constrained")
@@ -44,7 +44,7 @@ def picture(data: ScenarioSet, table: ScoreTable, plots: int, beside: Beside, ou
     x, y = (float(number) for number in scenario.agent_xy[step, 0])
     draw_on(scene, scenario, step, (x, y), REACH_M)
     scene.set_title(f"{step * DT_S:.1f} s, score {table.steps[row, step]:.2f}", fontsize=10)
-    beside([page.add_subplot(grid[number, 1]) for number in range(plots)], row, step)
+    draw_plots([page.add_subplot(grid[number, 1]) for number in range(plots)], row, step)
     save_picture(page, out)
     print(f"{out.name}: {table.scenario_ids[row]}, step {step}")
 
@@ -61,7 +61,7 @@ def kinematic(data: ScenarioSet, out: Path) -> None:
     """Components over time, each as it counts, and the score."""
     table = curate("kinematic", Request(data))
 
-    def beside(axes: list[Axes], row: int, step: int) -> None:
+    def draw_plots(axes: list[Axes], row: int, step: int) -> None:
         valid = np.flatnonzero(table.valid[row])
         parts = {
             name: weight * table.components[name][row, valid] for name, weight in _weights(table).items()
@@ -72,7 +72,7 @@ def kinematic(data: ScenarioSet, out: Path) -> None:
         axes[0].set_ylim(0.0, 1.0)
         over_time(axes[0], step, "components times their weights: the score of a step is their sum")
 
-    picture(data, table, 1, beside, out)
+    picture(data, table, 1, draw_plots, out)
 
 
 def _weights(table: ScoreTable) -> dict[str, float]:
@@ -80,11 +80,11 @@ def _weights(table: ScoreTable) -> dict[str, float]:
 
 
 def ensemble(data: ScenarioSet, out: Path) -> None:
-    """What each scout would do, what the expert did, and the score."""
-    scouts = train_ensemble(EnsembleConfig(), data)
-    table, predictions = ensemble_table(scouts, data), scouts.predictions(data)
+    """What each member would do, what the expert did, and the score."""
+    ensemble = train_ensemble(EnsembleConfig(), data)
+    table, predictions = ensemble_table(ensemble, data), ensemble.predictions(data)
 
-    def beside(axes: list[Axes], row: int, step: int) -> None:
+    def draw_plots(axes: list[Axes], row: int, step: int) -> None:
         known = np.flatnonzero(predictions.known[row])
         for number, (name, part) in enumerate({"acceleration": axes[0], "steering": axes[1]}.items()):
             part.plot(
@@ -92,14 +92,16 @@ def ensemble(data: ScenarioSet, out: Path) -> None:
             )
             part.plot(known * DT_S, predictions.expert[row, known, number], color=LIGHT["ink"], linewidth=1.6)
             over_time(
-                part, step, f"{name}: five scouts, and (black) what the expert did; units of the action space"
+                part,
+                step,
+                f"{name}: five members, and (black) what the expert did; units of the action space",
             )
         valid = np.flatnonzero(table.valid[row])
         axes[2].fill_between(valid * DT_S, table.steps[row, valid], color=LIGHT["mark"])
         axes[2].set_ylim(0.0, 1.0)
         over_time(axes[2], step, "score, by the variance among them")
 
-    picture(data, table, 3, beside, out)
+    picture(data, table, 3, draw_plots, out)
 
 
 def rarity(data: ScenarioSet, out: Path) -> None:
@@ -111,7 +113,7 @@ def rarity(data: ScenarioSet, out: Path) -> None:
     places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     density = KernelRarity().density(action[known], places).reshape(201, 201)
 
-    def beside(axes: list[Axes], row: int, step: int) -> None:
+    def draw_plots(axes: list[Axes], row: int, step: int) -> None:
         seen: Any = axes[0].pcolormesh(side, side, np.log10(density + 1e-4), cmap="Greys", rasterized=True)
         axes[0].figure.colorbar(seen, ax=axes[0], label="density of all actions, power of ten")
         mine = action[row, known[row]]
@@ -122,7 +124,7 @@ def rarity(data: ScenarioSet, out: Path) -> None:
         )
         axes[0].title.set_fontsize(10)
 
-    picture(data, table, 1, beside, out)
+    picture(data, table, 1, draw_plots, out)
 
 
 def main() -> None:

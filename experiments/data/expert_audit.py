@@ -2,7 +2,7 @@
 
 Replays logs exactly (``expert``) and drives them through the dynamics (``expert_actions``) on the built-in world and on
 every file that a reader exists for: every window, with the ego of the source and with every logged vehicle that moves
-as ego. Steps at which the log does not know the ego are judged by nobody. Off-road steps get a second opinion: they
+as ego. Steps at which the log does not know the ego do not count. Off-road steps are checked a second way: they
 are "contradicted" where every corner is on the drivable side of its nearest edge, however far that is.
 
     python -m experiments.data.expert_audit --data ../shared/data [--write] [--pictures FOLDER]
@@ -129,7 +129,7 @@ def _row(case: Case, planner: str, facts: Mapping[str, np.ndarray]) -> dict[str,
 def nearest_edges_say_on_road(scenario: Scenario, step: int) -> bool:
     """Whether the nearest stored edge of every corner of the logged ego, however far, has it on the drivable side.
 
-    A second opinion on an off-road step, by brute force over all edges of the ego's level and without grid, cut-off and
+    A second check of an off-road step, by brute force over all edges of the ego's level and without grid, cut-off and
     lanes. A corner right of its nearest edge by up to 0.3 m still counts as on the road.
     """
     last = int(scenario.segment_blocks[1])

@@ -89,7 +89,7 @@ def _summary(found: EpisodeTable, wanted: tuple[str, ...]) -> dict[str, Any]:
 
 
 def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
-    """Both policies in the place of the vehicles nearest to ego, one at a time, everyone else as logged."""
+    """Both policies in the place of the vehicles nearest to ego, one at a time, all others as logged."""
     traffic = policy_traffic(runs / "aggressive", count=OTHERS)
     start = jax.jit(jax.vmap(lambda bank, row: traffic.start(bank, row, CURRENT_STEP), (None, 0)))
     table: Table = {}
@@ -148,7 +148,7 @@ PARTS = {"ego": in_egos_place, "others": in_others_place, "traffic": in_traffic}
 
 
 def judged(args: argparse.Namespace) -> None:
-    """Measures, prints, and with --write stores what was measured beside what is stored of the other parts."""
+    """Measures, prints, and with --write stores what was measured next to what is stored of the other parts."""
     stored = ScenarioSet.open(args.data)
     scenarios = list(stored)
     bank, names = ScenarioBank.from_scenarios(scenarios), [dict(row) for row in scenario_names(scenarios)]

@@ -53,7 +53,7 @@ COLUMNS = {
 }  # fmt: skip
 #: Whom every learned planner is compared with, and in what.
 AGAINST, COMPARED = ("idm", "pdm"), ("accuracy", "at_fault_collision", "vmax_score")
-#: Tags by which accuracy is told apart, and where those of the scenarios are kept.
+#: Tags by which accuracy is broken down, and where those of the scenarios are kept.
 TAGS, STRATA = ("difficulty", "type", "density"), "strata.npz"
 #: What the table of random actions shows: until the first failure, as published episodes end there.
 UNTIL = {"steps_until_failure": "steps", "metres_until_failure": "metres driven"}
@@ -227,7 +227,7 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
     with np.load(EPISODES / STRATA, allow_pickle=False) as stored:
         tags, of = {tag: stored[tag] for tag in TAGS}, str(stored["test"])
     if any(one.about["test"] != of for one in driven.values()):
-        raise SystemExit("the tags are those of another test set: drive a planner anew")
+        raise SystemExit("the tags are those of another test set: evaluate a planner again")
     planners = {name: one for (name, kind), one in driven.items() if kind == "log" and name != BOX}
     found = []
     for tag, values in tags.items():
@@ -242,8 +242,10 @@ def strata(driven: Mapping[tuple[str, str], Driven]) -> list[dict[str, Any]]:
                 )
                 for name, one in planners.items()
             }
-            told = {name: one.as_dict() for name, one in some.items()}
-            found.append({"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": told})
+            intervals = {name: one.as_dict() for name, one in some.items()}
+            found.append(
+                {"tag": tag, "value": str(value), "scenarios": int(rows.sum()), "planners": intervals}
+            )
     return found
 
 

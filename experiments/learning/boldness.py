@@ -1,4 +1,4 @@
-"""How boldly somebody drives, as metrics of an evaluation (``boldness:speed_ratio``); ``aggressive.py`` uses them."""
+"""How boldly ego drives, as metrics of an evaluation (``boldness:speed_ratio``); ``aggressive.py`` uses them."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ from experiments.repository import RESULTS, fetched, save_picture
 
 RESULT = RESULTS / "learning.json"
 SPEEDS = RESULT.with_name("training.json")
-#: What is kept of a training beside its policies.
+#: What is kept of a training next to its policies.
 TRAINING = "training.json"
 REFERENCES = ("expert", "idm", "constant_velocity")
 
@@ -88,14 +88,16 @@ def judged() -> dict[str, Any]:
     driven = {name: one for name, one in found.items() if one is not None}
     tests = {one.about["test"] for one in driven.values()}
     if len(tests) != 1:
-        raise SystemExit(f"{len(tests)} test sets instead of one: drive the others anew (benchmark.py drive)")
-    told = {
+        raise SystemExit(
+            f"{len(tests)} test sets instead of one: evaluate the others again (benchmark.py drive)"
+        )
+    stored = {
         name: json.loads((POLICIES / name / TRAINING).read_text()) for name in learned() if name in driven
     }
     return {
         "command": "python -m experiments.learning.presets judge",
         "test": {"scenarios": len(next(iter(driven.values())).segments), "hash": tests.pop()},
-        "training": {name: {key: one[key] for key in ("seconds", "seeds")} for name, one in told.items()},
+        "training": {name: {key: one[key] for key in ("seconds", "seeds")} for name, one in stored.items()},
         "planners": {
             name: {metric: _mean(one, metric) for metric in COLUMNS} for name, one in driven.items()
         },
@@ -103,11 +105,11 @@ def judged() -> dict[str, Any]:
             f"{name} - {other}": {
                 metric: mean(driven[name], metric, driven[other]).as_dict() for metric in CURVES
             }
-            for name in told
+            for name in stored
             for other in ("idm", "bc")
             if other in driven and other != name
         },
-        "curves": {name: one["curves"] for name, one in told.items()},
+        "curves": {name: one["curves"] for name, one in stored.items()},
         "versions": versions(),
     }
 

@@ -84,7 +84,7 @@ def best(learning: Result) -> str:
 
 
 def aims(learning: Result, training: Result) -> list[str]:
-    """Every aim beside what was measured of the best preset."""
+    """Every target next to what was measured of the best preset."""
     name = best(learning)
     rows = []
     for metric, aim in AIMS.items():
@@ -94,9 +94,9 @@ def aims(learning: Result, training: Result) -> list[str]:
         for metric in CURVES:
             found = learning["differences"].get(f"{name} - {other}", {}).get(metric)
             nothing = "it is the best itself" if other == name else "not measured"
-            told = nothing if found is None else interval(found, signed=True)
+            cell = nothing if found is None else interval(found, signed=True)
             above = found is not None and found["low"] is not None and found["low"] > 0
-            rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", told, above])
+            rows.append([f"`{metric}`: `{name}` over `{other}`", "above 0", cell, above])
     speed = training["training"]["ppo"]["steps_per_second"]
     rows.append(["steps per second of training, `ppo`", f"{SPEED:,}", f"{speed:,}", speed >= SPEED])
     cells = [[*row[:3], "yes" if row[3] else "**no**"] for row in rows]
@@ -130,12 +130,12 @@ def pictures(learning: Result, names: list[str], page: Path) -> list[str]:
             lines += [f"No curves of preset `{name}` are stored yet.", ""]
             continue
         found, count = learning["planners"][name], learning["training"][name]["seeds"]
-        told = ", ".join(f"`{metric}` {interval(found[metric])}" for metric in CURVES)
+        cell = ", ".join(f"`{metric}` {interval(found[metric])}" for metric in CURVES)
         where = Path("../algorithms" if page.parent != FOLDER else "") / picture(name).name
         lines += [
             f"![Learning curves of {name}]({where.as_posix()})",
             "",
-            f"Preset `{name}`, {count} seeds, in validation on the way. On the test split: {told}.",
+            f"Preset `{name}`, {count} seeds, in validation on the way. On the test split: {cell}.",
             "",
         ]
     return lines[:-1]

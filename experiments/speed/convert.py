@@ -25,11 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets.convert import Conversion, convert, convert_file
-from drivax.datasets.export.tfrecord import write_record
+from drivax.datasets.conversion import Conversion, convert, convert_file
 from drivax.datasets.womd.messages import scenario_class
 from drivax.datasets.womd.scenario_reader import WomdScenario
-from drivax.datasets.womd.tfrecord import read_records
+from drivax.datasets.womd.tfrecord import read_records, write_record
 from drivax.evaluation.audit import audit
 from drivax.scenario.schema import record_dtype
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
@@ -42,7 +41,7 @@ BATCH = 64
 
 
 def repeated(source: Path, target: Path, copies: int) -> Path:
-    """The first record of a TFRecord file of protos, so many times, each with an id of its own."""
+    """The first record of a TFRecord file of protos, repeated, each with an id of its own."""
     _, payload = next(read_records(source))
     message = scenario_class().FromString(payload)
     with target.open("wb") as file:

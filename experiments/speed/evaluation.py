@@ -30,7 +30,7 @@ from experiments.speed.simulator import machine_ms
 RESULT = RESULTS / "evaluation.json"
 PAGE = DOCS / "results" / "speed.md"
 BEGIN, END = "<!-- evaluation.py: begin -->", "<!-- evaluation.py: end -->"
-#: Whole batches, so that their times are alike.
+#: Whole batches, so that their times are equal.
 SCENARIOS = 1024
 #: Seconds that 1,000 scenarios x 80 steps may take in recorded traffic, and how many times that in reactive traffic.
 AIMS, REACTIVE = {"expert": 8, "constant_velocity": 8, "idm": 8, "zoo:aggressive": 12, "pdm": 600}, 3

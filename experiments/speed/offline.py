@@ -1,4 +1,4 @@
-"""How fast offline learning is: updates of every preset ``offline/*``, scouts alone and side by side, and draws.
+"""How fast offline learning is: updates of every preset ``offline/*``, ensemble members alone and together, and draws.
 
 Nothing else may run on the machine.
 
@@ -31,7 +31,6 @@ from drivax.learning.experience import draw, sampler
 from drivax.learning.program import Program, Seeds
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
-from drivax.simulator.traffic.log import LogTraffic
 from drivax.tracking.run_folder import versions
 from experiments.repository import DOCS, RESULTS
 
@@ -55,8 +54,8 @@ def elapsed(call: Callable[[], Any]) -> float:
 
 
 def training(config: TrainConfig, data: ScenarioSet) -> tuple[Callable[[], Any], dict[str, Any]]:
-    """What runs an iteration of a training, and its size: gradients change so many parameters."""
-    environment, bank = config.environment(LogTraffic()), ScenarioBank.from_scenarios(data)
+    """What runs an iteration of a training, and its size: gradients change that many parameters."""
+    environment, bank = config.environment(), ScenarioBank.from_scenarios(data)
     learner = config.algorithm.build(environment, bank, config.iterations)
     began = time.perf_counter()
     weights = np.ones((len(bank), bank.steps))
@@ -100,8 +99,8 @@ def updates(data: ScenarioSet, repeats: int) -> dict[str, dict[str, Any]]:
     }
 
 
-def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
-    """Seconds per iteration of the default ensemble and of one of its scouts alone, by turns."""
+def members(data: ScenarioSet, repeats: int) -> dict[str, Any]:
+    """Seconds per iteration of the default ensemble and of one of its members alone, by turns."""
     config = EnsembleConfig()
     iterate, size = training(TrainConfig(task=config.task, algorithm=config.cloning, devices=1), data)
     config = replace(config, total_steps=(repeats + 1) * config.cloning.steps_per_iteration)
@@ -118,7 +117,7 @@ def scouts(data: ScenarioSet, repeats: int) -> dict[str, Any]:
     train_ensemble(config, data, turn)
     one, together = statistics.median(alone), statistics.median(all_of_them)
     return {
-        "scouts": config.folds,
+        "members": config.folds,
         "parameters_of_one": size["parameters"],
         "batch": config.cloning.batch,
         "updates": config.cloning.updates,
@@ -146,9 +145,9 @@ def table(result: dict[str, Any]) -> str:
         f"{one['batch']} | {one['parameters']:,} |"
         for name, one in result["algorithms"].items()
     ]
-    one = result["scouts"]
+    one = result["members"]
     return "\n".join(rows) + (
-        f"\n\n{one['scouts']} scouts of {one['parameters_of_one']:,} parameters, batch {one['batch']}: "
+        f"\n\n{one['members']} members of {one['parameters_of_one']:,} parameters, batch {one['batch']}: "
         f"{one['seconds_of_all']} s for {one['updates']} updates side by side, {one['ratio']} times as long as one "
         f"alone. Steps are drawn {result['draws_per_second']:,} times per second ({', '.join(result['devices'])})."
     )
@@ -178,7 +177,7 @@ def main() -> None:
         "devices": [device.device_kind for device in jax.devices()],
         "scenarios": len(data),
         "draws_per_second": draws(),
-        "scouts": scouts(data, args.repeats),
+        "members": members(data, args.repeats),
         "algorithms": updates(data, args.repeats),
         "versions": versions(),
     }

@@ -166,7 +166,7 @@ def more_segments(bank: ScenarioBank) -> ScenarioBank:
 
 
 def agents(bank: ScenarioBank, count: int) -> ScenarioBank:
-    """The bank with so many slots: of everyone the first ones, and empty ones where it has fewer."""
+    """The bank with this many slots: the first ones, and empty ones where it has fewer."""
     few = replace(
         bank,
         agents=bank.agents[:, :, :count],
@@ -309,7 +309,7 @@ def main() -> None:
         RUNS.write_text(json.dumps(runs, indent=1) + "\n")
         print("\n".join(runs_table(runs)))
         return
-    # The set by its name: where it lies on this machine is nobody's business.
+    # The set by its name: where it lies on this machine does not matter.
     command = (
         f"python -m experiments.speed.simulator --data {args.data.name} --repeats {args.repeats} --write"
     )

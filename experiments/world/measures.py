@@ -11,7 +11,7 @@ from scipy.stats import beta
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import DT_S, AgentKind, Scenario
 from drivax.synthetic.expert.comfort import broken_limits
-from drivax.synthetic.sensing import NoiseConfig, farthest_m
+from drivax.synthetic.sensing import NoiseConfig, largest_shift_m
 
 Array = np.ndarray[Any, Any]
 
@@ -25,7 +25,7 @@ def uncomfortable(scenario: Scenario) -> tuple[str, ...]:
     return broken_limits(scenario.agent_heading[:, 0].astype(np.float64), speed)
 
 
-def everybody(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
+def all_agents(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
     """Boxes ``[step, user, 6]``, velocities, validity, kinds and ids of moving and parked users, ego first."""
     moving = np.flatnonzero(scenario.agent_valid.any(axis=0))
     parked = np.flatnonzero(scenario.parked_valid.any(axis=0))
@@ -56,7 +56,7 @@ def everybody(scenario: Scenario) -> tuple[Array, Array, Array, Array, Array]:
 
 def overlapping_pairs(scenario: Scenario) -> int:
     """Pairs of vehicles, ego left out, whose boxes overlap at some step."""
-    box, _, valid, kind, _ = everybody(scenario)
+    box, _, valid, kind, _ = all_agents(scenario)
     vehicles = np.flatnonzero((kind == AgentKind.VEHICLE) & (np.arange(len(kind)) > 0))
     first, second = np.triu_indices(len(vehicles), 1)
     first, second = vehicles[first], vehicles[second]
@@ -67,12 +67,12 @@ def overlapping_pairs(scenario: Scenario) -> int:
 def constant_speed_ttc_s(scenario: Scenario) -> float:
     """Smallest time to collision with the labelled actors of an ego that keeps its speed from the event on.
 
-    It starts at the event's first step, with the speed that it has then, and goes on along its route, as far beside
+    It starts at the event's first step, with the speed that it has then, and goes on along its route, as far off
     it as it is (the log's own way may already avoid the actor). Time to collision is that of boxes at constant
     velocity; 0 where they overlap.
     """
     start, actors = int(scenario.event_start[0]), scenario.event_actor[0]
-    box, velocity, valid, _, number = everybody(scenario)
+    box, velocity, valid, _, number = all_agents(scenario)
     rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
     way = _way(scenario, start)
     speed = float(np.hypot(*scenario.agent_velocity[start, 0]))
@@ -93,7 +93,7 @@ def constant_speed_ttc_s(scenario: Scenario) -> float:
 
 
 def _way(scenario: Scenario, start: int) -> Array:
-    """Points of the route from where the ego is on, as far beside it as the ego is then."""
+    """Points of the route from where the ego is on, as far off it as the ego is then."""
     count = int(scenario.route_points[0])
     route = scenario.route_xy[0, :count].astype(np.float64)
     heading = scenario.route_heading[0, :count].astype(np.float64)
@@ -121,7 +121,7 @@ def share(successes: int, trials: int) -> dict[str, Any]:
 
 
 def against(wanted: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
-    """A share beside the probability that was configured.
+    """A share next to the probability that was configured.
 
     Of many 95 % intervals one in twenty misses the truth, so ``outside`` says whether the configured value is outside
     Bonferroni's interval, of level 1 - 0.05 / comparisons; ``outside_95`` says the same of the usual one.
@@ -137,6 +137,6 @@ def against(wanted: float, successes: int, trials: int, comparisons: int) -> dic
 
 
 def largest_noise_m(scenario: Scenario, config: NoiseConfig) -> float:
-    """How far perception noise can have moved a corner of anybody in a scenario, at most."""
+    """How far perception noise can have moved a corner of any agent in a scenario, at most."""
     sizes = scenario.agent_size[1:][scenario.agent_valid[:, 1:].any(axis=0), :2]
-    return max((farthest_m(config, float(length), float(width)) for length, width in sizes), default=0.0)
+    return max((largest_shift_m(config, float(length), float(width)) for length, width in sizes), default=0.0)

@@ -32,7 +32,7 @@ from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.events import EventKind
 from drivax.synthetic.world import WorldConfig, generate_one
 from experiments.repository import DOCS, save_picture
-from experiments.world.measures import everybody
+from experiments.world.measures import all_agents
 
 mpl.use("Agg")
 
@@ -134,7 +134,7 @@ def draw_family(axes: Axes, scenario: Scenario) -> None:
 
 def draw_event(axes: Axes, scenario: Scenario) -> None:
     """The moment at which ego and an actor are nearest during the event, and the ways of both from first to last."""
-    box, _, valid, _, number = everybody(scenario)
+    box, _, valid, _, number = all_agents(scenario)
     actors = scenario.event_actor[0]
     rows = np.flatnonzero(np.isin(number, actors[actors >= 0]))
     first = int(scenario.event_start[0])

@@ -31,7 +31,7 @@ from drivax.scenario.schema import CAPACITIES, DT_S, STEPS, AgentKind, Scenario
 from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 from experiments.repository import DOCS, RESULTS, save_picture
-from experiments.world.measures import everybody
+from experiments.world.measures import all_agents
 
 FIGURE = DOCS / "guide" / "world-resemblance.png"
 RESULT = RESULTS / "world_resemblance.json"
@@ -63,7 +63,7 @@ EVERY = 5
 
 def quantities(scenario: Scenario) -> dict[str, Array]:
     """Values of all subjects and steps of one scenario."""
-    box, velocity, valid, kind, _ = everybody(scenario)
+    box, velocity, valid, kind, _ = all_agents(scenario)
     subjects = np.flatnonzero(valid.all(axis=0) & (kind == AgentKind.VEHICLE))
     way = np.hypot(*np.moveaxis(np.diff(box[:, subjects, :2], axis=0), -1, 0)).sum(axis=0)
     apart = np.hypot(*np.moveaxis(box[:, subjects, :2] - box[:, :1, :2], -1, 0)).mean(axis=0)

@@ -163,7 +163,7 @@ def markdown(results: dict[str, Result]) -> str:
         f" {name}: {result['scenarios']:,} + {result['rare_scenarios']:,} rare |"
         for name, result in results.items()
     )
-    rows = [f"| what | wanted |{head}", "|---|---|" + "---|" * len(results)]
+    rows = [f"| what | target |{head}", "|---|---|" + "---|" * len(results)]
     for target in TARGETS:
         cells = []
         for result in results.values():

@@ -95,7 +95,7 @@ def speed(domain: str, scenarios: int, workers: int) -> dict[str, Any]:
 
 
 def measured(folder: Path, planners: tuple[str, ...], driven: int | None = None) -> list[dict[str, Any]]:
-    """One row per scenario: tags, what its arrays show, how the expert drove it, and the planners the first ones."""
+    """One row per scenario: tags, what its arrays show, what the expert did, and the planners the first ones."""
     data, rows = ScenarioSet.open(folder), []
     for first in range(0, len(data), CHUNK):
         scenarios = [data[i] for i in range(first, min(first + CHUNK, len(data)))]
@@ -149,7 +149,7 @@ def difficulty(rows: list[dict[str, Any]], rare: list[dict[str, Any]], planner: 
 
 
 def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: WorldConfig) -> dict[str, Any]:
-    """Families, events and their rate beside what was configured.
+    """Families, events and their rate and what was configured.
 
     Families are counted over the maps of common scenarios: a rare one takes roads that give occasion to its event, and
     scenarios on the same map have their family from one draw. Kinds of events are counted over all rare scenarios.
@@ -296,7 +296,7 @@ def main() -> None:
         "--timed",
         type=int,
         default=None,
-        help="only time sets of so many scenarios of both domains, and store that; nothing else may run",
+        help="only time sets of this many scenarios of both domains, and store that; nothing else may run",
     )
     parser.add_argument(
         "--driven",

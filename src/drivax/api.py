@@ -1,16 +1,24 @@
-"""The Python interface: load a scenario set, make a simulator, evaluate a planner."""
+"""The Python interface: one function per command of the command line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from drivax.curation.methods import Request
+from drivax.curation.methods import curate as curate_set
+from drivax.curation.scores import ScoreTable
+from drivax.datasets.conversion import Conversion, Converted
+from drivax.datasets.conversion import convert as convert_set
 from drivax.errors import UsageError
 from drivax.evaluation import runner
-from drivax.evaluation.audit import scenario_names
+from drivax.evaluation.audit import audit, scenario_names
+from drivax.evaluation.comparison import Comparison
+from drivax.evaluation.comparison import compare as compare_evaluations
 from drivax.evaluation.episode_table import EpisodeTable
+from drivax.evaluation.plan import ComparisonPlan
 from drivax.evaluation.run_evaluation import with_metrics
 from drivax.learning.policies import find_traffic, load_policy
 from drivax.planners.catalogue import PLANNERS, as_planner, make_planner
@@ -23,6 +31,8 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.starts import Start
 from drivax.simulator.types import Traffic
+from drivax.synthetic.generate import Generation
+from drivax.synthetic.generate import generate as generate_set
 from drivax.tasks.task import Task
 from drivax.tracking.run_folder import run_and_step
 from drivax.tracking.zoo import is_policy, zoo
@@ -105,7 +115,7 @@ def evaluate(
     Args:
         planner: Name, run folder of a training (``RUN`` or ``RUN@STEP``), ``zoo:NAME``, or a planner or its class.
         data: Folder of a scenario set, or scenarios from :func:`load`.
-        task: Action space and observation of a planner object.
+        task: Action space, observation and reward; a trained policy has its own.
         traffic: As for :func:`make_simulator`; it is prepared here.
         start: How episodes start: as logged by default, or ``simulator.starts.NoisyStart()``.
         sample: Whether a policy given by name samples its actions instead of taking the mode.
@@ -114,9 +124,7 @@ def evaluate(
     """
     loaded = data if isinstance(data, Loaded) else load(data, 1)
     if isinstance(planner, str | Path):
-        if task is not None:
-            raise UsageError("a planner by name brings its own task", cure="leave out task=")
-        planner, task = find_planner(str(planner), loaded.bank, sample)
+        planner, task = find_planner(str(planner), loaded.bank, sample, task)
     elif sample:
         raise UsageError("only a policy by name can sample", cure="leave out sample=")
     return runner.evaluate(
@@ -130,16 +138,100 @@ def evaluate(
     )
 
 
-def find_planner(name: str, bank: ScenarioBank, sample: bool = False) -> tuple[Planner, Task]:
+def find_planner(
+    name: str, bank: ScenarioBank, sample: bool = False, task: Task | None = None
+) -> tuple[Planner, Task]:
     """Return the planner of a name, run folder or zoo policy, and its task.
 
+    Args:
+        name: Name, ``module:name``, run folder (``RUN`` or ``RUN@STEP``) or ``zoo:NAME``.
+        bank: Scenarios of the evaluation; a policy's shapes follow from it.
+        sample: Whether a trained policy samples its actions.
+        task: Task of a named planner; None: the default task, with the planner's own action space.
+
     Raises:
-        UsageError: There is no such planner, folder or policy.
+        UsageError: There is no such planner, folder or policy, or a policy was given another task.
     """
     if name in PLANNERS or (is_dotted(name) and not is_policy(name)):
-        return make_planner(name), Task()
+        return make_planner(name, task and task.actions), task or Task()
     folder, step = run_and_step(name)
     if not is_policy(folder):
         kinds = [*PLANNERS, "package.module:name", "the folder of a training run", *zoo()]
         raise UsageError(f"unknown planner {name!r}", cure=f"use {', '.join(kinds)}")
+    if task is not None:
+        raise UsageError(f"trained policy {name!r} has its own task", cure="leave out --task (task=)")
     return load_policy(folder, bank, step=step, samples=sample)
+
+
+def generate(
+    out: str | Path, scenarios: int = 256, seed: int = 0, *, options: Generation | None = None
+) -> ScenarioSet:
+    """Generate a scenario set of the built-in world, audited, and open it.
+
+    Args:
+        out: Folder to write.
+        scenarios: Number of scenarios.
+        seed: Scenario ``i`` of a seed is the same in every set.
+        options: World, workers and capacity.
+
+    Raises:
+        UsageError: ``out`` exists, or an option is impossible.
+    """
+    return ScenarioSet.open(generate_set(out, scenarios, seed, options, audit=audit).path)
+
+
+def convert(src: str | Path, out: str | Path, **options: Any) -> Converted:
+    """Convert recordings of a public data set to a scenario set, audited.
+
+    Args:
+        src: File, or folder that is searched to any depth.
+        out: Folder to write.
+        options: Fields of :class:`drivax.datasets.Conversion`.
+
+    Raises:
+        DataError: ``src`` holds nothing that can be converted.
+        UsageError: ``out`` exists, an option is impossible, or a package is missing.
+    """
+    return convert_set(src, out, Conversion(**options), audit=audit)
+
+
+def compare(
+    a: str | Path,
+    b: str | Path,
+    plan: ComparisonPlan | None = None,
+    data: Path | None = None,
+    **settings: Any,
+) -> Comparison:
+    """Compare two evaluations.
+
+    Args:
+        a: Run folder of ``drivax evaluate``, or a folder with one such run per seed.
+        b: The other.
+        plan: Metrics and decision rule.
+        data: The evaluated set, for a stratified split, if it has moved.
+        settings: Fields of the plan to change, as ``primary="success"``.
+
+    Raises:
+        DataError: A run folder is missing or damaged.
+        UsageError: The evaluations cannot be compared, or a setting is impossible.
+    """
+    plan = replace(plan or ComparisonPlan(), **settings)
+    first, second = (EpisodeTable.read_seeds(Path(run)) for run in (a, b))
+    entries = first[0].open_set(data).entries if plan.split == "stratified" else ()
+    return compare_evaluations(plan, first, second, entries)
+
+
+def curate(method: str, data: str | Path | ScenarioSet, **options: Any) -> ScoreTable:
+    """Score how critical each step and scenario of a set is.
+
+    Args:
+        method: Name of a method, as ``kinematic``.
+        data: The set, or its folder.
+        options: Fields of :class:`drivax.curation.Request`: ``config``, ``seed``, ``like``, ``progress``.
+
+    Raises:
+        DataError: The method cannot score this set.
+        UsageError: Unknown method or impossible settings.
+    """
+    scenarios = data if isinstance(data, ScenarioSet) else ScenarioSet.open(data)
+    return curate_set(method, Request(scenarios, **options))

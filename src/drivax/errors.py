@@ -64,10 +64,11 @@ class UsageError(DrivaxError):
 
 def missing_package(error: ImportError) -> UsageError | None:
     """Return the error for an optional package that is not installed, None if no extra installs it."""
-    package = (error.name or "").split(".")[0]
+    package = (error.name or str(error)).split(".")[0]
     if package not in _EXTRAS:
         return None
-    return UsageError(f"{package} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
+    name = "protobuf" if package == "google" else package
+    return UsageError(f"{name} is not installed", cure=f"pip install 'drivax[{_EXTRAS[package]}]'")
 
 
 def did_you_mean(

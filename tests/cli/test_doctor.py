@@ -15,8 +15,8 @@ import pytest
 
 from datasets.samples import womd_scenario as wire
 from drivax.cli import doctor, main
-from drivax.datasets.convert import convert
-from drivax.datasets.diagnosis import diagnose, gaps
+from drivax.datasets.conversion import convert
+from drivax.datasets.doctor import diagnose, gaps
 from drivax.errors import UsageError
 
 FORMATS = {
@@ -202,7 +202,7 @@ def test_damaged_files_in_a_folder_are_listed(tmp_path, capsys):
 
 
 def test_many_files_are_sampled(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("drivax.datasets.diagnosis._SAMPLE", 4)
+    monkeypatch.setattr("drivax.datasets.doctor._SAMPLE", 4)
     for number in range(8):
         (tmp_path / f"{number}.tfrecord").write_bytes(wire.frame(wire.scenario(steps=11)))
     status, out = asked(tmp_path, capsys)

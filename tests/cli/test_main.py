@@ -1,4 +1,4 @@
-"""The frame of the command line: what is listed, how errors are told, which status comes back."""
+"""The command line: list of commands, error messages, exit status."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_overrides_reach_the_command(probe: Any):
         (OSError(28, "No space left on device"), "No space left on device", 1),
         (
             ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot"),
-            "matplotlib.pyplot is not installed; pip install 'drivax[show]'",
+            "matplotlib is not installed; pip install 'drivax[show]'",
             1,
         ),
         (KeyError("a\nb"), r"unexpected KeyError: 'a\nb'; --debug shows where", 1),
@@ -120,9 +120,9 @@ def test_debug_shows_the_traceback(probe: Any, capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["convrt"], "there is no command 'convrt'; did you mean 'convert'?"),
-        (["zzz"], "there is no command 'zzz'; see drivax --help"),
-        (["--vresion"], "there is no option '--vresion'; see drivax --help"),
+        (["convrt"], "unknown command 'convrt'; did you mean 'convert'?"),
+        (["zzz"], "unknown command 'zzz'; see drivax --help"),
+        (["--vresion"], "unknown option '--vresion'; see drivax --help"),
     ],
 )
 def test_unknown_commands(argv: list[str], line: str, capsys: pytest.CaptureFixture[str]):

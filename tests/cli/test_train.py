@@ -112,7 +112,7 @@ def test_scoring_for_training_shows_progress(place, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_weights_change_the_draws(place):
-    """Kinematic scores, evened out or not: all alike where the whole mixture is uniform."""
+    """Kinematic scores, evened out or not: all equal where the whole mixture is uniform."""
     effective = []
     curate = ["curate", "kinematic", "--data", str(place / "set-3"), "--out", str(place / "kinematic.npz")]
     assert main([*curate, "--overwrite"]) == 0

@@ -84,7 +84,7 @@ def test_interaction_grows_with_distance(found):
 
 
 def test_distances_are_to_points(found):
-    """The nearest point of the lane is 0.5 m beside ego and up to 0.25 m along it, so that the distance wobbles."""
+    """The nearest point of the lane is 0.5 m off ego and up to 0.25 m along it, so that the distance wobbles."""
     deviation = found["aside"]["lane_deviation"] * 1.25
     assert deviation.min() == pytest.approx(0.5, abs=2e-2)
     assert deviation.max() == pytest.approx(np.hypot(0.5, 0.25), abs=1e-2)

@@ -94,7 +94,7 @@ def test_older_versions_are_refused(data, table, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def lively(tmp_path_factory):
-    """A drive that speeds up, brakes, swerves and is not seen for a second; somebody ahead, and an oncoming car."""
+    """A drive that speeds up, brakes, swerves and is not seen for a second; a car ahead, and an oncoming car."""
     t = (np.arange(91) - 10) * 0.1
     speed, swerve = 9.0 + 3.0 * np.sin(0.9 * t), 0.8 * np.sin(0.7 * t)
     along = np.cumsum(speed) * 0.1
@@ -279,7 +279,7 @@ def test_the_command(data, tmp_path, capsys):
             main([*command, "--out", str(tmp_path / "x"), "--export", str(tmp_path / "y"), out_of_range]) == 2
         )
         assert "most critical of 2 scenarios; ask for 1 to 2" in capsys.readouterr().err
-    for taken, words in ((data.path, "is the set that is read"), (top, "exists already")):
+    for taken, words in ((data.path, "is the set that is read"), (top, "already exists")):
         assert main([*command, "--out", str(tmp_path / "x"), "--export", str(taken), "1"]) == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -27,3 +28,17 @@ def write_records(tmp_path):
         return path
 
     return write
+
+
+@pytest.fixture
+def hide_packages(monkeypatch):
+    """A function that makes packages look as if they were not installed."""
+
+    def hide(*packages: str) -> None:
+        loaded = [
+            name for name in sys.modules if name.startswith(tuple(f"{package}." for package in packages))
+        ]
+        for name in (*packages, *loaded):
+            monkeypatch.setitem(sys.modules, name, None)
+
+    return hide

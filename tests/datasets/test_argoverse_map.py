@@ -110,7 +110,7 @@ def test_check_list_22_ids_of_nine_digits_survive(read):
 
 
 def test_painted_lines_come_once_and_unpainted_ones_not(read):
-    """Both lanes beside a line name it; the oncoming ones from the other end and with other points between."""
+    """Both lanes next to a line name it; the oncoming ones from the other end and with other points between."""
     found = read(av2_motion.local_map())
     counts = Counter(f.kind for f in found.features if 5 <= f.kind <= 13)
     assert counts[RoadKind.LINE_SOLID_SINGLE_WHITE] == 2 * 2  # bike|slow is drawn with 3 and with 2 points

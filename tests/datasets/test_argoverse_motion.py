@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import math
 
@@ -112,7 +111,7 @@ def test_check_list_3_sizes_are_those_of_the_class_and_flagged(recording):
 
 
 def test_the_ego_is_moved_from_its_rear_axle_to_its_middle(recording):
-    """And stands on the sloping road like everyone else: box centres half a height above it."""
+    """And stands on the sloping road like all agents: box centres half a height above it."""
     tracks, t = recording.tracks, np.arange(110)
     np.testing.assert_allclose(tracks.xy[4], place(4 + 1.34 + 0.8 * t, 1.75)[:, :2])
     on_map = tracks.xy[4, :, 0] - av2_motion.ORIGIN[0]
@@ -241,16 +240,9 @@ def test_describe(sample):
     assert "110 steps in austin" in found.flavour and "5 tracks" in found.notes
 
 
-def test_missing_pyarrow_names_the_extra(sample, monkeypatch):
-    found = builtins.__import__
-
-    def blocked(name, *args, **kwargs):
-        if name.startswith("pyarrow"):
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", blocked)
-    with pytest.raises(UsageError, match=r"pip install 'drivax\[av2,maps\]'"):
+def test_missing_pyarrow_names_the_extra(sample, hide_packages):
+    hide_packages("pyarrow")
+    with pytest.raises(UsageError, match=r"pip install 'drivax\[av2\]'"):
         list(READER.read(sample))
 
 

@@ -204,7 +204,7 @@ def test_missing_files_are_named(tmp_path):
     (map_path,) = (path.parent / "map").iterdir()
     map_path.unlink()
     (bad,) = READER.read(path)
-    assert "has no map/log_map_archive_*.json beside it" in bad.problem and bad.file == path
+    assert "has no map/log_map_archive_*.json next to it" in bad.problem and bad.file == path
     path.with_name(POSES).unlink()
     (bad,) = READER.read(path)
     assert bad.file.name == POSES and bad.problem == "is missing"

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from drivax import cli
-from drivax.datasets.export import subset as exports
-from drivax.datasets.export.subset import NOTE, Export, export
+from drivax.datasets.export import writer as exports
+from drivax.datasets.export.writer import NOTE, Export, export
 from drivax.datasets.formats import survey
 from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
@@ -67,7 +67,7 @@ def test_everything_again_has_the_same_data(stored, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("text", "expected_ids"),
     [
         ("d\nb\n", [("one", "b"), ("two", "d")]),  # in the order of the set
         ("a\n", [("one", "a"), ("two", "a")]),
@@ -75,10 +75,10 @@ def test_everything_again_has_the_same_data(stored, tmp_path):
         ("a\ntwo\ta\n", [("one", "a"), ("two", "a")]),
     ],
 )
-def test_ids(stored, tmp_path, text, wanted):
+def test_ids(stored, tmp_path, text, expected_ids):
     (tmp_path / "ids.txt").write_text(text)
     export(stored, tmp_path / "part", Export(ids=tmp_path / "ids.txt"))
-    assert ids(tmp_path / "part") == wanted
+    assert ids(tmp_path / "part") == expected_ids
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_what_exists_is_replaced_only_when_asked_and_when_it_is_an_export(stored
     options = Export(format=name, limit=1)
     export(stored, tmp_path / "out", options)
     before = listing(tmp_path / "out")
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         export(stored, tmp_path / "out", options)
     export(stored, tmp_path / "out", replace(options, overwrite=True))
     assert listing(tmp_path / "out") == before

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from datasets.samples import womd_scenario
-from datasets.test_restore import assert_same_map
-from drivax.datasets.export.restore import restore
+from datasets.test_export_recording import assert_same_map
+from drivax.datasets.export.recording import restore
 from drivax.datasets.export.tfexample import PATHS, tf_example
-from drivax.datasets.export.tfrecord import example
 from drivax.datasets.womd import example_reader as womd_example
 from drivax.datasets.womd import records as womd
 from drivax.datasets.womd import scenario_reader as protos
+from drivax.datasets.womd.tfrecord import example
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, AgentKind, Flag, RoadKind

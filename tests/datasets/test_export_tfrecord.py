@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datasets.samples import womd_example, womd_scenario
-from drivax.datasets.export.tfrecord import example, shard_name, varints, write_record
 from drivax.datasets.womd.messages import example_class
-from drivax.datasets.womd.tfrecord import read_records
+from drivax.datasets.womd.tfrecord import example, read_records, shard_name, varints, write_record
 
 
 @given(arrays.arrays(np.int64, st.integers(0, 40)))

@@ -1,4 +1,4 @@
-"""Formats are told by content, and what cannot be told is named."""
+"""Formats are detected by content; unknown content is reported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from datasets import samples
-from drivax.datasets.convert import convert
+from drivax.datasets.conversion import convert
 from drivax.datasets.formats import READERS, detect, find_files, reader_named, survey
 from drivax.datasets.womd.scenario_reader import WomdScenario
 from drivax.errors import DataError, UsageError
@@ -77,7 +77,7 @@ def test_names_are_relative_to_what_was_given(sampled, tmp_path):
 
 
 def test_sensor_data_is_not_opened(tmp_path, wire, write_records, monkeypatch):
-    """Camera images and sweeps lie beside nuScenes' tables by the hundred thousand."""
+    """Camera images and sweeps lie next to nuScenes' tables by the hundred thousand."""
     good = write_records("a.tfrecord", wire.scenario())
     for name in ("image.JPG", "sweep.pcd.bin", "blob.png"):
         (tmp_path / name).write_bytes(b"content")
@@ -89,7 +89,7 @@ def test_sensor_data_is_not_opened(tmp_path, wire, write_records, monkeypatch):
     assert asked == [good] and found.ignored == 3
 
 
-def test_a_missing_extra_is_told_for_the_files_that_need_it_only(sampled, tmp_path, monkeypatch):
+def test_missing_extra_is_reported_only_for_files_that_need_it(sampled, tmp_path, monkeypatch):
     def fail():
         raise UsageError("reading TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'")
 

@@ -248,10 +248,7 @@ def test_describe(tmp_path):
 
 
 #: shared/data/README.md
-REAL = {
-    "325": ("ef3a8f65142f41ac", 62, 61, 157, 10_527),
-    "4": ("db4edc9bd0c9d18c", 81, 80, 102, 5_388),
-}
+REAL = {"325": ("ef3a8f65142f41ac", 62, 61, 157, 10_527), "4": ("db4edc9bd0c9d18c", 81, 80, 102, 5_388)}
 
 
 @pytest.mark.parametrize("number", REAL)

@@ -204,7 +204,7 @@ def test_numbers_of_tracks_hold_for_the_whole_log(recordings):
 
 
 def test_gaps_of_tracks_stay_gaps(recordings):
-    """Item 4: nobody saw the pedestrian between 3 s and 4 s; nothing is filled in."""
+    """Item 4: the pedestrian is unobserved between 3 s and 4 s; nothing is filled in."""
     recording = recordings[0]
     row = recording.tracks.track_id.tolist().index(6)
     seen = np.array([sample.walker(t) is not None for t in recording.timestamps_s])
@@ -228,7 +228,7 @@ def test_boxes_without_a_track_are_counted(tmp_path):
     assert 1 not in recording.tracks.track_id[1:] or len(recording.tracks.track_id) == 12
 
 
-def test_sizes_and_velocities_that_nobody_knows(tmp_path):
+def test_unknown_sizes_and_velocities(tmp_path):
     path = sample.write(tmp_path)
     change(
         path, "UPDATE lidar_box SET length = NULL, vx = NULL WHERE track_token = ?", sample.token("track", 3)
@@ -245,7 +245,7 @@ def test_sizes_and_velocities_that_nobody_knows(tmp_path):
 
 
 def test_lights_by_connector(recordings):
-    """Item 10: keyed by the connector that they control, yellow mapped, -1 where nobody observed them."""
+    """Item 10: keyed by the connector that they control, yellow mapped, -1 where the light is unobserved them."""
     states = {"red": LightState.STOP, "yellow": LightState.CAUTION, "green": LightState.GO}
     for recording in recordings:
         lights = {light.lane_id: light for light in recording.lights}
@@ -439,7 +439,7 @@ def test_too_many_tracks_are_refused_before_they_take_memory(tmp_path, monkeypat
 
 
 def test_an_index_that_leads_to_boxes_of_other_sweeps(tmp_path):
-    """Entries of an index out of order make SQLite return rows that nobody asked for; they are left out."""
+    """Entries of an index out of order make SQLite return rows outside the query; they are left out."""
     path = sample.write(tmp_path)
     (whole,) = read(path)
     data = path.read_bytes()

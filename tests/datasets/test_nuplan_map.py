@@ -14,10 +14,10 @@ import pytest
 import shapely
 
 from datasets.samples import nuplan as sample
-from drivax.datasets.nuplan import features as nuplan_features
 from drivax.datasets.nuplan import map as nuplan_map
-from drivax.datasets.nuplan.features import features_around
+from drivax.datasets.nuplan import map_features as nuplan_features
 from drivax.datasets.nuplan.map import city_map, corridor, feature_id, find_map
+from drivax.datasets.nuplan.map_features import features_around
 from drivax.errors import DataError, UsageError
 from drivax.scenario.schema import LANE_KINDS, RoadKind
 
@@ -119,7 +119,7 @@ def test_lane_graph(features):
 
 
 def test_neighbours_are_of_the_same_group_and_direction(features):
-    """Item 13: index 0 is the leftmost lane of a group; the oncoming lane beside it is no neighbour."""
+    """Item 13: index 0 is the leftmost lane of a group; the oncoming lane next to it is no neighbour."""
     left, right = features[lane_id(sample.IN["w"])], features[lane_id(sample.SECOND)]
     assert (left.left_neighbours, left.right_neighbours) == ((), (right.feature_id,))
     assert (right.left_neighbours, right.right_neighbours) == ((left.feature_id,), ())
@@ -166,7 +166,7 @@ def test_widths_between_boundaries(features):
         assert features[connector_id(*pair)].width_m == pytest.approx(sample.WIDTH, abs=0.05)
 
 
-def test_widths_that_nobody_knows(tmp_path):
+def test_unknown_widths(tmp_path):
     layers = sample.map_layers()
     del layers["gen_lane_connectors_scaled_width_polygons"]
     shape, values = layers["lanes_polygons"].rows[51]
@@ -190,7 +190,7 @@ def test_painted_lines_by_type(features):
 
 
 def test_edges_are_rings_with_drivable_space_on_their_left(features):
-    """Item 7: the union of all drivable polygons, the car park joined to the road beside it."""
+    """Item 7: the union of all drivable polygons, the car park joined to the road next to it."""
     edges = [feature for feature in features.values() if feature.kind == RoadKind.EDGE_BOUNDARY]
     drivable = [
         sample.rectangle(arm, sample.RADIUS, 162.0, -7.0 if arm == "w" else -3.5, 3.5) for arm in sample.ARMS
@@ -346,12 +346,12 @@ def test_what_is_no_map_is_named(tmp_path, statement, problem):
 def test_maps_are_found_above_the_log_then_by_the_environment(tmp_path, monkeypatch):
     monkeypatch.delenv("NUPLAN_MAPS_ROOT", raising=False)
     log = sample.write(tmp_path / "a")
-    beside = tmp_path / "a" / "maps" / sample.CITY / sample.VERSION / "map.gpkg"
-    assert find_map(log, sample.CITY) == beside
+    nearest = tmp_path / "a" / "maps" / sample.CITY / sample.VERSION / "map.gpkg"
+    assert find_map(log, sample.CITY) == nearest
     elsewhere = tmp_path / "b" / "maps"
     (tmp_path / "b").mkdir()
     (tmp_path / "a" / "maps").rename(elsewhere)
-    with pytest.raises(DataError, match=r"no nuPlan maps beside it .*NUPLAN_MAPS_ROOT"):
+    with pytest.raises(DataError, match=r"no nuPlan maps next to it .*NUPLAN_MAPS_ROOT"):
         find_map(log, sample.CITY)
     monkeypatch.setenv("NUPLAN_MAPS_ROOT", str(elsewhere))
     assert find_map(log, sample.CITY).parent.parent.parent == elsewhere
@@ -393,5 +393,5 @@ def test_feature_ids_are_distinct():
 def test_missing_packages_are_named_with_the_extra_that_brings_them(city, monkeypatch, name):
     nuplan_features._transformer.cache_clear()
     monkeypatch.setitem(sys.modules, name, None)  # makes its import fail
-    with pytest.raises(UsageError, match=f"need {name}; pip install 'drivax\\[maps\\]'"):
+    with pytest.raises(UsageError, match=f"{name} is not installed; pip install 'drivax\\[maps\\]'"):
         features_around(city, DRIVE)

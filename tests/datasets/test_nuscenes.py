@@ -11,10 +11,9 @@ from scipy.integrate import solve_ivp
 
 from datasets.samples import nuscenes as sample
 from drivax.datasets.nuscenes import map as nuscenes_map
-from drivax.datasets.nuscenes.cropping import Box
-from drivax.datasets.nuscenes.json_rows import rows
+from drivax.datasets.nuscenes.map import Box
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M, EGO_SIZE_M, NuScenes, interpolate
-from drivax.datasets.nuscenes.tables import kind_of, yaw
+from drivax.datasets.nuscenes.tables import kind_of, rows, yaw
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
@@ -45,7 +44,7 @@ def test_is_a_reader(tmp_path):
     assert (about.version, about.recordings, about.missing) == ("v1.0-mini", 1, ())
 
 
-def test_what_is_missing_is_told(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     path = sample.write(tmp_path)
     path.with_name("ego_pose.json").unlink()
     (tmp_path / "maps" / "expansion" / f"{sample.CITY}.json").unlink()

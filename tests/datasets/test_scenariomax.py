@@ -33,7 +33,7 @@ def by_span(wire, name: str, make) -> dict[str, bytes]:
 # --- Which of the two kinds of tf.Example a record is.
 
 
-def test_told_from_womd_by_content(wire, write_records):
+def test_format_is_detected_by_content(wire, write_records):
     ours, womd = write_records("a", wire.scenariomax()), write_records("b", wire.example())
     proto = write_records("c", wire.scenario())
     for reader, path in ((ScenarioMax(), ours), (WomdExample(), womd), (WomdScenario(), proto)):
@@ -193,7 +193,7 @@ def test_describe_and_count(wire, write_records):
 
 
 def test_read_as_womd_padding_would_be_tracks(wire):
-    """Why the format is told apart: WOMD's reader refuses or misreads what ScenarioMax writes."""
+    """Why the format is detected: WOMD's reader refuses or misreads what ScenarioMax writes."""
     with pytest.raises(DataError, match="names a track twice"):
         decode_womd(wire.scenariomax(**{"state/id": wire.floats([0, 1, 2, 0, 0])}))
     assert len(decode_womd(wire.scenariomax()).lights) == 2

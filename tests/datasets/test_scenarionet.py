@@ -15,8 +15,12 @@ import pytest
 from datasets.samples import scenarionet as sample
 from drivax.datasets.reader import BadRecord, Reader
 from drivax.datasets.scenarionet import pickles
-from drivax.datasets.scenarionet.edges import drivable_on_left, inside, outlines_on_left
-from drivax.datasets.scenarionet.map import third_column_is_heading
+from drivax.datasets.scenarionet.map import (
+    drivable_on_left,
+    inside,
+    outlines_on_left,
+    third_column_is_heading,
+)
 from drivax.datasets.scenarionet.reader import ScenarioNet, decode
 from drivax.errors import DataError
 from drivax.geometry.polylines import point_to_segment
@@ -99,7 +103,7 @@ def test_12_units_of_speed_limits(tree):
 
 
 @pytest.mark.parametrize("dataset", ["nuscenes", "nuplan", "av2"])
-def test_limits_that_nobody_measured_are_unknown(tree, dataset):
+def test_invented_limits_are_unknown(tree, dataset):
     tree["metadata"]["dataset"] = dataset
     recording = decode(tree)
     assert all(f.limit_mps is None for f in recording.features)
@@ -428,7 +432,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], Any]] = {
     "the file has no dictionary 'map_features'": _without("map_features"),
     "the file has no dictionary 'dynamic_map_states'": _without("dynamic_map_states"),
     "the ego 'gone' is not one of 3 tracks": lambda tree: tree["metadata"].update(sdc_id="gone"),
-    "the ego 'is not named' is none": lambda tree: tree["metadata"].pop("sdc_id"),
+    "the ego 'is not named' is not one": lambda tree: tree["metadata"].pop("sdc_id"),
     "has 40 values of heading, 91 steps": lambda tree: tree["tracks"]["17"]["state"].update(heading=np.zeros(40)),
     "has a velocity of shape (91, 1)": lambda tree: tree["tracks"]["17"]["state"].update(velocity=np.zeros(91)),
     "has no position": lambda tree: tree["tracks"]["17"]["state"].pop("position"),

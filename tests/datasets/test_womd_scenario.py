@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import math
 import random
 import subprocess
@@ -119,7 +118,7 @@ def test_other_features(recording, wire):
 
 
 def test_10_lights_are_keyed_by_lane(recording, wire):
-    """Check-list 10: -1 where nobody observed; the place in the list of a step means nothing."""
+    """Check-list 10: -1 where unobserved; the place in the list of a step means nothing."""
     lights = {light.lane_id: light for light in recording.lights}
     assert set(lights) == {2, 4}
     assert lights[2].states.tolist() == [4] * 50 + [6] * 41
@@ -364,17 +363,10 @@ def test_other_flavour_names_the_cure(wire, write_records):
     assert bad.error().cure == "use --format womd-example" and "tf.Examples" in bad.problem
 
 
-def test_missing_protobuf_names_the_extra(wire, monkeypatch):
-    found = builtins.__import__
-
-    def without_protobuf(name, *args, **kwargs):
-        if name.startswith("google.protobuf"):
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
+def test_missing_protobuf_names_the_extra(wire, hide_packages):
     messages._class.cache_clear()
     messages._pool.cache_clear()
-    monkeypatch.setattr(builtins, "__import__", without_protobuf)
+    hide_packages("google.protobuf")
     with pytest.raises(UsageError, match=r"pip install 'drivax\[womd\]'"):
         decode(wire.scenario())
 
@@ -412,19 +404,10 @@ def test_describe_names_the_damage(wire, write_records, tmp_path):
     assert WomdScenario().count(half) == 4
 
 
-def test_without_packages_a_tfrecord_is_recognised_so_that_reading_names_them(
-    wire, write_records, monkeypatch
-):
+def test_tfrecords_are_recognised_without_packages(wire, write_records, hide_packages):
     path, other = write_records("a.tfrecord", wire.example()), write_records("b").with_name("c")
     other.write_bytes(b"SQLite format 3\0")
-    found = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith(("google.protobuf", "google_crc32c")):
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    hide_packages("google.protobuf", "google_crc32c")
     assert WomdScenario().recognise(path) and not WomdScenario().recognise(other)
     with pytest.raises(UsageError, match=r"pip install 'drivax\[womd\]'"):
         next(WomdScenario().read(path))

@@ -246,7 +246,7 @@ def test_report(evaluation, data):
         ),
         (["--planner", "own_drivers:plain", "--data", "SET", "--out", "NEW"], ["@drivax.python_planner"], 2),
         (["--planner", "idm", "--data", "SET", "--out", "NEW", "--metrics", "min_tcc"], ["'min_ttc'"], 2),
-        (["--planner", "idm", "--data", "SET", "--out", "NEW", "--batch", "0"], ["a batch of 0"], 2),
+        (["--planner", "idm", "--data", "SET", "--out", "NEW", "--batch", "0"], ["batch of 0"], 2),
     ],
 )
 def test_wrong_calls_get_one_line(arguments, words, status, evaluation, data, capsys, tmp_path):

@@ -16,9 +16,12 @@ from drivax.api import find_planner, load
 from drivax.cli import main
 from drivax.errors import UsageError
 from drivax.evaluation.run_evaluation import EvaluationConfig
+from drivax.learning.config import TrainConfig
 from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import NoisyStart
 from drivax.synthetic.generate import Generation, generate
+from drivax.tasks.actions import Published
+from drivax.tasks.task import Task
 from tiny_run import write_run
 
 START = 60
@@ -37,7 +40,7 @@ def evaluate(data, planner, out, *more):
     return main([*call, "--start-step", str(START), "--seed", "7", *more])
 
 
-def driven(out):
+def rollouts(out):
     with np.load(out / "trajectories.npz") as stored:
         return dict(stored)
 
@@ -49,10 +52,15 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
     assert evaluate(data, planner, out, "--sample") == 0
     config = settings.load(EvaluationConfig, out / "config.yaml")
     assert config == EvaluationConfig(
-        planner=planner, noisy_start=True, start_step=START, seed=7, sample=True
+        planner=planner,
+        noisy_start=True,
+        start_step=START,
+        seed=7,
+        sample=True,
+        task=run.config(TrainConfig).task,
     )
     assert json.loads((out / "run.json").read_text())["planner"] == "bold@4"
-    sampled, scenarios = driven(out), ScenarioSet.open(data)
+    sampled, scenarios = rollouts(out), ScenarioSet.open(data)
     assert (sampled["start"] == START).all()
     assert sampled["ego"].shape == (2, 91 - START, 4) and sampled["action"].shape == (2, 90 - START, 2)
     logged = np.stack([one.agent_xy[START, 0] for one in scenarios])
@@ -66,14 +74,48 @@ def test_sampling_checkpoint_with_noisy_start_replaces_a_run(data, tmp_path, cap
         drivax.evaluate(find_planner(planner, load(data).bank)[0], data, sample=True)
     (out / "crashes.json").write_text("[]")
     capsys.readouterr()
-    assert evaluate(data, planner, out) == 2 and "exists already" in capsys.readouterr().err
+    assert evaluate(data, planner, out) == 2 and "already exists" in capsys.readouterr().err
     assert (out / "crashes.json").exists(), "a run that was not to be replaced is whole"
     assert evaluate(data, planner, out, "--overwrite") == 0
-    modes = driven(out)
+    modes = rollouts(out)
     assert not (out / "crashes.json").exists(), "nothing of the old run stays"
     assert not settings.load(EvaluationConfig, out / "config.yaml").sample
     np.testing.assert_array_equal(modes["ego"][:, 0], sampled["ego"][:, 0])
     assert (np.abs(modes["action"] - sampled["action"]).max(axis=(1, 2)) > 0.05).all()
+
+
+@pytest.mark.parametrize("planner", ["random", "constant_velocity"])
+def test_task_flags_hold_for_rule_based_planners(data, planner, tmp_path):
+    assert evaluate(data, planner, tmp_path / "run", "--task.actions", "published") == 0
+    task = settings.load(EvaluationConfig, tmp_path / "run" / "config.yaml").task
+    assert task == Task(actions=Published())
+    options = {"start": NoisyStart(), "start_step": START, "seed": 7}
+    published = drivax.evaluate(planner, data, task=task, **options)
+    ego = rollouts(tmp_path / "run")["ego"]
+    np.testing.assert_array_equal(published.trajectories.ego, ego)
+    if planner == "random":
+        default = drivax.evaluate(planner, data, **options)
+        assert np.abs(default.trajectories.ego - ego).max() > 0.1
+
+
+def test_task_flags_are_refused_for_trained_policies(data, tmp_path, capsys):
+    assert evaluate(data, "zoo:aggressive", tmp_path / "run", "--task.actions", "published") == 2
+    assert "trained policy 'zoo:aggressive' has its own task; leave out --task" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="has its own task"):
+        drivax.evaluate("zoo:aggressive", data, task=Task())
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--task.action", "published"], "did you mean 'actions'"),
+        (["--limt", "1"], "unknown option '--limt'; did you mean '--limit'"),
+        (["extra"], "extra"),
+    ],
+)
+def test_unknown_flags_name_the_closest_one(data, flags, message, tmp_path, capsys):
+    assert evaluate(data, "idm", tmp_path / "run", *flags) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

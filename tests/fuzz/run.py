@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets.convert import Conversion, convert_file
+from drivax.datasets.conversion import Conversion, convert_file
 from drivax.datasets.formats import reader_named
 from drivax.datasets.reader import BadRecord
 from drivax.errors import DrivaxError

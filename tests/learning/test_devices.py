@@ -15,9 +15,7 @@ CASES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "extent"), CASES)
-def test_several_devices_and_seeds_side_by_side_learn_what_one_learns_alone(
-    name, extent, repository, monkeypatch
-):
+def test_devices_and_seeds_learn_the_same_as_one_alone(name, extent, repository, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=4")
     folders = ("src", "tests", "tests/learning")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(repository / folder) for folder in folders))

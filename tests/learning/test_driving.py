@@ -58,7 +58,7 @@ def experience(bank, driving):
     return jax.device_get(run(bank, environments, jax.random.key(1)))
 
 
-def test_it_is_an_environment(bank, driving):
+def test_driving_is_an_environment(bank, driving):
     assert isinstance(driving, Environment)
     assert driving.action_size == 2 and driving.levels is None
     assert driving.shapes(bank)["moment"] == (1, 4)
@@ -81,7 +81,7 @@ ON_LEVELS = [
 
 
 @pytest.mark.parametrize("config", ON_LEVELS, ids=lambda config: config.kind)
-def test_discrete_actions_are_learned_by(config, bank):
+def test_algorithms_learn_discrete_actions(config, bank):
     """Levels are asked for while the network is traced."""
     task = Task(actions=Discrete(accelerations=3, curvatures=5), observation=OBSERVATION, metrics="none")
     environment = Driving(Simulator(task), LATEST)
@@ -91,7 +91,7 @@ def test_discrete_actions_are_learned_by(config, bank):
 
 
 @pytest.mark.slow
-def test_a_policy_on_levels_takes_levels(bank):
+def test_discrete_policy_takes_levels(bank):
     task = Task(actions=Discrete(accelerations=3, curvatures=5), observation=OBSERVATION, metrics="none")
     environment = Driving(Simulator(task), LATEST)
     learner = ON_LEVELS[0].build(environment, bank, 2)
@@ -105,7 +105,7 @@ def test_a_policy_on_levels_takes_levels(bank):
     assert np.isin(taken[:, 0], accelerations).all() and np.isin(taken[:, 1], np.float32(curvatures)).all()
 
 
-def test_the_row_behind_an_end_holds_the_final_state(experience):
+def test_row_after_an_end_holds_the_final_state(experience):
     after, rollout, _ = experience
     ended, alive = rollout.terminated | rollout.truncated, rollout.alive
     assert ended.sum() >= 6 and rollout.terminated.any() and rollout.observation is None
@@ -134,7 +134,7 @@ def test_new_episodes_begin_as_logged(experience, bank):
         np.testing.assert_allclose(history[-len(logged) :, :2], logged[:, :2], atol=1e-4)
 
 
-def test_episodes_begin_at_the_steps_asked_for(bank):
+def test_episodes_begin_at_requested_steps(bank):
     late = replace(bank, agents=bank.agents.at[1, :3, 0, AgentColumn.VALID].set(0.0))
     index, step, _ = _draw(late, jax.random.key(2), 64, 0, 0)
     np.testing.assert_array_equal(step, np.where(index == 1, 10, 0))
@@ -145,7 +145,7 @@ def test_episodes_begin_at_the_steps_asked_for(bank):
             Driving(Simulator(Task()), latest, earliest)
 
 
-def test_stored_states_are_observed_as_they_were_seen(experience, bank, driving):
+def test_stored_states_give_the_same_observation(experience, bank, driving):
     _, rollout, _ = experience
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rollout.state)
     again = jax.jit(driving.observe_all)(bank, rows)
@@ -154,7 +154,7 @@ def test_stored_states_are_observed_as_they_were_seen(experience, bank, driving)
     np.testing.assert_allclose(one["route"], again["route"][7], atol=1e-5)
 
 
-def test_sums_are_over_what_counts(experience, driving):
+def test_sums_leave_out_resets(experience, driving):
     _, rollout, totals = experience
     ended = rollout.terminated | rollout.truncated
     assert totals["episodes"] == ended.sum() == totals["steps/n"] == totals["red_light/n"]

@@ -61,7 +61,7 @@ def drive(bank, index):
     return jax.lax.scan(step, simulator.reset(bank, index), None, bank.steps - 11)[1]
 
 
-def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, experience):
+def test_transitions_equal_a_simulated_expert(bank, experience):
     online = jax.device_get(jax.jit(jax.vmap(drive, (None, 0)))(bank, jnp.arange(3)))
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.usable)
@@ -87,7 +87,7 @@ def test_a_transition_is_what_the_simulator_gives_while_the_expert_drives(bank, 
     assert np.abs(reward).max() > 0
 
 
-def test_nothing_is_learned_behind_an_end_nor_without_the_expert(experience):
+def test_steps_after_an_end_or_without_expert_are_unusable(experience):
     expert = jax.device_get(experience.expert)
     assert isinstance(DRIVING, Recorded)
     end = int(np.argmax(expert.terminated[0]))
@@ -99,7 +99,7 @@ def test_nothing_is_learned_behind_an_end_nor_without_the_expert(experience):
     assert lost[10:68].all() and not lost[68:].any()
 
 
-def test_clipped_steps_are_left_out_unless_they_are_asked_for(bank, experience):
+def test_clipped_steps_are_left_out_by_default(bank, experience):
     expert = jax.device_get(experience.expert)
     index, step = np.nonzero(expert.clipped & expert.usable)
     assert {JUMP - 1} <= {s for i, s in zip(index, step, strict=True) if i == 1}
@@ -110,7 +110,7 @@ def test_clipped_steps_are_left_out_unless_they_are_asked_for(bank, experience):
         assert ((chances.reshape(expert.usable.shape)[index, step] > 0) == drawn).all()
 
 
-def test_what_follows_the_weights(bank, experience):
+def test_weights_apply_to_policy_or_all(bank, experience):
     usable = np.asarray(experience.expert.usable & ~experience.expert.clipped)
     weights = np.zeros(usable.shape)
     weights[1, 20], weights[1, 30], weights[0, 3] = 3.0, 1.0, 100.0
@@ -127,7 +127,7 @@ def test_what_follows_the_weights(bank, experience):
         np.testing.assert_array_equal(made.uniform.cumulative, experience.critic.cumulative)
 
 
-def test_steps_that_weights_are_made_for_are_those_that_are_drawn(data):
+def test_usable_steps_are_the_drawn_steps(data):
     config = TrainConfig(task=DRIVING.task, algorithm=CqlConfig())
     own = ExperienceConfig().of(DRIVING, ScenarioBank.from_scenarios(data))
     usable = usable_steps(config, data)

@@ -17,7 +17,7 @@ from drivax.learning.experience import ExperienceConfig
 from drivax.learning.training_log import rank
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
-from recorded import Table, Told
+from recorded import Logged, Table
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(32,)), head=(32,), activation="relu")
 GAMMA, LENGTH = 0.8, 6
@@ -40,12 +40,12 @@ def table():
     )
 
 
-def test_policies_are_worth_what_they_earn(table):
+def test_fitted_q_estimates_returns(table):
     """By hand: always right earns 1 / (1 - gamma) = 5 without ends, and (1 - gamma^6) / (1 - gamma) = 3.69 with one."""
     ends = replace(table, terminated=table.truncated, truncated=table.terminated)
     # Where episodes are cut off the same state follows, so that the loop goes on for ever.
     loops = replace(table, seen=jnp.ones_like(table.seen))
-    judge = FittedQ(FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05), NETWORK, Told(), GAMMA)
+    judge = FittedQ(FittedQConfig(updates=1500, batch=64, rate=5e-3, tau=0.05), NETWORK, Logged(), GAMMA)
 
     @jax.jit
     def both(data):
@@ -55,13 +55,13 @@ def test_policies_are_worth_what_they_earn(table):
         return always(0.5), always(-0.5)
 
     for data, worth in ((loops, 1 / (1 - GAMMA)), (ends, (1 - GAMMA**LENGTH) / (1 - GAMMA))):
-        right, left = both(ExperienceConfig().of(Told(), data))
+        right, left = both(ExperienceConfig().of(Logged(), data))
         assert float(right) == pytest.approx(worth, rel=0.05)
         assert float(left) == pytest.approx(0.0, abs=0.1)
 
 
-def test_a_learner_is_judged_by_it(table):
-    """A clone of pushes to the right, all features of which lie close together: told apart by normalising alone.
+def test_learner_logs_fitted_q(table):
+    """A clone of pushes to the right, all features of which lie close together, and only normalisation separates them.
 
     Pushing right pays as much as the number of the step then, so that a critic that sees no steps cannot know it.
     """
@@ -77,17 +77,17 @@ def test_a_learner_is_judged_by_it(table):
     )  # fmt: skip
     found = {}
     for normalise in (True, False):
-        learner = replace(config, normalise=normalise).build(Told(), near, 4)
-        made = training_data(learner.config, Told(), near, np.asarray(right, np.float64))
+        learner = replace(config, normalise=normalise).build(Logged(), near, 4)
+        made = training_data(learner.config, Logged(), near, np.asarray(right, np.float64))
         state = jax.jit(learner.init)(made, jax.random.key(0))
         for _ in range(4):
             state, _ = jax.jit(learner.iterate)(made, state)
-        found[normalise] = learner.held_out_metrics(ExperienceConfig().of(Told(), near), state)
+        found[normalise] = learner.held_out_metrics(ExperienceConfig().of(Logged(), near), state)
     assert found[True]["fitted_q"] == pytest.approx(worth, rel=0.05)
     assert abs(found[False]["fitted_q"] - worth) > 0.2 * worth
 
 
-def test_checkpoints_are_compared_by_it():
+def test_checkpoints_are_ranked_by_fitted_q():
     row = {"validation/fitted_q": -3.0, "validation/mean_q": 9.0, "validation/vmax_score": 0.5}
     assert rank("fitted_q", row) == (-3.0,) < rank("fitted_q", row | {"validation/fitted_q": -2.0})
     assert rank("fitted_q", row | {"validation/fitted_q": float("nan")}) == (-np.inf,)

@@ -104,7 +104,7 @@ def two():
 @pytest.mark.slow
 @pytest.mark.parametrize("encoder", ENCODERS)
 @pytest.mark.parametrize("name", ["bc", "ppo", "sac", "bc_ppo", "bc_sac"])
-def test_two_scenarios_are_driven_without_a_fault(two, name, encoder):
+def test_algorithms_overfit_two_scenarios(two, name, encoder):
     config, iterations = algorithm(name, encoder)
     learner = config.build(Driving(Simulator(TASK), latest_start=60), two, iterations)
     state = jax.jit(learner.init)(two, jax.random.key(0))

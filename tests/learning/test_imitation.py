@@ -1,4 +1,4 @@
-"""Cloning against NumPy, and imitation beside learning by reward."""
+"""Cloning against NumPy, and imitation in addition to learning by reward."""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ PPO = PpoConfig(network=TINY, environments=4, unroll=4, epochs=1, minibatches=2)
 
 
 @dataclass(frozen=True)
-class Told(Pendulum):
+class Logged(Pendulum):
     """Always the same moments."""
 
     def demonstrations(self, data, key, count):
@@ -56,26 +56,26 @@ def test_losses_against_numpy(mask):
     density = stats.norm.logpdf(np.arctanh(action.astype(float)), loc, scale) - np.log1p(-(action**2.0))
     for loss, expected in (("mse", (error**2).mean(axis=-1)), ("likelihood", -density.sum(axis=-1))):
         cloning = Cloning(loss=loss, mask_clipped=mask)
-        found, logs = cloning.batch_loss(gaussian, parameters, Told(), data, jax.random.key(0))
+        found, logs = cloning.batch_loss(gaussian, parameters, Logged(), data, jax.random.key(0))
         assert float(found) == pytest.approx(expected[counts].mean(), rel=1e-4)
         assert float(logs["imitation_error"]) == pytest.approx(np.abs(error)[counts].mean(), rel=1e-4)
         assert float(logs["left_out"]) == pytest.approx(2 / 6 if mask else 0.0, abs=1e-6)
 
 
-def test_clipped_moments_teach_nothing():
+def test_clipped_steps_have_no_loss():
     clipped = jnp.array([True, False])
     data = ({"pendulum": jnp.zeros((2, 3))}, jnp.array([[1.0], [0.3]]), clipped)
     parameters = {"loc": jnp.zeros((2, 1)), "scale": jnp.full((2, 1), 0.3)}
     for loss in ("mse", "likelihood"):
 
         def of(parameters, loss=loss):
-            return Cloning(loss=loss).batch_loss(gaussian, parameters, Told(), data, jax.random.key(0))[0]
+            return Cloning(loss=loss).batch_loss(gaussian, parameters, Logged(), data, jax.random.key(0))[0]
 
         slope = jax.grad(of)(parameters)["loc"][:, 0]
         assert slope[0] == 0.0 and slope[1] < 0.0
 
 
-def test_the_likelihood_fits_the_spread(shown):
+def test_likelihood_fits_the_standard_deviation(shown):
     """Of an expert that acts by N(0.4, 0.2) before squashing, whatever it sees."""
     action = jnp.tanh(0.4 + 0.2 * jax.random.normal(jax.random.key(1), shown.action.shape))
     data = replace(shown, action=action)
@@ -101,7 +101,7 @@ def test_a_grid_and_missing_experts_are_refused(shown):
         SacConfig(network=network)
 
 
-def test_imitation_fades():
+def test_imitation_weight_decays():
     weights = [float(WarmStart(weight=0.8, half_life=10).weight_at(jnp.asarray(i))) for i in (0, 10, 30)]
     np.testing.assert_allclose(weights, [0.8, 0.4, 0.1], rtol=1e-6)
     assert float(WarmStart(weight=0.8).weight_at(jnp.asarray(1000))) == pytest.approx(0.8)
@@ -113,7 +113,7 @@ def test_imitation_fades():
 
 
 @pytest.mark.slow
-def test_imitation_beside_pulls_the_policy_toward_the_expert(shown):
+def test_imitation_loss_keeps_the_policy_near_the_expert(shown):
     """From the same clone, learning by reward with a large weight stays nearer to the expert than without."""
     errors = {}
     for weight in (0.0, 30.0):

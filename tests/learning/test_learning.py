@@ -52,8 +52,8 @@ def config_of(kind, **more):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_that_was_told_to_stop_goes_on_bit_for_bit(data, kind, tmp_path, monkeypatch):
-    """Six iterations at one go, and as three, a checkpoint, and three more of a process that begins anew."""
+def test_preempted_run_resumes_bit_for_bit(data, kind, tmp_path, monkeypatch):
+    """Six iterations at one go, and as three, a checkpoint, and three more of a process that starts again."""
     config = config_of(kind)
     each = config.algorithm.steps_per_iteration
     config = replace(config, total_steps=6 * each)
@@ -105,7 +105,7 @@ def test_means_of_an_iteration():
     }  # fmt: skip
 
 
-def test_settings_that_cannot_be_meant():
+def test_impossible_settings_are_refused():
     for values, words in (
         ({"traffic": "ldm"}, "there is no traffic 'ldm'"),
         ({"latest_start": 9}, r"latest_start is 9; use 10 \(earliest_start\) to 88"),
@@ -120,7 +120,7 @@ def test_settings_that_cannot_be_meant():
 
 
 @pytest.mark.slow
-def test_what_is_recorded_of_a_run(data, tmp_path):
+def test_run_folder_records_data_and_metrics(data, tmp_path):
     run = train(replace(config_of("ppo"), total_steps=2 * 8 * 16), data, tmp_path / "run")
     info = json.loads((tmp_path / "run" / "run.json").read_text())
     assert info["kind"] == "training" and info["data"][0]["hash"] == data.hash

@@ -75,7 +75,7 @@ def test_seeds_are_runs_of_their_own(data, config, tmp_path):
     assert [training.name for training in trainings] == ["seed-4", "seed-5", "seed-6"]
 
 
-def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_path):
+def test_seeds_resume_from_their_newest_common_checkpoint(data, config, tmp_path):
     whole = train(config, data, tmp_path / "whole", seeds=2)
     cut = train(config, data, tmp_path / "cut", seeds=2)
     # As if the machine had gone while checkpoints were written: one agent is a checkpoint behind.
@@ -90,7 +90,7 @@ def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(data, config, tmp_
 
 
 @pytest.mark.slow
-def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
+def test_run_fine_tunes_the_networks_of_another(data, config, tmp_path):
     """The toy adds random numbers of its key to its parameters, so what it began with is what a fresh one lacks."""
     former = train(config, data, tmp_path / "former").path
     plain = train(replace(config, total_steps=10), data, tmp_path / "plain", seeds=2).path
@@ -135,8 +135,8 @@ def test_a_run_begins_with_the_networks_of_another(data, config, tmp_path):
 
 
 @pytest.mark.slow
-def test_learning_stops_when_patience_is_up(data, config, tmp_path):
-    """The toy always drives alike: the first validation is the best, two more are waited for."""
+def test_training_stops_when_patience_is_exceeded(data, config, tmp_path):
+    """The toy always drives the same: the first validation is the best, two more are waited for."""
     patient = replace(config, evaluate_every=1, patience=2, checkpoint_rule="lexicographic")
     lines = []
     run = train(patient, data, tmp_path / "run", validation=data, seeds=2, log=lines.append)
@@ -209,7 +209,7 @@ def test_the_command_trains_several(data, tmp_path, capsys):
     assert "0 seeds; use 1 or more" in capsys.readouterr().err
 
 
-def test_weights_are_for_algorithms_that_learn_from_records(data, config, tmp_path):
+def test_weights_need_an_offline_algorithm(data, config, tmp_path):
     weighted = WeightedSet(data, np.ones((3, 91)))
     with pytest.raises(UsageError, match="ToyConfig does not learn from logged steps"):
         train(config, weighted, tmp_path / "run")

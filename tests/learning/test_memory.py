@@ -26,7 +26,7 @@ class Inner:
     replay: jax.Array
 
 
-def test_every_byte_is_on_one_line():
+def test_account_covers_all_bytes():
     data = {"scenarios": jnp.zeros((5, 7)), "codes": jnp.zeros(9, jnp.int8)}
     state = State(
         parameters=jnp.zeros((10, 3)),

@@ -19,7 +19,7 @@ from drivax.learning.algorithms.td3_bc import Td3BcConfig
 from drivax.networks.actor_critic import NetworkConfig
 from drivax.networks.encoders import MlpConfig
 from pendulum import MAX_TORQUE, returns
-from recorded import Told, episodes
+from recorded import Logged, episodes
 
 EPISODES, GOOD = 200, 10
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(64,)), head=(64,), activation="relu")
@@ -69,8 +69,8 @@ def mixture():
 
 def earns(config, table, weights):
     """Mean return, by its mode, of what was learned."""
-    learner = config.build(Told(), table, ITERATIONS)
-    made = training_data(config, Told(), table, weights)
+    learner = config.build(Logged(), table, ITERATIONS)
+    made = training_data(config, Logged(), table, weights)
 
     @jax.jit
     def run(made):
@@ -81,7 +81,7 @@ def earns(config, table, weights):
     return float(run(made))
 
 
-def test_the_mixture_is_one(mixture):
+def test_demonstrations_are_a_mixture(mixture):
     _, found, weights = mixture
     assert found[:GOOD].min() > -500 and found[GOOD:].max() < -1400
     assert weights[:GOOD].sum() / weights.sum() > 0.95 and GOOD / EPISODES == 0.05

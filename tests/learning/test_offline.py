@@ -28,7 +28,7 @@ from drivax.simulator.traffic.log import LogTraffic
 from drivax.testing import check_algorithm
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.sinks import read_rows
-from recorded import Table, Told, arms
+from recorded import Logged, Table, arms
 
 NETWORK = NetworkConfig(encoder=MlpConfig(hidden=(8,)), head=(8,))
 COUNT, ACTIONS = 16, 3
@@ -58,7 +58,7 @@ def improved(part):
 
 def begun(config):
     """A learner with what it trains, and targets that differ from what they follow."""
-    learner = config.build(Told(), arms([0.0], [0.0]), 1)
+    learner = config.build(Logged(), arms([0.0], [0.0]), 1)
     state = jax.jit(learner.init)((), jax.random.key(0))
     target = jax.tree.map(lambda leaf: leaf + 0.1, state.target)
     return learner, {"policy": state.parameters, **state.rest}, target
@@ -146,7 +146,7 @@ def test_cql_against_numpy(part, improved):
 
 
 @pytest.mark.slow
-def test_the_published_penalty_puts_the_action_of_the_data_among_the_others(part, improved):
+def test_published_penalty_includes_the_logged_action(part, improved):
     config = replace(CQL, importance=False, next_actions=False, imitation=0.0)
     learner, trained, target = begun(config)
     key = jax.random.key(7)
@@ -263,9 +263,9 @@ def test_every_loss_reaches_its_own_parameters_only(config, part, improved):
 
 
 def learned(config, data, iterations=20, weights=None):
-    """A learner and its state after so many iterations, and what the last one logged."""
-    learner = config.build(Told(), data, iterations)
-    made = training_data(config, Told(), data, weights)
+    """A learner and its state after n iterations, and what the last one logged."""
+    learner = config.build(Logged(), data, iterations)
+    made = training_data(config, Logged(), data, weights)
 
     @jax.jit
     def run(made):
@@ -281,7 +281,7 @@ FAST = {"batch": 64, "updates": 50, "policy_rate": 3e-3, "critic_rate": 3e-3}
 
 @pytest.fixture(scope="module")
 def bandit():
-    """Arms from -0.5 to 0.5, of which the higher ones pay more; beyond, where nobody has been, all pay -1."""
+    """Arms from -0.5 to 0.5, of which the higher ones pay more; beyond, where no agent has been, all pay -1."""
     action = np.random.default_rng(0).uniform(-0.5, 0.5, 500)
     return arms(action, action)
 
@@ -300,7 +300,7 @@ def bandit():
         pytest.param(Td3BcConfig(network=NETWORK, q_weight=0.2, **FAST), True, id="td3_bc"),
     ],
 )
-def test_arms_that_nobody_pulled(bandit, config, stays):
+def test_unlogged_arms_are_not_overestimated(bandit, config, stays):
     """Without a term that keeps them there, actions go where the critic makes up values."""
     learner, state, _ = learned(config, bandit)
     seen = {"pendulum": jnp.ones(3)}
@@ -314,7 +314,7 @@ def test_arms_that_nobody_pulled(bandit, config, stays):
 
 
 @pytest.mark.slow
-def test_a_multiplier_finds_the_weight_that_a_gap_takes():
+def test_multiplier_reaches_the_gap():
     """Arms from 0.2 to 0.4: the lower the penalty is to be, the larger its weight; above what there is, nothing."""
     action = np.random.default_rng(0).uniform(0.2, 0.4, 500)
     settings = {"network": NETWORK, "penalty": 1.0, "penalty_rate": 0.01, **FAST}
@@ -326,7 +326,7 @@ def test_a_multiplier_finds_the_weight_that_a_gap_takes():
     assert found[1.0][1] > found[-0.5][1] > found[-1.0][1]
 
 
-def test_a_timeout_is_worth_what_follows():
+def test_timeouts_bootstrap():
     """One state for ever, paid 1 a step: 1 / (1 - gamma) where episodes are cut off, 1 where they end."""
     ones, number = jnp.ones((20, 10)), jnp.broadcast_to(jnp.arange(10), (20, 10))
     never = jnp.zeros((20, 10), bool)
@@ -338,7 +338,7 @@ def test_a_timeout_is_worth_what_follows():
 
 
 @pytest.mark.slow
-def test_weights_choose_what_is_learned_from(bandit):
+def test_weights_select_training_steps(bandit):
     """Only the arms around 0.3 have weight: for all that is learned, or for the policy alone."""
     weights = np.zeros((500, 2))
     weights[:, 0] = np.abs(np.asarray(bandit.action[:, 0, 0]) - 0.3) < 0.05
@@ -384,8 +384,8 @@ RESUMED = {
 def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     """Stopped in the middle, with an odd number of updates behind it, and restored from disk."""
     config, weights = RESUMED[name], np.random.default_rng(0).uniform(size=(500, 2))
-    learner = config.build(Told(), bandit, 4)
-    data = training_data(config, Told(), bandit, weights)
+    learner = config.build(Logged(), bandit, 4)
+    data = training_data(config, Logged(), bandit, weights)
     iterate, states = jax.jit(learner.iterate), [jax.jit(learner.init)(data, jax.random.key(5))]
     for _ in range(4):
         states.append(iterate(data, states[-1])[0])
@@ -393,7 +393,7 @@ def test_resuming_is_bit_for_bit(bandit, name, tmp_path):
     checkpoints.save(1, states[1])
     # Restored into shapes alone, and for the environment's bare data, as a fresh process does.
     state = checkpoints.restore(jax.eval_shape(learner.init, bandit, jax.random.key(0)))
-    again = training_data(config, Told(), bandit, weights)
+    again = training_data(config, Logged(), bandit, weights)
     for _ in range(3):
         state = iterate(again, state)[0]
     one, other = ([_plain(leaf) for leaf in jax.tree.leaves(part)] for part in (state, states[-1]))
@@ -416,13 +416,13 @@ def _plain(leaf):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RESUMED)
-def test_algorithms_keep_to_the_rules(name):
+def test_algorithms_pass_their_checks(name):
     check_algorithm(RESUMED[name])
 
 
 @pytest.mark.slow
-def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
-    """Of one run: validation in closed loop beside the mean Q, and a policy that drives."""
+def test_held_out_values_are_logged_without_ranking(data, tmp_path):
+    """Of one run: validation in closed loop next to the mean Q, and a policy that drives."""
     network = {"encoder": {"rows": [8], "hidden": [16]}, "head": [8]}
     values = {
         "task": {"observation": {"agents": 2, "steps": 1, "road": 0, "lights": 1, "route": 3}},
@@ -451,7 +451,7 @@ def test_held_out_values_are_logged_and_choose_nothing(data, tmp_path):
 def test_rates_fall_linearly_over_the_run_or_a_part_of_it(kind, every, falling):
     """Adam's step under a constant gradient is its rate, whatever moves how often."""
     config = replace(kind, updates=10, last_rate=0.25, falling=falling, policy_rate=1e-3, gradient_norm=1e6)
-    learner = config.build(Told(), arms([0.0], [0.0]), 4)
+    learner = config.build(Logged(), arms([0.0], [0.0]), 4)
     adam = learner.adam(config.policy_rate, every)
     weights = jnp.zeros(1)
 

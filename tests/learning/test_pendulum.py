@@ -52,7 +52,7 @@ BC = BcConfig(network=NETWORK, batch=256, updates=100, learning_rate=2e-3)
 
 
 def trained(config, data, steps):
-    """A learner per seed after so many steps: the learner, its states, and what was logged by iteration."""
+    """A learner per seed after some steps: the learner, its states, and what was logged by iteration."""
     iterations = -(-steps // config.steps_per_iteration)
     learner = config.build(Pendulum(), data, iterations)
     states = jax.jit(jax.vmap(learner.init, (None, 0)))(data, SEEDS)
@@ -125,7 +125,7 @@ def test_ppo_swings_up():
 
 
 @pytest.mark.slow
-def test_a_clone_swings_up_as_well_as_its_expert(expert):
+def test_cloned_policy_swings_up_like_its_expert(expert):
     best, shown, _ = expert
     learner, states, _ = trained(BC, shown, 20 * BC.steps_per_iteration)
     found, _ = driven(learner.distribution, states.parameters)

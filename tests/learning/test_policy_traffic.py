@@ -38,7 +38,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_planner_is_judged_among_vehicles_that_a_policy_drives(tmp_path):
+def test_planner_is_evaluated_among_policy_driven_vehicles(tmp_path):
     generate(tmp_path / "set", 2, 3, Generation(workers=0))
     data = ScenarioSet.open(tmp_path / "set")
     run = train(settings.load(TrainConfig, TINY), data, tmp_path / "bold")

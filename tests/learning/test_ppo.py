@@ -106,7 +106,7 @@ def test_heads(network):
     assert network.distribution != "grid" or float(action[0]) in (-1.0, 0.0, 1.0)
 
 
-def test_parts_are_clipped_by_their_own_norms():
+def test_networks_are_clipped_by_their_own_norms():
     gradient = {
         "policy": {"w": jnp.array([0.3, 0.4])},
         "value": {"w": jnp.array([30.0]), "b": jnp.array([40.0])},

@@ -91,7 +91,7 @@ def sampled(buffer, kept, count, seed=1):
 
 @pytest.mark.parametrize("store", ["state", "observation"])
 @pytest.mark.parametrize(("capacity", "steps"), [(60, 12), (60, 20), (60, 24), (37, 48), (60, 84)])
-def test_samples_are_the_steps_that_happened(store, capacity, steps):
+def test_samples_are_collected_steps(store, capacity, steps):
     """Before the ring is full, exactly full, and after it was written over once and four times."""
     buffer, kept, held = fill(ReplayConfig(capacity, store), steps, 4)
     batch = sampled(buffer, kept, 4000)
@@ -109,7 +109,7 @@ def test_samples_are_the_steps_that_happened(store, capacity, steps):
     assert batch.observation["place_mask"].dtype == bool
 
 
-def test_every_step_is_as_likely_as_any_other():
+def test_steps_are_sampled_uniformly():
     buffer, kept, held = fill(ReplayConfig(60), 84, 4)
     batch = np.asarray(sampled(buffer, kept, 20_000).observation["place"]).astype(int)
     counts = np.unique(batch, axis=0, return_counts=True)[1]

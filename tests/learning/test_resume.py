@@ -84,7 +84,7 @@ def test_resuming_is_bit_for_bit(run, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, *(jax.tree.map(_plain, part) for part in (state, states[-1])))
 
 
-def test_a_warm_start_clones_and_then_learns(run):
+def test_warm_start_pretrains_and_then_reinforces(run):
     name, _, _, states, raw = run
     if not name.startswith("bc_"):
         pytest.skip("has one phase")
@@ -119,7 +119,7 @@ def test_a_warm_start_clones_and_then_learns(run):
 
 
 @pytest.mark.slow
-def test_networks_go_over_to_another_run(tmp_path):
+def test_networks_transfer_to_another_run(tmp_path):
     """SAC, hotter, from each of them: it gets all the networks that there are, and nothing else."""
     hot = replace(SAC, temperature=0.5).build(Pendulum(), SHOWN, 6)
     fresh = jax.jit(hot.init)(SHOWN, jax.random.key(5))
@@ -159,7 +159,7 @@ def _plain(leaf):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bc", "sac", "bc_sac", "bc_ppo"])
-def test_algorithms_keep_to_the_rules(name):
+def test_algorithms_pass_their_checks(name):
     config = ALGORITHMS[name]
     if name.startswith("bc_"):
         config = replace(config, warm_start=replace(START, iterations=1))

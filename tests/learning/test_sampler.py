@@ -50,7 +50,7 @@ def test_frequencies_follow_the_weights(weights):
     assert stats.chisquare(counts[there][enough], wrong).pvalue < 1e-6
 
 
-def test_many_places_keep_their_chances():
+def test_probabilities_are_exact_among_many_steps():
     """Among a million places float32 would be wrong by a twentieth; here scenarios far apart stay equally likely."""
     many = sampler(np.ones((12_000, 91)))
     steps = np.diff(np.asarray(many.cumulative).astype(np.int64), prepend=0)
@@ -70,7 +70,7 @@ def test_draws_follow_from_the_key_alone(weights):
     assert float(sampler(np.array([[3.0, 1.0, 0.0]])).effective) == pytest.approx(1.6)
 
 
-def test_no_weight_at_all_is_refused():
+def test_zero_weights_are_refused():
     with pytest.raises(DataError, match="no step has any weight"):
         sampler(np.zeros((2, 2)))
 

@@ -23,7 +23,7 @@ print(os.environ["NPROC"], sum("XLA" in name for name in names))
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads as Linux lists them")
 @pytest.mark.parametrize("given", [None, "3"])
-def test_a_pool_of_eight_threads_unless_another_is_asked_for(given):
+def test_thread_pool_has_eight_threads_by_default(given):
     environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
     environment |= {"NPROC": given} if given else {}
     result = subprocess.run(

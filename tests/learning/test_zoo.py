@@ -25,6 +25,8 @@ from drivax.learning.policies import (
     load_policy,
     policy_traffic,
 )
+from drivax.planners.planner_traffic import TrafficPolicy
+from drivax.simulator.traffic.bank_data import data_of, prepare_bank
 from drivax.simulator.traffic.log import LogTraffic
 from drivax.simulator.traffic.reactive import IdmTraffic
 from drivax.tracking.run_folder import RunFolder
@@ -48,7 +50,7 @@ def weights(planner):
 
 
 @pytest.mark.slow
-def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
+def test_exported_policy_is_the_best_of_its_run(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
     (one, task), (best, _) = load_policy(packed.path, bank), load_policy(run.path, bank, step=4)
     assert task == settings.load(TrainConfig, TINY).task and one.name == "packed"
@@ -60,7 +62,7 @@ def test_a_packed_policy_is_the_best_of_its_run(run, bank, tmp_path):
     assert load_policy(packed.path, bank, samples=True)[0].samples
 
 
-def test_a_packed_policy_says_where_it_comes_from_and_not_where_it_lay(run, bank, tmp_path):
+def test_exported_policy_has_provenance_without_paths(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank, {"measured": {"speed": 0.5}})
     assert sorted(path.name for path in packed.path.iterdir()) == ["config.yaml", POLICY_FILE, "run.json"]
     assert packed.config(TrainConfig) == settings.load(TrainConfig, TINY)
@@ -76,11 +78,11 @@ def test_a_packed_policy_says_where_it_comes_from_and_not_where_it_lay(run, bank
 
 
 @pytest.mark.slow
-def test_what_a_packed_policy_is_not(run, bank, tmp_path):
+def test_exported_policies_have_no_steps_or_checkpoints(run, bank, tmp_path):
     packed = export_policy(run.path, tmp_path / "packed", bank)
     with pytest.raises(UsageError, match="packed and without steps; leave out @4"):
         find_planner(f"{packed.path}@4", bank)
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         export_policy(run.path, packed.path, bank)
     wider = {**TINY, "algorithm": {**TINY["algorithm"], "network": {"encoder": {"rows": [4], "hidden": [9]}}}}
     (packed.path / "config.yaml").write_text(settings.dump(settings.load(TrainConfig, wider)))
@@ -91,7 +93,7 @@ def test_what_a_packed_policy_is_not(run, bank, tmp_path):
         load_policy(packed.path, bank)
 
 
-def test_policies_load_when_what_drove_beside_them_is_gone(run, bank, tmp_path):
+def test_policies_load_without_their_training_traffic(run, bank, tmp_path):
     text = (run.path / "config.yaml").read_text()
     moved = RunFolder.create(tmp_path / "moved", settings.load(TrainConfig, TINY), kind="training")
     (moved.path / "config.yaml").write_text(text.replace("traffic: idm", "traffic: runs/gone"))
@@ -130,7 +132,7 @@ def test_names_of_the_zoo():
             policy_folder(name)
 
 
-def test_a_misspelt_policy_is_one_line_that_lists_the_names(bank, capsys, tmp_path):
+def test_misspelt_policy_lists_the_names(bank, capsys, tmp_path):
     command = [
         "evaluate",
         "--planner",
@@ -150,7 +152,7 @@ def test_a_misspelt_policy_is_one_line_that_lists_the_names(bank, capsys, tmp_pa
 
 
 @pytest.mark.parametrize("name", zoo())
-def test_shipped_policies_drive_and_say_where_they_come_from(name, bank):
+def test_shipped_policies_drive_and_have_provenance(name, bank):
     folder = policy_folder(name)
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5e6
     info = json.loads((folder / "run.json").read_text())

@@ -7,10 +7,10 @@ import pytest
 from scipy.signal import savgol_filter
 
 from drivax.cli import main
-from drivax.curation.ensemble import ScoutsConfig
+from drivax.curation.ensemble import EnsembleConfig
 from drivax.curation.kinematic import KinematicConfig
-from drivax.curation.logged import of_logs
-from drivax.curation.methods import Wanted, curate
+from drivax.curation.logged import score_bank
+from drivax.curation.methods import Request, curate
 from drivax.curation.published import PublishedConfig
 from drivax.curation.scores import read_scores
 from drivax.curation.subset import top_rows
@@ -41,7 +41,7 @@ def test_published_components_of_a_recorded_drive(recording, bank):
         first = np.diff(values, prepend=values[0]) / 0.1
         return np.abs(np.diff(first, prepend=first[0])) / 0.1
 
-    found = {name: np.asarray(part[0]) for name, part in of_logs(PublishedConfig(), bank).items()}
+    found = {name: np.asarray(part[0]) for name, part in score_bank(PublishedConfig(), bank).items()}
     # Headings go through a cosine and a sine in float32, which 1 / dt^2 makes a hundred times larger.
     wanted = np.minimum(np.maximum(twice(speed) / 2.5, twice(heading) / 1.5), 1.0)
     np.testing.assert_allclose(found["volatility"], wanted, atol=5e-3)
@@ -59,7 +59,7 @@ def test_jerk_of_a_recorded_drive_is_that_of_scipy(recording, bank):
     jerk = savgol_filter(np.diff(speed) / 0.1, 15, 2, deriv=1, delta=0.1)
     yaw = savgol_filter((heading[1:] + heading[:-1]) / 2, 15, 3, deriv=2, delta=0.1)
     wanted = np.minimum(np.maximum(np.abs(jerk) / 8.26, np.abs(yaw) / 3.86), 1.0)
-    found = np.asarray(of_logs(KinematicConfig(), bank)["volatility"][0])
+    found = np.asarray(score_bank(KinematicConfig(), bank)["volatility"][0])
     np.testing.assert_allclose(found[:-1], wanted, atol=2e-3)
     assert found[-1] == found[-2]
 
@@ -101,9 +101,9 @@ def test_members_score_logged_steps(real_data, tmp_path):
         writer.add(assemble(recorded))
         writer.add(assemble(replace(recorded, scenario_id="again", segment="another")))
     data = ScenarioSet.open(tmp_path / "set")
-    config = ScoutsConfig(
-        folds=2, cloning=replace(ScoutsConfig().cloning, batch=16, updates=5), total_steps=160
+    config = EnsembleConfig(
+        folds=2, cloning=replace(EnsembleConfig().cloning, batch=16, updates=5), total_steps=160
     )
-    table = curate("ensemble", Wanted(data, config=config))
+    table = curate("ensemble", Request(data, config=config))
     assert table.steps[table.valid].max() > 0.0
     np.testing.assert_allclose(table.steps[0], table.steps[1], atol=1e-5)

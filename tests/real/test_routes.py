@@ -36,19 +36,19 @@ class Source:
 _OVERPASS, _MIAMI = "eb4b91b10ca94ff2", "3b3570b4-7b0b-3268-a571-b0889dbf40b6"
 SOURCES = {
     "womd": Source(
-        "womd_scenario", "WomdScenario", "womd/motion_data_one_scenario.tfrecord", "google.protobuf",
+        "womd.scenario_reader", "WomdScenario", "womd/motion_data_one_scenario.tfrecord", "google.protobuf",
         frozenset({"637f20cafde22ff8#1662"}),
     ),
     "scenarionet": Source(
-        "scenarionet", "ScenarioNet", f"scenarionet/sd_waymo_v1.2_{_OVERPASS}.pkl", "numpy",
+        "scenarionet.reader", "ScenarioNet", f"scenarionet/sd_waymo_v1.2_{_OVERPASS}.pkl", "numpy",
         frozenset(f"{_OVERPASS}@{rest}" for rest in ("0#5", "80#29", "80#33")),
     ),
     "av2-motion": Source(
-        "argoverse_motion", "ArgoverseMotion", "av2/*/scenario_*.parquet", "pyarrow",
+        "argoverse.motion", "ArgoverseMotion", "av2/*/scenario_*.parquet", "pyarrow",
         frozenset({"0a1e6f0a-1817-4a98-b02e-db8c9327d151@0#139310"}),
     ),
     "av2-sensor": Source(
-        "argoverse_sensor", "ArgoverseSensor", "av2_sensor/*/annotations*.feather", "pyarrow",
+        "argoverse.sensor", "ArgoverseSensor", "av2_sensor/*/annotations*.feather", "pyarrow",
         frozenset(f"{_MIAMI}@{rest}" for rest in ("0#17", "0#35", "0#58")),
     ),
 }  # fmt: skip
@@ -92,7 +92,9 @@ def test_some_candidate_covers_the_log_of_every_ego_that_moves(source, recording
             moving += 1
             assert Flag.ROUTE in scenario.has
             assert routes.candidate_coverage(scenario) >= routes.SHARE, scenario.id
-    assert moving == (0 if source.module == "womd_scenario" else len(recordings))  # WOMD's ego is parked
+    assert moving == (
+        0 if source.module == "womd.scenario_reader" else len(recordings)
+    )  # WOMD's ego is parked
 
 
 def test_some_candidate_covers_the_log_of_every_other_vehicle_on_lanes(source, recordings):

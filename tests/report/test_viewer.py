@@ -137,7 +137,7 @@ def test_critical_scenarios_come_first_with_their_components(data, tmp_path, cap
     assert text.count("criticality over time</figcaption>") == 2 and '"id":"calm"' not in text
     capsys.readouterr()
     assert main(["view", str(data.path), "--scores", str(tmp_path / "none.npz"), "--out", str(out)]) == 1
-    assert "there are no scores" in capsys.readouterr().err
+    assert "score table not found" in capsys.readouterr().err
 
 
 @needs_browser

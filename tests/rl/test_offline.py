@@ -49,7 +49,7 @@ def slopes(of, at, step=1e-4):
     return found
 
 
-def test_mass_by_hand():
+def test_log_mass_by_hand():
     # Half of [-1, 1] has Q = ln 2, half 0: the integral of exp(Q) is 2 + 1 = 3.
     q = jnp.array([[np.log(2.0)], [0.0]])
     np.testing.assert_allclose(log_mass(q, jnp.full((2, 1), np.log(0.5))), [np.log(3.0)], rtol=1e-6)
@@ -61,7 +61,7 @@ def test_mass_by_hand():
     np.testing.assert_allclose(log_mass(q, jnp.zeros((2, 1)), 1e-3), [np.log(2.0)], atol=1e-3)
 
 
-def test_the_mass_does_not_depend_on_what_actions_were_drawn_from():
+def test_log_mass_does_not_depend_on_the_sampling_distribution():
     """The integral of exp(-8 (a - 0.3)^2) over [-1, 1], from uniform and from Gaussian actions."""
     rng = np.random.default_rng(1)
     exact = np.trapezoid(np.exp(-8 * (np.linspace(-1, 1, 20_001) - 0.3) ** 2), dx=1e-4)
@@ -90,7 +90,7 @@ def test_penalties_against_numpy_and_their_gradients_against_finite_differences(
     np.testing.assert_allclose(slope, slopes(lambda q: expected(q).sum(), q), atol=1e-5)
 
 
-def test_the_weight_of_the_penalty_goes_where_it_should():
+def test_penalty_weight_moves_toward_the_gap():
     """By hand: alpha = 2, penalties of 3 and 0 around a gap of 1: -2 (3 - 1) and -2 (0 - 1)."""
     log_weight, penalty = jnp.log(2.0), jnp.array([3.0, 0.0])
     np.testing.assert_allclose(penalty_weight_loss(log_weight, penalty, 1.0), [-4.0, 2.0], rtol=1e-6)
@@ -131,7 +131,7 @@ def test_advantage_weights():
     np.testing.assert_array_equal(slope, 0.0)
 
 
-def test_a_scaled_loss_is_freed_of_the_unit_of_rewards():
+def test_scaled_policy_loss_is_invariant_to_reward_scale():
     q = jnp.array([4.0, -2.0])
     # -Q over the mean of 4 and 2.
     np.testing.assert_allclose(scaled_policy_loss(-q, q), [-4 / 3, 2 / 3], rtol=1e-6)
@@ -174,7 +174,7 @@ def test_tabular_conservative_values_have_a_closed_form(world):
     assert (below < 0.0).all(), below
 
 
-def test_implicit_values_lie_between_the_mean_and_the_best_that_was_done(world):
+def test_implicit_values_lie_between_mean_and_best_logged_action(world):
     """Expectile 0.5 gives the value of the data's own policy; toward 1 it gives the best policy that was ever shown."""
     transition, reward, behaviour = world
     shown = np.where(np.arange(ACTIONS) == 3, 0.0, behaviour)  # nobody ever does the last
@@ -199,7 +199,7 @@ def test_implicit_values_lie_between_the_mean_and_the_best_that_was_done(world):
     assert (mean < between).all() and (between < best).all()
 
 
-def test_a_timeout_is_no_end():
+def test_truncated_steps_bootstrap():
     """A loop that pays 1 for ever is worth 1 / (1 - gamma), however often it is cut off; with ends it is worth less."""
     reward = jnp.ones(8)
     for terminated, worth in ((jnp.zeros(8, bool), 1 / (1 - GAMMA)), (jnp.arange(8) == 7, None)):

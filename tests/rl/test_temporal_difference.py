@@ -21,7 +21,7 @@ def test_td_target_by_hand():
     np.testing.assert_allclose(target, [3.0, 2.0, 2.0])
 
 
-def test_a_terminated_step_looks_at_no_value_and_targets_have_no_gradient():
+def test_terminated_targets_ignore_values_and_have_no_gradient():
     terminated = jnp.array([True, False])
     target = td_target(jnp.ones(2), jnp.array([jnp.inf, 1.0]), terminated, 0.9)
     np.testing.assert_allclose(target, [1.0, 1.9])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.datasets.export.restore import restore
+from drivax.datasets.export.recording import restore
 from drivax.errors import DataError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import windows, with_ego

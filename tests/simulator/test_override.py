@@ -114,7 +114,7 @@ def test_ego_collides_with_a_car_overridden_to_stand():
     }  # fmt: skip
     np.testing.assert_array_equal(over, np.arange(8) >= 5)
     np.testing.assert_array_equal(reward, np.where(np.arange(8) >= 5, -1.0, 0.0))
-    # Told to stand in the lane beside, it is passed.
+    # Logged to stand in the lane beside, it is passed.
     metrics, reward, over = driven_past(3.7)
     assert float(metrics["collision"].value) == 0.0 and not over.any() and not reward.any()
 

@@ -9,7 +9,7 @@ import pytest
 
 from drivax import settings
 from drivax.cli import main
-from drivax.curation.arms import ARMS, CURATED, weighted
+from drivax.curation.arms import ARMS, ClaimGroup, weighted
 from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics
@@ -20,17 +20,16 @@ from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.stats.seeds import Crossed
 from drivax.stats.significance import holm
 from drivax.studies import longtail
-from drivax.studies.longtail_plan import LongtailConfig, Sets
-from drivax.studies.longtail_rankings import rankings
+from drivax.studies.longtail_drives import LongtailConfig, Sets
 from drivax.studies.longtail_results import (
     METRICS,
-    ClaimGroup,
     Condition,
     claims,
     cost_of_rule,
     detectable,
     judge,
     needed,
+    rankings,
     rates,
 )
 from experiment_scripts import load_script
@@ -39,13 +38,13 @@ from scenes import SMALL, car, straight_road
 SEEDS, SCENARIOS = 5, 400
 TINY = [
     "--total_steps", "64", "--validations", "4", "--seeds", "2",
-    "--agents", "[baseline, bc, heuristic, random_matched]",
+    "--arms", "[baseline, bc, heuristic, random_matched]",
     "--training", '["--algorithm.batch", "8", "--algorithm.updates", "1", "--algorithm.network.head", "[4]"]',
 ]  # fmt: skip
 
 
 def drives(rates_of, rng):
-    """Failures drawn by the rates of every agent; accuracy is their absence, the rest says nothing."""
+    """Failures drawn by the rates of every arm; accuracy is their absence, the rest says nothing."""
     found = {}
     for name, rate in rates_of.items():
         seeds = np.clip(rate + 0.004 * rng.normal(size=(SEEDS, 1)), 0, 1)
@@ -55,18 +54,18 @@ def drives(rates_of, rng):
 
 
 def verdicts(rates_of, seed=0, rare_rates=None, share=None):
-    """Judged claims by their words; every second scenario is rare."""
+    """JudgedClaim claims by their words; every second scenario is rare."""
     rng = np.random.default_rng(seed)
     labels = [f"recording-{number}" for number in range(SCENARIOS)]
     rare = np.arange(SCENARIOS) % 2 == 0
-    made = drives(rates_of, rng)
+    tested = drives(rates_of, rng)
     if rare_rates:
         other = drives(rare_rates, rng)
-        made = {
+        tested = {
             name: {metric: np.where(rare, other[name][metric], values) for metric, values in one.items()}
-            for name, one in made.items()
+            for name, one in tested.items()
         }
-    found = judge(made, labels, rare, list(rates_of), share)
+    found = judge(tested, labels, rare, list(rates_of), share)
     return {one.claim.words: one for one in found}
 
 
@@ -81,13 +80,13 @@ def test_agents_that_do_not_differ_support_no_claim():
     assert of_size.count("contradicted") >= 18
 
 
-def test_a_real_effect_is_supported_and_one_that_lots_have_too_is_not_credited():
+def test_effect_that_the_random_control_shares_is_not_credited():
     better = EVEN | {"ensemble": 0.02, "heuristic": 0.06, "random_matched": 0.06}
     found = verdicts(better)
     assert found["ensemble collides less than the baseline"].verdict == "supported"
     assert found["ensemble fails less than the baseline"].verdict == "supported"
     assert found["heuristic collides less than the baseline"].verdict == "supported"
-    assert found["heuristic collides less than weights as strong, dealt out by lot"].verdict == "undecided"
+    assert found["heuristic collides less than its matched random control"].verdict == "undecided"
     assert found[SIZE].verdict == "supported"
     low_high = found[SIZE].change
     assert low_high[1] < 0.02 / 0.16 - 1 < low_high[2] < -0.5
@@ -142,14 +141,14 @@ def test_what_is_undecided_says_what_would_decide():
 
 
 def test_what_can_be_found_is_known_before_the_others_learn():
-    """By the variation of the baseline's seeds, and at a stricter level where more claims are made."""
+    """By the variation of the baseline's seeds, and at a stricter level where more claims are tested."""
     rng = np.random.default_rng(1)
-    made, labels = drives({"baseline": 0.16, "bc": 0.3}, rng), list(map(str, range(SCENARIOS)))
+    tested, labels = drives({"baseline": 0.16, "bc": 0.3}, rng), list(map(str, range(SCENARIOS)))
     rare = np.arange(SCENARIOS) < 40
-    one, nine = (detectable(made["baseline"], made["bc"], labels, rare, 0.05, m) for m in (1, 9))
+    one, nine = (detectable(tested["baseline"], tested["bc"], labels, rare, 0.05, m) for m in (1, 9))
     assert sorted(one) == sorted(METRICS) and 0.02 < one["collision"] < nine["collision"] < 0.2
-    undefined = made["baseline"] | {"vmax_score": np.full((SEEDS, SCENARIOS), np.nan)}
-    assert "vmax_score" not in detectable(undefined, made["bc"], labels, rare, 0.05, 1)
+    undefined = tested["baseline"] | {"vmax_score": np.full((SEEDS, SCENARIOS), np.nan)}
+    assert "vmax_score" not in detectable(undefined, tested["bc"], labels, rare, 0.05, 1)
 
 
 def test_mean_q_is_judged_in_pairs():
@@ -163,7 +162,7 @@ def test_mean_q_is_judged_in_pairs():
     assert 0.0 < found["collision"]["interval"][0] < found["collision"]["difference"] < 0.05
 
 
-def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_sizes(data):
+def test_controls_have_the_effective_sizes_of_their_arms(data):
     """Of steps and of scenarios: of scores that lie together within scenarios more or less, and of labels, mostly 0."""
     rng, shape = np.random.default_rng(0), (600, 91)
     found = {}
@@ -179,23 +178,24 @@ def test_every_agent_that_a_claim_compares_with_a_lot_has_one_of_its_effective_s
     usable = np.zeros(shape, bool)
     usable[:, 10:89] = rng.random((shape[0], 79)) < 0.95
     pairs = {(c.one, c.other) for c in claims(list(ARMS)) if ARMS[c.other].permuted}
-    assert {one for one, _ in pairs} == {*CURATED, "oracle"}
+    curated = [name for name in ARMS if name.startswith(("heuristic", "ensemble", "action_rarity"))]
+    assert {one for one, _ in pairs} == {*curated, "oracle"}
     for pair in pairs:
-        own, lot = (
+        own, control = (
             draw_statistics(
                 weighted(ARMS[name], data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
                 usable,
             )
             for name in pair
         )
-        assert lot.effective == pytest.approx(own.effective, rel=0.02), pair
-        assert lot.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
+        assert control.effective == pytest.approx(own.effective, rel=0.02), pair
+        assert control.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
     for name, share in (("oracle", 0.115), ("oracle_strong", 0.3)):
         weights = weighted(ARMS[name], data, found.__getitem__, WeightConfig(), usable).weights
         during = weights[found["oracle"].steps > 0].sum() / weights.sum()
         # And those that uniform draws find.
         assert during == pytest.approx(share + (1 - share) * (found["oracle"].steps > 0)[usable].mean())
-    assert len(CURATED) == 6 and {ARMS[name].scale for name in CURATED} == {"step", "scenario"}
+    assert len(curated) == 6 and {ARMS[name].scale for name in curated} == {"step", "scenario"}
 
 
 def test_scores_of_another_method_are_refused(data):
@@ -291,7 +291,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     assert "does not drive well enough" in capsys.readouterr().err
     assert main([*arguments, "--anyway"]) == 0
     told = capsys.readouterr()
-    assert "undecided" in told.out and "trained and drove random_matched, seed 1" in told.err
+    assert "undecided" in told.out and "trained and evaluated random_matched, seed 1" in told.err
     results = json.loads((out / "results.json").read_text())
     assert (
         results["about"]["test"] == 4 and results["about"]["rare"] == 2
@@ -302,7 +302,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     page = (out / "report.html").read_text()
     assert "The conditions of the comparison are not met" in page and "http://" not in page
     assert (out / "critical.html").is_file()
-    # Everything is there: nothing is trained or driven again.
+    # Everything is there: nothing is trained or episodes again.
     assert main([*arguments, "--anyway"]) == 0
     again = capsys.readouterr().err
     assert "trained" not in again and "driving" not in again
@@ -332,8 +332,8 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
     page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
     assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
-    assert "heuristic collides less than weights as strong, dealt out by lot" in page
-    # What was trained with other weights, or drove before it was trained, belongs to no study.
+    assert "heuristic collides less than its matched random control" in page
+    # What was trained with other weights, or evaluated before it was trained, belongs to no study.
     run = out / "runs" / "heuristic" / "seed-0" / "run.json"
     told, drive = json.loads(run.read_text()), out / "drives" / "heuristic" / "seed-0" / "run.json"
     run.write_text(json.dumps(told | {"weights": "0" * 64}))
@@ -342,26 +342,26 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     run.write_text(json.dumps(told))
     drive.write_text(json.dumps(json.loads(drive.read_text()) | {"started": "2020-01-01T00:00:00+00:00"}))
     assert main([*arguments, "--anyway"]) == 2
-    assert "is older than the run that drove it" in capsys.readouterr().err
+    assert "is older than the run that evaluated it" in capsys.readouterr().err
     assert main([*arguments, "--anyway", "--rare", "0.3"]) == 2
     assert "holds a study with other settings" in capsys.readouterr().err
 
 
 def test_what_cannot_be_studied_is_refused(data, tmp_path):
     with pytest.raises(UsageError, match="a study without bc"):
-        settings.load(LongtailConfig, {"agents": ["baseline"]})
-    with pytest.raises(UsageError, match="there is no agent 'heuristics'"):
-        settings.load(LongtailConfig, {"agents": ["baseline", "bc", "heuristics"]})
+        settings.load(LongtailConfig, {"arms": ["baseline"]})
+    with pytest.raises(UsageError, match="there is no arm 'heuristics'"):
+        settings.load(LongtailConfig, {"arms": ["baseline", "bc", "heuristics"]})
     with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
         Sets.of(data.path, None, ())
     with pytest.raises(UsageError, match="none: does not exist"):
         Sets.of(tmp_path / "none", None, ())
     assert asdict(LongtailConfig())["seeds"] == 5
-    # Before anything is scored or trained, and with the agents that need no labels.
+    # Before anything is scored or trained, and with the arms that need no labels.
     with ScenarioWriter(tmp_path / "recorded", SMALL) as writer:
         writer.add(assemble(straight_road([car(speed=8.0)]), SMALL))
     recorded = tmp_path / "recorded"
     sets = Sets.of(recorded, recorded, (recorded,))
-    with pytest.raises(UsageError, match=r"recorded: has no labelled events.*--agents \[bc,baseline,.*o\]"):
+    with pytest.raises(UsageError, match=r"recorded: has no labelled events.*--arms \[bc,baseline,.*o\]"):
         longtail.study(LongtailConfig(), sets, tmp_path / "study")
     assert not (tmp_path / "study").exists()

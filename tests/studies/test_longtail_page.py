@@ -11,12 +11,12 @@ from drivax.studies.longtail_page import mean_q_curve, write_page
 from drivax.studies.longtail_results import METRICS
 
 RATE = {metric: {"mean": 0.1234, "low": 0.1, "high": 0.15} for metric in METRICS}
-CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group": "lot", "metric": "collision",
+CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group": "control", "metric": "collision",
     "rows": "ordinary"}  # fmt: skip
 RESULTS = {
     "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True, "share": 0.05},
     "conditions": [
-        {"agent": name, "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": name == "baseline"}
+        {"arm": name, "progress": 0.93, "least": 0.9, "change": 0.004, "moved": 0.01, "met": name == "baseline"}
         for name in ("baseline", "heuristic")
     ],
     "detectable": dict.fromkeys(METRICS, 0.031),
@@ -60,14 +60,14 @@ def page(tmp_path):
         steps.mean(axis=1),
         {"urgency": steps},
     )
-    kept = replace(table, method="ensemble", components={})  # of a study that went on elsewhere
+    kept = replace(table, method="ensemble", components={})  # of a study that was continued elsewhere
     tables = {"kinematic": table, "ensemble": kept}
     tables |= {name: replace(kept, method=name) for name in ("uniform", "oracle")}
     write_page(RESULTS, tables, rng.normal(0, 0.3, (500, 2)), tmp_path / "report.html")
     return tmp_path / "report.html", table
 
 
-def test_it_says_what_was_found(page):
+def test_report_shows_the_results(page):
     path, table = page
     text = path.read_text()
     assert "2 claims: 1 supported, 0 contradicted, 1 undecided" in text
@@ -87,7 +87,7 @@ def test_it_says_what_was_found(page):
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text
-    assert "Better than the same weights dealt out by lot?" in text and "than the baseline?" not in text
+    assert "Better than the matched random control?" in text and "than the baseline?" not in text
     assert "of which they are 5.0%" in text
     assert "Common scenarios" not in text  # there are none in these results
 

@@ -17,7 +17,7 @@ from drivax.synthetic.roads.network import Control, Line, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.roles import Cast, Motion, Scripted
+from drivax.synthetic.traffic.roles import Motion, Roles, Scripted
 
 FIRST, STEPS = 60, 151
 CURRENT = FIRST + 10
@@ -33,7 +33,7 @@ def drivers(count):
 
 
 def scene(network, routes, at, speed, parked=()):
-    """Everybody drives along a sequence of lanes at constant speed; the first is ego."""
+    """All users drive along a sequence of lanes at constant speed; the first is ego."""
     paths = [lane_path(network, route, Sway()) for route in routes]
     times = np.arange(STEPS) * 0.1
     distance = np.array(at, float)[:, None] + np.array(speed, float)[:, None] * times
@@ -45,7 +45,7 @@ def scene(network, routes, at, speed, parked=()):
         heading[i] = np.interp(distance[i], along, path.curve.heading)
     table = drivers(len(at))
     users = len(at) + len(parked)
-    cast = Cast(network, paths, table, distance[:, 0], np.array(speed, float), routes[0], (), tuple(parked))
+    roles = Roles(network, paths, table, distance[:, 0], np.array(speed, float), routes[0], (), tuple(parked))
     motion = Motion(
         kind=np.full(users, AgentKind.VEHICLE, np.int8),
         size_m=np.concatenate([table.size_m, *(np.array([p.size_m]) for p in parked)]),
@@ -59,7 +59,7 @@ def scene(network, routes, at, speed, parked=()):
         acceleration=np.zeros_like(distance),
         paths=paths,
     )
-    return cast, motion
+    return roles, motion
 
 
 def road(lanes=2, ends=False, limit=14.0):
@@ -106,7 +106,7 @@ def junction(turning):
 
 
 def parked_row():
-    """Cars beside the road every 9 m, 2.6 m to the right of ego's way."""
+    """Cars next to the road every 9 m, 2.6 m to the right of ego's way."""
     poses = [Pose(60.0 + 9.0 * k, -2.7, 0.0) for k in range(30)]
     return [Scripted.standing(AgentKind.VEHICLE, (4.4, 1.8, 1.5), pose, STEPS) for pose in poses]
 

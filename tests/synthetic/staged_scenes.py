@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.expert.driver import drawn_expert
+from drivax.synthetic.expert.driver import draw_expert
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.network import Lane, Line, RoadNetwork
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion
+from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles
 
 WIDTH, LENGTH, LIMIT = 3.5, 400.0, 14.0
 CAR = (4.6, 1.9, 1.5)
@@ -51,17 +51,17 @@ def crossed(lines_at, control, network=None):
 
 
 def user(xy, heading=0.0, size=CAR, kind=AgentKind.VEHICLE, velocity=(0.0, 0.0), from_s=0.0):
-    """Somebody who moves at constant velocity from a time on: (kind, size, xy, heading, speed)."""
+    """A user that moves at constant velocity from a time on: (kind, size, xy, heading, speed)."""
     moved = np.maximum(TIMES - from_s, 0.0)[:, None] * np.array(velocity)
     speed = np.where(from_s <= TIMES, math.hypot(*velocity), 0.0)
     return kind, size, np.array(xy) + moved, np.full(len(TIMES), float(heading)), speed
 
 
 def scene(network, speed, users=(), at=30.0, lanes=(0,)):
-    """Ego on a lane at constant speed among users who do not care: the cast and the motion."""
-    driver = replace(drawn_expert(np.random.default_rng(0)), size_m=np.array([CAR]))
+    """Ego on a lane at constant speed among users who do not care: the roles and the motion."""
+    driver = replace(draw_expert(np.random.default_rng(0)), size_m=np.array([CAR]))
     path = lane_path(network, lanes, Sway())
-    cast = Cast(network, [path], driver, np.array([at]), np.array([speed]), lanes)
+    roles = Roles(network, [path], driver, np.array([at]), np.array([speed]), lanes)
     distance = at + speed * TIMES
     grid = path.step_m * np.arange(len(path.curve.xy))
     xy = np.stack([np.interp(distance, grid, path.curve.xy[:, k]) for k in (0, 1)], axis=-1)
@@ -79,11 +79,11 @@ def scene(network, speed, users=(), at=30.0, lanes=(0,)):
         acceleration=np.zeros((1, len(TIMES))),
         paths=[path],
     )
-    return cast, motion
+    return roles, motion
 
 
 def driven(motion, plan: EgoPlan):
-    """The motion with ego where its plan says; nobody reacts."""
+    """The motion with ego where its plan says; no user reacts."""
     xy, heading, speed = motion.xy.copy(), motion.heading.copy(), motion.speed.copy()
     xy[0, plan.first_step :], heading[0, plan.first_step :] = plan.xy, plan.heading
     speed[0, plan.first_step :] = plan.speed

@@ -99,11 +99,11 @@ def test_where_ego_should_be():
 
 def crossed(side_m, speed=10.0):
     """Ego at 10 m/s towards a car that stands 40 m ahead, this far to the left of its way; somebody staged it."""
-    cast, motion = scene(road(), [(0,), (0,)], [60.0, 60.0 + (FIRST + 20) + 40.0], [10.0, 0.0])
+    roles, motion = scene(road(), [(0,), (0,)], [60.0, 60.0 + (FIRST + 20) + 40.0], [10.0, 0.0])
     motion = dataclasses.replace(motion, xy=motion.xy + np.array([[[0.0, 0.0]], [[0.0, side_m]]]))
     staged = Staged(EventKind.STALLED_VEHICLE, Staging(), (1,), FIRST + 20, FIRST + 70, 3.0)
     slower = dataclasses.replace(motion, speed=motion.speed * np.array([[speed / 10.0], [1.0]]))
-    return Scene(cast, motion, FIRST), slower, staged
+    return Scene(roles, motion, FIRST), slower, staged
 
 
 def test_an_event_counts_when_who_keeps_its_speed_would_collide():
@@ -115,16 +115,16 @@ def test_an_event_counts_when_who_keeps_its_speed_would_collide():
 
 
 def test_who_would_hit_somebody_that_crosses_is_known():
-    cast, motion = scene(road(), [(0,), (1,), (1,), (0,)], [60.0, 40.0, 200.0, 20.0], [10.0] * 4)
+    roles, motion = scene(road(), [(0,), (1,), (1,), (0,)], [60.0, 40.0, 200.0, 20.0], [10.0] * 4)
     t = np.arange(STEPS) * 0.1
     # Somebody walks over the road at x = 160 from 8 s on: the first car on lane 1 (y = 3.5) is there after 12 s.
     y = np.clip(-2.0 + 1.5 * (t - 8.0), -2.0, 6.0)
     xy = np.stack([np.full(STEPS, 160.0), y], axis=-1)
     speed = np.gradient(y, 0.1)
     walker = Scripted(AgentKind.PEDESTRIAN, (0.5, 0.6, 1.7), xy, np.full(STEPS, math.pi / 2), speed, t >= 0.0)
-    assert in_its_cross_way(Scene(cast, motion, FIRST), walker) == (1,)
+    assert in_its_cross_way(Scene(roles, motion, FIRST), walker) == (1,)
     along = dataclasses.replace(walker, heading=np.zeros(STEPS))
-    assert in_its_cross_way(Scene(cast, motion, FIRST), along) == ()
+    assert in_its_cross_way(Scene(roles, motion, FIRST), along) == ()
 
 
 def test_hard_events_are_drawn_more_often():

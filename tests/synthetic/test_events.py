@@ -18,8 +18,8 @@ from drivax.synthetic.events import (
     stage,
 )
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.population import Density, drawn_drivers
-from drivax.synthetic.traffic.roles import Cast, Override, Scripted, Staging, Tailgate
+from drivax.synthetic.traffic.population import Density, draw_drivers
+from drivax.synthetic.traffic.roles import Override, Roles, Scripted, Staging, Tailgate
 from drivax.synthetic.traffic.simulation import Traffic
 
 from .event_scenes import FIRST, STEPS, junction, occasion, road, scene
@@ -90,8 +90,8 @@ def test_an_ego_that_keeps_its_speed_meets_the_actor_and_one_that_brakes_as_requ
     staged_count, close, severities = 0, 0, []
     for seed in range(14):
         rng = np.random.default_rng([int(kind), seed])
-        cast, motion = occasion(kind, rng)
-        staged = stage(kind, Scene(cast, motion, FIRST), drawn_severity(rng), rng)
+        roles, motion = occasion(kind, rng)
+        staged = stage(kind, Scene(roles, motion, FIRST), drawn_severity(rng), rng)
         if staged is None:
             continue
         staged_count += 1
@@ -119,8 +119,8 @@ def test_an_ego_that_keeps_its_speed_meets_the_actor_and_one_that_brakes_as_requ
 def test_actors_are_plausible(kind):
     for seed in range(8):
         rng = np.random.default_rng([int(kind), seed])
-        cast, motion = occasion(kind, rng)
-        staged = stage(kind, Scene(cast, motion, FIRST), drawn_severity(rng), rng)
+        roles, motion = occasion(kind, rng)
+        staged = stage(kind, Scene(roles, motion, FIRST), drawn_severity(rng), rng)
         if staged is None:
             continue
         for override in staged.staging.overrides:
@@ -159,21 +159,21 @@ def test_actors_are_plausible(kind):
 )  # fmt: skip
 def test_without_occasion_there_is_no_event(kind):
     # One lane, nobody else, no junction, no parked cars.
-    cast, motion = scene(road(lanes=1), [(0,)], [60.0], [11.0])
-    assert stage(kind, Scene(cast, motion, FIRST), 3.0, np.random.default_rng(0)) is None
+    roles, motion = scene(road(lanes=1), [(0,)], [60.0], [11.0])
+    assert stage(kind, Scene(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
 @pytest.mark.parametrize("kind", sorted(SCRIPTS))
 def test_who_stands_meets_nobody(kind):
-    cast, motion = scene(road(), [(0,), (0,)], [60.0, 75.0], [0.0, 0.0])
-    assert stage(kind, Scene(cast, motion, FIRST), 3.0, np.random.default_rng(0)) is None
+    roles, motion = scene(road(), [(0,), (0,)], [60.0, 75.0], [0.0, 0.0])
+    assert stage(kind, Scene(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
 def test_a_runner_enters_at_red():
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        cast, motion = occasion(EventKind.RED_LIGHT_RUNNER, rng)
-        staged = stage(EventKind.RED_LIGHT_RUNNER, Scene(cast, motion, FIRST), 2.5, rng)
+        roles, motion = occasion(EventKind.RED_LIGHT_RUNNER, rng)
+        staged = stage(EventKind.RED_LIGHT_RUNNER, Scene(roles, motion, FIRST), 2.5, rng)
         if staged is not None:
             (extra,) = staged.staging.extras
             front = extra.xy[:, 1] + extra.size_m[0] / 2
@@ -189,13 +189,13 @@ def test_the_queue_at_the_runners_light_is_not_there():
     staged = None
     for seed in range(6):
         v = 11.0
-        cast, motion = scene(network, [route, cross, cross], [166.0 - 10 * v, 195.0, 188.0], [v, 0.0, 0.0])
+        roles, motion = scene(network, [route, cross, cross], [166.0 - 10 * v, 195.0, 188.0], [v, 0.0, 0.0])
         rng = np.random.default_rng(seed)
-        staged = staged or stage(EventKind.RED_LIGHT_RUNNER, Scene(cast, motion, FIRST), 2.5, rng)
+        staged = staged or stage(EventKind.RED_LIGHT_RUNNER, Scene(roles, motion, FIRST), 2.5, rng)
     assert staged is not None and staged.staging.removed == (1, 2)
-    table = drawn_drivers(3, Density(), np.random.default_rng(0))
-    cast = dataclasses.replace(cast, drivers=table)
-    went = Traffic(cast, np.arange(30) * 0.1 - 6.0).run(Staging(removed=(1, 2)))
+    table = draw_drivers(3, Density(), np.random.default_rng(0))
+    roles = dataclasses.replace(roles, drivers=table)
+    went = Traffic(roles, np.arange(30) * 0.1 - 6.0).run(Staging(removed=(1, 2)))
     assert went.valid[0].all() and not went.valid[1:].any()
 
 
@@ -205,13 +205,13 @@ def test_numbers_of_kinds_are_stored_and_stay():
 
 
 def test_a_tailgater_keeps_its_short_gap():
-    table = drawn_drivers(2, Density(), np.random.default_rng(0))
+    table = draw_drivers(2, Density(), np.random.default_rng(0))
     paths = [lane_path(road(lanes=1), (0,), Sway()) for _ in range(2)]
     at, speed = np.array([70.0, 40.0]), np.array([10.0, 10.0])
-    cast = Cast(road(lanes=1, limit=11.0), paths, table, at, speed, (0,))
+    roles = Roles(road(lanes=1, limit=11.0), paths, table, at, speed, (0,))
     slower = Staging(overrides=(Override(0, 0, 150, 0.0),))
-    usual = Traffic(cast, np.arange(150) * 0.1).run(slower)
-    close = Traffic(cast, np.arange(150) * 0.1).run(
+    usual = Traffic(roles, np.arange(150) * 0.1).run(slower)
+    close = Traffic(roles, np.arange(150) * 0.1).run(
         dataclasses.replace(slower, tailgates=(Tailgate(1, 0.5),))
     )
     gaps = [float(m.distance_m[0, -1] - m.distance_m[1, -1]) for m in (usual, close)]

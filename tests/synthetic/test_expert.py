@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivax.synthetic.expert import driver as expert
-from drivax.synthetic.expert.driver import drawn_expert, drive, expert_lanes, expert_path
+from drivax.synthetic.expert.driver import draw_expert, drive_ego, expert_lanes, expert_path
 from drivax.synthetic.expert.violations import touching, user_boxes
 from drivax.synthetic.roads.families import CurvedRoad
 from drivax.synthetic.roads.network import Control
@@ -20,7 +20,7 @@ BARRIER = (1.0, 20.0, 1.5)
 
 
 class Runs:
-    """Traffic in which nobody reacts; it remembers the plans."""
+    """Traffic in which no user reacts; it remembers the plans."""
 
     def __init__(self, motion, reaction=None):
         self.motion, self.plans, self.reaction = motion, [], reaction
@@ -34,16 +34,16 @@ class Runs:
 
 
 def test_a_good_drive_is_not_planned():
-    cast, motion = scene(road(), 12.0)
+    roles, motion = scene(road(), 12.0)
     runs = Runs(motion)
-    got, cause = drive(cast, TIMES, Staging(), 0, runs)
+    got, cause = drive_ego(roles, TIMES, Staging(), 0, runs)
     assert (got, cause, runs.plans) == (motion, "", [])
 
 
 def test_a_collision_is_planned_away():
-    cast, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
+    roles, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
     runs = Runs(motion)
-    got, cause = drive(cast, TIMES, EVENT, 10, runs)
+    got, cause = drive_ego(roles, TIMES, EVENT, 10, runs)
     assert cause == ""
     assert [plan.first_step for plan in runs.plans] == [10]
     assert np.array_equal(got.xy[0, :11], motion.xy[0, :11])
@@ -54,16 +54,16 @@ def test_a_collision_is_planned_away():
 @pytest.mark.parametrize(("aware", "begins"), [(15, [15]), (32, [32, 16])])
 def test_ego_acts_late_if_that_is_early_enough(aware, begins):
     # 12 m/s: bumpers meet during the 38th step; from 3.2 s on no braking helps.
-    cast, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
+    roles, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
     runs = Runs(motion)
-    assert drive(cast, TIMES, EVENT, 0, runs, aware)[1] == ""
+    assert drive_ego(roles, TIMES, EVENT, 0, runs, aware)[1] == ""
     assert [plan.first_step for plan in runs.plans] == begins
 
 
-def test_what_cannot_be_avoided_is_rejected_by_its_cause():
-    cast, motion = scene(road((1,)), 14.0, [user((40.0, 0.0), size=BARRIER)])
+def test_unavoidable_collisions_are_rejected_by_cause():
+    roles, motion = scene(road((1,)), 14.0, [user((40.0, 0.0), size=BARRIER)])
     runs = Runs(motion)
-    _, cause = drive(cast, TIMES, EVENT, 0, runs)
+    _, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
     assert cause == "ego_collides"
     assert len(runs.plans) == 3
 
@@ -71,22 +71,22 @@ def test_what_cannot_be_avoided_is_rejected_by_its_cause():
 def test_common_driving_must_not_brake_hard():
     # 12^2 / (2 x 5.2) m and a metre ahead of the bumper.
     barrier = user((30.0 + 2.3 + 13.8 + 1.5, 0.0), size=BARRIER)
-    cast, motion = scene(road((1,)), 12.0, [barrier])
-    assert drive(cast, TIMES, EVENT, 0, Runs(motion))[1] == ""
-    assert drive(cast, TIMES, Staging(), 0, Runs(motion))[1] == "ego_brakes_hard"
+    roles, motion = scene(road((1,)), 12.0, [barrier])
+    assert drive_ego(roles, TIMES, EVENT, 0, Runs(motion))[1] == ""
+    assert drive_ego(roles, TIMES, Staging(), 0, Runs(motion))[1] == "ego_brakes_hard"
 
 
 @pytest.mark.parametrize(("staging", "cause", "plans"), [(Staging(), "ego_hardly_moves", 0), (EVENT, "", 1)])
 def test_who_stands_all_the_time_is_planned_only_where_something_is_staged(staging, cause, plans):
-    cast, motion = scene(road(), 0.0)
+    roles, motion = scene(road(), 0.0)
     runs = Runs(motion)
-    assert drive(cast, TIMES, staging, 0, runs)[1] == cause
+    assert drive_ego(roles, TIMES, staging, 0, runs)[1] == cause
     assert len(runs.plans) == plans
 
 
 def test_others_who_react_are_planned_for_again():
     """The standing car rolls back by 8 m as soon as ego has a plan."""
-    cast, motion = scene(road((1,)), 12.0, [user((85.0, 0.0))])
+    roles, motion = scene(road((1,)), 12.0, [user((85.0, 0.0))])
 
     def reaction(motion, run):
         xy = motion.xy.copy()
@@ -94,25 +94,25 @@ def test_others_who_react_are_planned_for_again():
         return replace(motion, xy=xy)
 
     runs = Runs(motion, reaction)
-    got, cause = drive(cast, TIMES, EVENT, 0, runs)
+    got, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
     assert cause == ""
     assert 1 <= len(runs.plans) <= 3
     assert got.xy[0, -1, 0] < 77.0 - CAR[0]
 
 
 def test_a_rough_drive_is_smoothed_or_kept():
-    cast, motion = scene(road((1,)), 12.0)
+    roles, motion = scene(road((1,)), 12.0)
     speed = motion.speed.copy()
     speed[0] = 12.0 - 0.5 * np.sin(2 * np.pi * TIMES / 0.9)
     rough = replace(motion, speed=speed)
     runs = Runs(rough)
-    got, cause = drive(cast, TIMES, EVENT, 0, runs)
+    got, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
     assert cause == ""
     assert np.abs(np.diff(got.speed[0])).max() < np.abs(np.diff(speed[0])).max() / 3
 
 
 def test_the_plan_begins_where_ego_stood_at_a_stop_sign():
-    cast, motion = scene(crossed(100.0, Control.STOP), 10.0, [user((140.0, 0.0))], lanes=(0, 1, 2))
+    roles, motion = scene(crossed(100.0, Control.STOP), 10.0, [user((140.0, 0.0))], lanes=(0, 1, 2))
     falling = 10.0 - 0.25 * np.arange(41)
     speed = np.concatenate([falling, np.zeros(5), 0.2 * np.arange(1, 46)])
     at = 75.0 + np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) * 0.05)])
@@ -125,7 +125,7 @@ def test_the_plan_begins_where_ego_stood_at_a_stop_sign():
     blocked = motion.xy.copy()
     blocked[1, :, 0] = at[-1] - 1.0
     runs = Runs(replace(motion, xy=blocked))
-    got, cause = drive(cast, TIMES, EVENT, 0, runs)
+    got, cause = drive_ego(roles, TIMES, EVENT, 0, runs)
     assert cause == ""
     assert runs.plans[0].first_step == 47  # 0.4 m/s: still standing
     assert got.xy[0, -1, 0] < blocked[1, 0, 0] - CAR[0]
@@ -135,7 +135,7 @@ def test_the_plan_begins_where_ego_stood_at_a_stop_sign():
 def test_drawn_experts_keep_limits(seed):
     rng = np.random.default_rng(seed)
     network = CurvedRoad().build(rng, GRID)
-    driver = drawn_expert(rng)
+    driver = draw_expert(rng)
     assert driver.speed_factor[0] < 1.0
     lanes, change = expert_lanes(network, network.starts[0].lane, 1.0, rng)
     path = expert_path(network, lanes, change, rng)

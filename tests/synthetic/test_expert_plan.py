@@ -8,7 +8,7 @@ import pytest
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.comfort import discomfort
 from drivax.synthetic.expert.plan import plan_ego
-from drivax.synthetic.expert.violations import fault
+from drivax.synthetic.expert.violations import find_violation
 from drivax.synthetic.roads.curves import Pose, joined, resampled, straight, turn
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
@@ -23,11 +23,11 @@ BARRIER = (1.0, 20.0, 1.5)
 
 def planned(network, speed, users=(), lanes=(0,)):
     """The plan, ego's motion with it, and what is wrong with it (an event excuses the wrong side of the road)."""
-    cast, motion = scene(network, speed, users, lanes=lanes)
-    plan = plan_ego(cast, motion, TIMES, 0)
+    roles, motion = scene(network, speed, users, lanes=lanes)
+    plan = plan_ego(roles, motion, TIMES, 0)
     result = driven(motion, plan)
     excuse = Staging(overrides=(Override(0, 0, 0, 9.0),))
-    return plan, fault(cast, result, TIMES, 0, excuse, 6.0).cause
+    return plan, find_violation(roles, result, TIMES, 0, excuse, 6.0).cause
 
 
 def braking(plan):
@@ -35,7 +35,7 @@ def braking(plan):
 
 
 def walker(ahead_m, side_m, speed, from_s=0.0):
-    """Somebody who walks across the road, so far ahead of ego's front."""
+    """A user that walks across the road, so far ahead of ego's front."""
     x = 30.0 + CAR[0] / 2 + ahead_m + PERSON[0] / 2
     return user((x, side_m), np.pi / 2, PERSON, AgentKind.PEDESTRIAN, (0.0, speed), from_s)
 
@@ -143,8 +143,8 @@ def test_bends_are_driven_within_comfort():
     first = straight(Pose(0.0, 0.0, 0.0), 60.0)
     arc = turn(first.end, np.pi / 2, 14.0)
     curve = resampled(joined(first, arc, straight(arc.end, 100.0)), 0.5)
-    cast, motion = scene(road(turn=curve), 12.0)
-    plan = plan_ego(cast, motion, TIMES, 0)
+    roles, motion = scene(road(turn=curve), 12.0)
+    plan = plan_ego(roles, motion, TIMES, 0)
     assert discomfort(plan.heading, plan.speed) == ""
     rate = np.diff(plan.heading) / 0.1
     lateral = rate * (plan.speed[1:] + plan.speed[:-1]) / 2
@@ -159,36 +159,36 @@ def test_followers_are_expected_to_brake_unless_they_ran_into_ego():
     at = 18.0 + 12.0 * np.minimum(TIMES, 2.2) + 12.0 * slow - 1.5 * slow**2
     behind = user((0.0, 0.0), velocity=(1.0, 0.0))
     behind[2][:] = np.stack([at, 0 * at], axis=-1)
-    cast, motion = scene(road((1,)), 12.0, [behind, barrier])
+    roles, motion = scene(road((1,)), 12.0, [behind, barrier])
     # The follower is a vehicle on a path of its own.
     motion = replace(
         motion, distance_m=np.stack([motion.distance_m[0], at]), paths=motion.paths * 2,
         acceleration=np.zeros((2, 91)),
     )  # fmt: skip
-    plan = plan_ego(cast, motion, TIMES, 0)
+    plan = plan_ego(roles, motion, TIMES, 0)
     assert plan.xy[-1, 0] < 80.0 - 2.3 - 0.5
     assert braking(plan) < 3.5
     assert (plan.xy[:, 0] - at).min() < 4.6
-    wary = plan_ego(cast, motion, TIMES, 0, frozenset({1}))
+    wary = plan_ego(roles, motion, TIMES, 0, frozenset({1}))
     assert (wary.xy[:, 0] - at).min() > 4.6 + 0.1
     assert wary.xy[-1, 0] < 80.0 - 2.3 - 0.5
 
 
 def test_a_plan_begins_with_the_pose_of_its_first_step():
-    cast, motion = scene(road(), 12.0, [user((120.0, 0.0))])
-    plan = plan_ego(cast, motion, TIMES, 30)
+    roles, motion = scene(road(), 12.0, [user((120.0, 0.0))])
+    plan = plan_ego(roles, motion, TIMES, 30)
     assert plan.first_step == 30
     assert len(plan.speed) == 61
     assert np.allclose(plan.xy[0], motion.xy[0, 30])
     assert plan.speed[0] == motion.speed[0, 30]
 
 
-def test_ego_beside_its_path_is_taken_where_it_is():
-    cast, motion = scene(road(), 12.0)
+def test_plans_start_at_the_offset_of_ego_from_its_path():
+    roles, motion = scene(road(), 12.0)
     xy, heading = motion.xy.copy(), motion.heading.copy()
     xy[0, :, 1] += 0.7
     heading[0] += 0.03
-    plan = plan_ego(cast, replace(motion, xy=xy, heading=heading), TIMES, 5)
+    plan = plan_ego(roles, replace(motion, xy=xy, heading=heading), TIMES, 5)
     assert np.allclose(plan.xy[0], xy[0, 5])
     assert plan.heading[0] == pytest.approx(0.03)
     assert np.abs(np.diff(np.hypot(*np.diff(plan.xy, axis=0).T))).max() < 0.01

@@ -16,9 +16,15 @@ from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import dump
 from drivax.synthetic import generate as generation
-from drivax.synthetic import portable
-from drivax.synthetic.generate import RESERVED_SEED, FamilyCount, GeneratedSet, Generation, generate
-from drivax.synthetic.portable import portable_workers
+from drivax.synthetic import generate as portable
+from drivax.synthetic.generate import (
+    RESERVED_SEED,
+    FamilyCount,
+    GeneratedSet,
+    Generation,
+    generate,
+    portable_workers,
+)
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig, generate_one
 
 SCENARIOS = 7
@@ -90,7 +96,7 @@ def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
     assert found[0] == found[1] and found[0].startswith("False")
 
 
-def test_workers_are_told_again_what_this_process_was_told(monkeypatch):
+def test_workers_inherit_disabled_features(monkeypatch):
     """What it was told to leave alone it lacks; a worker that was not told would have it."""
     has = {"A": True, "B": False, "C": False}
     monkeypatch.setattr(portable, "_umath", SimpleNamespace(__cpu_dispatch__=[*has], __cpu_features__=has))

@@ -89,7 +89,7 @@ def test_the_polite_make_way_for_who_follows_and_the_impolite_do_not(politeness)
     assert (gain > 0.25) == (politeness > 0)
 
 
-def test_nobody_changes_without_a_reason_or_with_somebody_beside():
+def test_no_lane_change_without_incentive_or_next_to_a_vehicle():
     ways = [(1,), (1,), (0,)]
     assert decisions(ways, [20.0, 300.0, 500.0], [10.0, 14.0, 14.0])[0] == []
     assert decisions([(1,), (1,), (1,), (0,)], [20.0, 300.0, 315.0, 302.0], [10.0, 12.0, 5.0, 12.0])[0] == []
@@ -136,7 +136,7 @@ def drop():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_everybody_merges_before_the_lane_ends(seed):
+def test_all_vehicles_merge_before_the_lane_ends(seed):
     network = drop()
     table = drivers(7, seed, speed_factor=0.9)
     left, right = (0, 1, 2, 3, 4, 5), (6, 7, 8)
@@ -151,7 +151,7 @@ def test_everybody_merges_before_the_lane_ends(seed):
     assert motion.acceleration.min() > -5.0
 
 
-def test_who_finds_no_room_waits_before_the_end_of_the_lane():
+def test_vehicles_without_room_wait_before_the_end_of_the_lane():
     network = drop()
     count = 24
     table = drivers(count, 1, speed_factor=0.9, politeness=0.0)

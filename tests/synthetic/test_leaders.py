@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import AgentKind
-from drivax.synthetic.traffic.leaders import Leaders
 from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import Sway, lane_path
+from drivax.synthetic.traffic.simulation import Leaders
 
 from .traffic_scenes import drivers, road
 
@@ -53,6 +53,6 @@ def test_a_cyclist_is_followed_only_where_the_lane_is_too_narrow_to_pass(width, 
     assert gap[0] == (pytest.approx(20.0 - 3.2, abs=1e-6) if follows else np.inf)
 
 
-def test_nobody_there_leads_nobody():
+def test_an_empty_road_has_no_leaders():
     gap, _ = leaders([(0,), (0,)], [20.0, 40.0], drivers(2), [False, False])
     assert np.all(gap == np.inf)

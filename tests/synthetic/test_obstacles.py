@@ -14,7 +14,7 @@ from drivax.synthetic.traffic.obstacles import Boxes, Standing, extents
 from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import Sway, lane_path
 from drivax.synthetic.traffic.roles import Scripted, Staging
-from drivax.synthetic.traffic.scripted import boxes_at
+from drivax.synthetic.traffic.simulation import boxes_at
 
 from .oracles import box_corners, distance_to_polyline, shared_area
 from .traffic_scenes import drivers, road, run
@@ -120,14 +120,14 @@ def test_what_stands_in_a_band_ahead_is_met(x, y, meets):
     assert standing.meets(0, 22.0, 1.2, 45.0) == meets
 
 
-def test_cars_beside_the_lane_change_nothing():
+def test_cars_next_to_the_lane_change_nothing():
     table = drivers(1)
     free = run(street(), [(0,)], table, [20.0], [10.0], 15.0)
     beside = run(street(), [(0,)], table, [20.0], [10.0], 15.0, parked=(parked(150.0, -2.6, 150),))
     assert np.array_equal(free.xy[0], beside.xy[0])
 
 
-def test_somebody_who_steps_into_the_lane_is_braked_for():
+def test_vehicles_brake_for_a_pedestrian_in_the_lane():
     steps = 150
     times = np.arange(steps) / 10
     # Walks from the right over the lane at x = 120 at 1.5 m/s from second 4 on, waiting on the lane.
@@ -158,7 +158,7 @@ def test_the_quintic_leaves_with_value_and_slope_and_ends_level():
     assert np.abs(np.gradient(slope, step)[(at > 10.1) & (at < 60)]).max() < 0.02
 
 
-def test_a_displaced_path_runs_beside_itself():
+def test_a_displaced_path_keeps_its_offset():
     network, _ = road(200.0)
     path = lane_path(network, (0,), Sway())
     shifted = around(path, (40.0, 60.0, 90.0, 115.0), 2.0)

@@ -9,7 +9,7 @@ import pytest
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.network import Bay, RoadNetwork
-from drivax.synthetic.traffic.parking import parked_cars
+from drivax.synthetic.traffic.population import parked_cars
 
 
 def street(width=3.5, oncoming=True):

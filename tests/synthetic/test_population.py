@@ -8,7 +8,7 @@ import pytest
 from drivax.scenario.schema import AgentKind, RoadKind
 from drivax.synthetic.roads.curves import Pose
 from drivax.synthetic.roads.families import CurvedRoad
-from drivax.synthetic.traffic.population import Density, drawn_drivers, driven_path, joined_drivers, placed
+from drivax.synthetic.traffic.population import Density, draw_drivers, driven_path, join_drivers, placed
 from drivax.synthetic.traffic.roles import Scripted
 
 from .traffic_scenes import drivers, road
@@ -30,7 +30,7 @@ def test_placed_vehicles_keep_their_distance(seed):
                 assert network.lanes[lane].length_m - along + there > 15.0
 
 
-def test_nobody_begins_in_or_right_behind_what_stands_in_a_lane_or_where_a_lane_ends():
+def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
     network, _ = road(600.0, lanes=2)
     lanes = (network.lanes[0], dataclasses.replace(network.lanes[1], ends=True))
     network = dataclasses.replace(network, lanes=lanes)
@@ -51,7 +51,7 @@ def test_nobody_begins_in_or_right_behind_what_stands_in_a_lane_or_where_a_lane_
 
 def test_shares_of_types_are_those_asked_for():
     density = Density(van_share=0.2, truck_share=0.1, bus_share=0.05, cyclist_share=0.15)
-    table = drawn_drivers(20000, density, np.random.default_rng(0))
+    table = draw_drivers(20000, density, np.random.default_rng(0))
     length, cyclist = table.size_m[:, 0], table.cyclist
     counts = [np.mean(cyclist), np.mean(length > 10.0), np.mean((length > 6.9) & (length < 10.0)), np.mean(
         (table.size_m[:, 2] > 1.99) & (length < 6.5))]  # fmt: skip
@@ -63,11 +63,11 @@ def test_shares_of_types_are_those_asked_for():
     assert table.critical_gap_s.min() >= 3.5 and table.critical_gap_s.max() <= 6.0
 
 
-def test_nobody_cycles_on_fast_roads_and_only_cyclists_use_their_lanes():
+def test_no_cyclists_on_fast_roads_and_only_cyclists_on_bicycle_lanes():
     lane = road()[0].lanes[0]
     fast, bike = dataclasses.replace(lane, limit_mps=25.0), dataclasses.replace(lane, kind=RoadKind.LANE_BIKE)
     lanes = [fast] * 300 + [bike] * 10 + [lane] * 300
-    table = drawn_drivers(610, Density(cyclist_share=0.3), np.random.default_rng(1), lanes)
+    table = draw_drivers(610, Density(cyclist_share=0.3), np.random.default_rng(1), lanes)
     assert not table.cyclist[:300].any() and table.cyclist[300:310].all() and table.cyclist[310:].any()
 
 
@@ -80,7 +80,7 @@ def test_cyclists_ride_at_the_right_side_of_the_lane():
 
 
 def test_tables_of_drivers_are_joined_and_chosen_in_order():
-    both = joined_drivers(drivers(2, 1), drivers(3, 2))
+    both = join_drivers(drivers(2, 1), drivers(3, 2))
     assert both.size_m.shape == (5, 3)
     assert np.array_equal(both.headway_s[2:], drivers(3, 2).headway_s)
     assert np.array_equal(both.chosen(np.array([4, 0])).headway_s, both.headway_s[[4, 0]])

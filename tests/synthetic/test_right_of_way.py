@@ -14,7 +14,7 @@ from .traffic_scenes import crossroads, drivers, entered, run, twins
 WAYS = ((0, 1, 2), (3, 4, 5), (6, 7, 8), (9, 10, 11))
 
 
-def test_conflict_zones_are_where_the_ways_are_near():
+def test_conflict_zones_are_where_connectors_are_near():
     network = crossroads(2)
     begin, end = conflict_zones(network)
     # Two lines at right angles: each is near the other within the clearance of the crossing point (112, -2).
@@ -57,14 +57,14 @@ def test_who_must_give_way_waits_for_a_car_three_seconds_away_and_goes_before_on
     assert motion.acceleration[0].min() > -1.0
 
 
-def test_nobody_at_a_yield_sign_stops_when_the_road_is_free():
+def test_vehicles_pass_a_yield_sign_without_stopping_when_the_road_is_free():
     network = crossroads(2, control=[Control.NONE, Control.YIELD], yields_to=[(), (1,)])
     table = drivers(2, speed_factor=0.7)
     motion = run(network, WAYS[:2], table, [200.0, 20.0], [10.0, 10.0], 12.0)
     assert motion.speed[1].min() > 8.0
 
 
-def test_at_a_stop_sign_everybody_stands_first():
+def test_all_vehicles_stand_at_a_stop_sign():
     network = crossroads(2, control=[Control.NONE, Control.STOP], yields_to=[(), (1,)])
     table = drivers(2, speed_factor=0.7)
     motion = run(network, WAYS[:2], table, [200.0, 20.0], [10.0, 10.0], 25.0)
@@ -76,7 +76,7 @@ def test_at_a_stop_sign_everybody_stands_first():
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 0, 3, 1)])
-def test_at_an_all_way_stop_who_stood_first_goes_first(order):
+def test_the_first_to_stop_at_an_all_way_stop_goes_first(order):
     network = crossroads(4, control=[Control.ALL_WAY_STOP] * 4)
     table = twins(4, speed_factor=0.6)
     # Each comes 12 m (more than a second) behind the one before.
@@ -99,7 +99,7 @@ def test_of_two_who_come_together_the_one_to_the_right_goes_first():
     assert lines[1] < lines[0] < 250
 
 
-def test_nobody_enters_a_junction_that_cannot_be_cleared():
+def test_no_vehicle_enters_a_junction_that_cannot_be_cleared():
     network = crossroads(2, control=[Control.YIELD, Control.NONE], yields_to=[(4,), ()])
     table = drivers(3, speed_factor=0.7)
     # Row 0 stands right behind the junction on row 1's way (both go east); row 2 goes north later.

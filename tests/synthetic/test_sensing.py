@@ -7,7 +7,7 @@ import shapely
 from drivax.geometry.boxes import corners
 from drivax.scenario.recording import Tracks
 from drivax.synthetic.expert.violations import touching
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, visible
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, visible
 
 SENSOR = SensorConfig()
 
@@ -31,7 +31,7 @@ def look(rows, heights, blocks=None, config=SENSOR):
 EGO = (0.0, 0.0, 0.0, 4.6, 1.9)
 
 
-def test_a_van_hides_a_person_behind_it_and_a_person_hides_nobody():
+def test_vans_occlude_pedestrians_and_pedestrians_occlude_no_agent():
     van, person = (10.0, 0.0, 0.0, 5.0, 2.0), (15.0, 0.0, 0.0, 0.6, 0.6)
     assert look([EGO, van, person], [1.5, 2.4, 1.75]) == [True, True, False]
     assert look([EGO, van, person], [1.5, 2.4, 1.75], [True, False, True]) == [True, True, True]
@@ -50,7 +50,7 @@ def test_over_a_low_roof_by_hand():
     assert not look([EGO, (12.0, 0.0, 0.0, 4.0, 1.9), (42.0, 0.0, 0.0, 4.6, 1.9)], [1.5, 1.5, 1.5])[2]
 
 
-def test_range_is_to_the_centre_and_nobody_sees_who_is_not_there():
+def test_range_is_to_the_centre_and_invalid_users_are_not_visible():
     rows = [EGO, (79.9, 0.0, 0.0, 4.6, 1.9), (0.0, 80.1, 0.0, 4.6, 1.9)]
     assert look(rows, [1.5, 1.5, 1.5]) == [True, True, False]
     assert look(rows, [1.5, 1.5, 1.5], config=SensorConfig(range_m=100.0))[2]
@@ -146,7 +146,7 @@ def test_ego_sizes_and_what_is_not_valid_stay_as_they_are():
     assert np.allclose(off.xy, plain.xy, atol=1e-12) and np.allclose(off.velocity, plain.velocity, atol=1e-12)
 
 
-def test_who_stands_stays_within_centimetres_and_keeps_speed_zero():
+def test_standing_users_stay_within_centimetres_and_keep_speed_zero():
     plain = tracks(300, speed=0.0)
     result = noisy(plain, 0, np.random.default_rng(1), NoiseConfig())
     assert (result.velocity == 0.0).all()
@@ -154,7 +154,7 @@ def test_who_stands_stays_within_centimetres_and_keeps_speed_zero():
     assert np.abs(result.heading - plain.heading).max() < 0.002
 
 
-def test_who_reverses_still_reverses():
+def test_reversing_users_still_reverse():
     plain = tracks(50, speed=-0.1)
     result = noisy(plain, 0, np.random.default_rng(1), NoiseConfig())
     along = result.velocity[..., 0] * np.cos(result.heading) + result.velocity[..., 1] * np.sin(
@@ -189,14 +189,14 @@ def test_no_corner_moves_farther_than_the_bound(length, width):
         return corners(np.concatenate(box, axis=-1))[:, 3:]
 
     shift = np.hypot(*np.moveaxis(points(moved) - points(plain), -1, 0)).max()
-    bound = farthest_m(NoiseConfig(), length, width)
+    bound = largest_shift_m(NoiseConfig(), length, width)
     assert 0.99 * bound < shift <= bound + 1e-4
-    assert farthest_m(NoiseConfig(level=2.0), length, width) == pytest.approx(2 * bound)
-    assert farthest_m(NoiseConfig(level=0.0), length, width) == 0.0
+    assert largest_shift_m(NoiseConfig(level=2.0), length, width) == pytest.approx(2 * bound)
+    assert largest_shift_m(NoiseConfig(level=0.0), length, width) == 0.0
 
 
 @pytest.mark.parametrize(("length", "width"), LARGEST)
-def test_noise_never_pushes_anybody_into_an_ego_that_was_found_free(length, width):
+def test_noise_never_makes_a_user_overlap_a_free_ego(length, width):
     """Whoever just passes the test for overlap with its skin is still clear of ego after the largest errors."""
     rng = np.random.default_rng(5)
     count = 100

@@ -84,13 +84,13 @@ def test_bounds_are_kept():
     assert np.all(drive.speed >= 0.0)
 
 
-def test_what_cannot_be_kept_is_told():
+def test_excess_of_infeasible_bounds_is_reported():
     # From 12 m/s a car needs 12 m with 6 m/s2.
     at, speed = braking()
     assert smoothed(at, speed, 0.0, bounds(40, high=11.0)).excess > 0.1
 
 
-def test_who_has_stopped_stands():
+def test_stopped_drives_stand():
     at, speed = braking(80)
     drive = smoothed(at, speed, 0.0, bounds(80))
     assert drive.speed[-1] == 0.0

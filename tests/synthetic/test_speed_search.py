@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from drivax.synthetic.expert import speed_search
-from drivax.synthetic.expert.speed_search import COARSE, Claims, search
+from drivax.synthetic.expert.speed_search import COARSE, Occupancy, search
 
 STEPS = 40  # 4 s
 
 
-def claims(steps=STEPS, length_m=100.0):
+def occupancy(steps=STEPS, length_m=100.0):
     places = int(length_m / 0.5) + 1
-    return Claims(0.5, np.zeros((steps + 1, places), bool), np.zeros((steps + 1, places)))
+    return Occupancy(0.5, np.zeros((steps + 1, places), bool), np.zeros((steps + 1, places)))
 
 
-def run(taken, speed, liked=12.0, bound=30.0):
-    places = taken.hard.shape[1]
-    return search(taken, np.full(places, liked), np.full(places, bound), speed)
+def run(occupied, speed, liked=12.0, bound=30.0):
+    places = occupied.hard.shape[1]
+    return search(occupied, np.full(places, liked), np.full(places, bound), speed)
 
 
 def test_nothing_in_the_way_costs_nothing():
-    plan = run(claims(), 12.0)
+    plan = run(occupancy(), 12.0)
     assert np.allclose(plan.speed, 12.0)
     assert plan.cost == pytest.approx(0.0, abs=1e-3)
     at, speed = plan.fine(STEPS + 1)
@@ -33,23 +33,23 @@ def test_nothing_in_the_way_costs_nothing():
 @pytest.mark.parametrize("speed", [3.0, 5.2])
 def test_it_is_the_best_of_all_speeds(speed):
     """Brute force over every sequence of accelerations, costs written out again."""
-    taken = claims(steps=4 * COARSE, length_m=40.0)
-    taken.hard[:, 18:22] = True
-    taken.hard[14:, :] = False
-    taken.near[:, 15:18] = 1.0
-    taken.near[14:, :] = 0.0
-    plan = run(taken, speed, liked=7.0)
+    occupied = occupancy(steps=4 * COARSE, length_m=40.0)
+    occupied.hard[:, 18:22] = True
+    occupied.hard[14:, :] = False
+    occupied.near[:, 15:18] = 1.0
+    occupied.near[14:, :] = 0.0
+    plan = run(occupied, speed, liked=7.0)
     unit = speed / int(np.ceil(speed / 0.75 - 0.3)) / 0.5
     choices = np.arange(int(np.ceil(-6.05 / unit)), int(2.3 / unit) + 1) * unit
     top = max(7.0, speed)
     best = np.inf
     for sequence in itertools.product(choices, repeat=4):
-        best = min(best, _cost(taken, speed, sequence, 7.0, np.ceil(top / (unit * 0.5)) * unit * 0.5))
+        best = min(best, _cost(occupied, speed, sequence, 7.0, np.ceil(top / (unit * 0.5)) * unit * 0.5))
     assert plan.cost == pytest.approx(best, rel=2e-3, abs=1e-2)
     assert not plan.touches
 
 
-def _cost(taken, v, sequence, liked, top):
+def _cost(occupied, v, sequence, liked, top):
     s, total = 0.0, 0.0
     for k, a in enumerate(sequence, start=1):
         after = v + a * 0.5
@@ -60,11 +60,11 @@ def _cost(taken, v, sequence, liked, top):
         total += 0.5 * (speed_search._FAST if v > liked else speed_search._SLOW) * (v - liked) ** 2
         pace = min(v / 5.0, 2.0)
         for j in range(-2, 3):
-            t = min(k * COARSE + j, len(taken.hard) - 1)
-            p = min(max(round((s + v * j * 0.1) / 0.5), 0), taken.hard.shape[1] - 1)
-            total += (pace + 0.02) * (1e5 * taken.hard[t, p] + 0.8 * taken.near[t, p])
-        p = min(round(s / 0.5), taken.hard.shape[1] - 1)
-        ahead = np.flatnonzero(taken.hard[k * COARSE, p:])
+            t = min(k * COARSE + j, len(occupied.hard) - 1)
+            p = min(max(round((s + v * j * 0.1) / 0.5), 0), occupied.hard.shape[1] - 1)
+            total += (pace + 0.02) * (1e5 * occupied.hard[t, p] + 0.8 * occupied.near[t, p])
+        p = min(round(s / 0.5), occupied.hard.shape[1] - 1)
+        ahead = np.flatnonzero(occupied.hard[k * COARSE, p:])
         free = ahead[0] * 0.5 if len(ahead) else 1000.0
         close = max(1.0 - (free - 1.0) / (1.1 * v + 0.5), 0.0) ** 2
         total += 6.0 * 0.5 * close * min(pace, 1.0)
@@ -72,9 +72,9 @@ def _cost(taken, v, sequence, liked, top):
 
 
 def test_it_stops_before_a_wall_and_goes_when_it_opens():
-    taken = claims(steps=80)
-    taken.hard[:50, 60:64] = True  # at 30 m until 5 s
-    plan = run(taken, 12.0)
+    occupied = occupancy(steps=80)
+    occupied.hard[:50, 60:64] = True  # at 30 m until 5 s
+    plan = run(occupied, 12.0)
     at, speed = plan.fine(81)
     assert not plan.touches
     assert at[49] < 30.0 < at[80]
@@ -85,9 +85,9 @@ def test_it_stops_before_a_wall_and_goes_when_it_opens():
 @pytest.mark.parametrize(("wall_m", "possible"), [(18.0, True), (10.0, False)])
 def test_the_limit_of_braking(wall_m, possible):
     """From 12 m/s a stop takes 12 m with 6 m/s2, and 14.4 m with 5 m/s2."""
-    taken = claims()
-    taken.hard[:, int(wall_m / 0.5) :] = True
-    plan = run(taken, 12.0)
+    occupied = occupancy()
+    occupied.hard[:, int(wall_m / 0.5) :] = True
+    plan = run(occupied, 12.0)
     assert plan.touches != possible
     if possible:
         assert plan.speed[-1] == 0.0
@@ -95,15 +95,15 @@ def test_the_limit_of_braking(wall_m, possible):
 
 
 def test_bends_bound_the_speed():
-    taken = claims(steps=80)
-    places = taken.hard.shape[1]
+    occupied = occupancy(steps=80)
+    places = occupied.hard.shape[1]
     bound = np.where(np.arange(places) * 0.5 > 40.0, 6.0, 30.0)
-    plan = search(taken, np.full(places, 12.0), bound, 12.0)
+    plan = search(occupied, np.full(places, 12.0), bound, 12.0)
     at, speed = plan.fine(81)
     assert speed[at > 41.0].max() <= 6.2
 
 
-def test_who_stands_can_start():
-    plan = run(claims(), 0.0)
+def test_a_standing_ego_can_start():
+    plan = run(occupancy(), 0.0)
     assert plan.speed[0] == 0.0
     assert np.diff(plan.speed)[:4].min() > 0.0

@@ -13,13 +13,13 @@ from drivax.synthetic.roads.network import Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.population import Density, drawn_drivers, driven_path, placed
-from drivax.synthetic.traffic.roles import Cast, EgoPlan, Override, Scripted, Staging, Walker
+from drivax.synthetic.traffic.population import Density, draw_drivers, driven_path, placed
+from drivax.synthetic.traffic.roles import EgoPlan, Override, Roles, Scripted, Staging, Walker
 from drivax.synthetic.traffic.simulation import Traffic
 
 from . import traffic_scenes
 from .oracles import box_corners, shared_area
-from .traffic_scenes import cast, crossroads, drivers, road
+from .traffic_scenes import crossroads, drivers, road, roles
 
 
 def line_with_light(signals=None):
@@ -55,7 +55,7 @@ def test_the_speed_profile_is_the_slowest_that_is_needed():
     assert got.min() < top.max()
 
 
-def test_a_free_driver_reaches_and_holds_the_wanted_speed():
+def test_a_free_driver_reaches_and_holds_the_preferred_speed():
     motion = run(line_with_light(), drivers(1, speed_factor=0.9), [10.0], [5.0], 20.0)
     assert motion.speed[0, -1] == pytest.approx(0.9 * 15.0, rel=0.02)
     assert motion.speed[0].max() <= 0.9 * 15.0 + 0.05
@@ -63,7 +63,7 @@ def test_a_free_driver_reaches_and_holds_the_wanted_speed():
 
 @pytest.mark.parametrize("speed", [6.0, 10.0, 14.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_at_red_everybody_stops_behind_the_line(speed, seed):
+def test_all_vehicles_stop_behind_the_line_at_red(speed, seed):
     table = drivers(3, seed, speed_factor=0.95)
     motion = run(line_with_light(light(1.0, -10.0)), table, [140.0, 110.0, 70.0], [speed] * 3, 30.0)
     front = motion.distance_m[0] + table.size_m[0, 0] / 2
@@ -97,7 +97,7 @@ def test_yellow_is_stopped_for_or_passed_but_red_never_run(at):
     assert motion.acceleration.min() > -5.5
 
 
-def test_nobody_touches_a_leader_who_brakes_to_a_halt():
+def test_no_follower_touches_a_leader_that_brakes_to_a_halt():
     table = drivers(4, seed=2)
     stop = Override(vehicle=0, first_step=20, last_step=120, acceleration_mps2=-4.0)
     motion = run(line_with_light(), table, [150.0, 120.0, 92.0, 60.0], [12.0] * 4, 16.0, (stop,))
@@ -122,7 +122,7 @@ def test_positions_are_the_integral_of_speeds_and_stops_are_exact():
 
 
 @pytest.mark.parametrize("crossing", [True, False])
-def test_nobody_enters_while_somebody_still_crosses(crossing):
+def test_no_vehicle_enters_while_another_still_crosses(crossing):
     network = crossroads()
     assert np.argwhere(network.conflicts).tolist() == [[1, 4], [4, 1]]
     table = drivers(2, speed_factor=0.9)
@@ -165,7 +165,7 @@ def test_a_platoon_settles_at_the_gap_of_the_closed_form():
         assert gap == pytest.approx(wanted, rel=0.02)
 
 
-def test_drivers_act_on_what_they_wanted_a_reaction_time_ago():
+def test_drivers_apply_decisions_after_their_reaction_time():
     network, _ = road(1000.0)
     stop = Staging(overrides=(Override(0, 30, 100, -3.0),))
     begins = []
@@ -189,7 +189,7 @@ def test_cyclists_are_followed_on_narrow_lanes_and_passed_on_wide_ones():
         table.kind[1] = AgentKind.CYCLIST
         table.size_m[1] = (1.8, 0.65, 1.75)
         table.top_speed_mps[1] = 5.0
-        scene = cast(network, [(0,)] * 2, table, [60.0, 90.0], [10.0, 5.0])
+        scene = roles(network, [(0,)] * 2, table, [60.0, 90.0], [10.0, 5.0])
         scene.paths[1] = lane_path(network, (0,), Sway((0.55 - width / 2,), (0.0,), (math.pi / 2,)))
         motion = Traffic(scene, np.arange(200) / 10).run()
         assert (motion.xy[0, -1, 0] > motion.xy[1, -1, 0]) == passes
@@ -238,7 +238,7 @@ def test_the_order_of_users_and_the_same_run_twice():
     stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)
     comes = Scripted.standing(AgentKind.CYCLIST, (1.8, 0.6, 1.7), Pose(60.0, -7.0, 0.0), steps)
     people = (Walker(straight(Pose(0.0, 9.0, 0.0), 80.0), 0.0, 1.2),)
-    scene = cast(network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, walkers=people, parked=(stands,))
+    scene = roles(network, [(0,)] * 2, drivers(2), [100.0, 60.0], [9.0] * 2, walkers=people, parked=(stands,))
     traffic = Traffic(scene, np.arange(steps) / 10)
     staging = Staging(overrides=(Override(0, 10, 30, -3.0),), extras=(comes,))
     first, calm, again = traffic.run(staging), traffic.run(), traffic.run(staging)
@@ -253,14 +253,14 @@ def test_the_order_of_users_and_the_same_run_twice():
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
 @pytest.mark.parametrize("seed", range(2))
-def test_in_dense_traffic_nobody_touches_anybody(family, seed):
+def test_dense_traffic_has_no_overlaps(family, seed):
     rng = np.random.default_rng(seed)
     network = family.build(rng)
     start = network.starts[int(rng.integers(len(network.starts)))]
     along = float(rng.uniform(start.low_m, start.high_m))
     where = placed(network, start.lane, along, Density(spacing_m=(12.0, 40.0)), rng)
     first = [start.lane, *where.lane]
-    table = drawn_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
+    table = draw_drivers(len(first), Density(), rng, [network.lanes[lane] for lane in first])
     paths = [
         driven_path(network, random_lanes(network, lane, rng), bool(cyclist), rng)
         for lane, cyclist in zip(first, table.cyclist, strict=True)
@@ -274,7 +274,7 @@ def test_in_dense_traffic_nobody_touches_anybody(family, seed):
         lines = [span.begin_m - at[i] - 8.0 for span in path.spans if network.lanes[span.lane].connector]
         room = max(min((line for line in lines if line > -8.0), default=math.inf), 0.0)
         speed.append(min(0.8 * fastest[int(at[i] / path.step_m)], math.sqrt(3.0 * room)))
-    traffic = Traffic(Cast(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
+    traffic = Traffic(Roles(network, paths, table, at, np.array(speed), ()), np.arange(150) / 10)
     motion = traffic.run()
     assert len(first) > 8
     for t in range(0, 150, 3):

@@ -52,7 +52,7 @@ def test_a_seed_and_an_index_are_a_recording():
 
 
 @pytest.mark.parametrize("index", range(COUNT))
-def test_nobody_ever_overlaps(index):
+def test_no_users_overlap(index):
     tracks = drawn(index).recording.tracks
     for t in range(0, STEPS, 3):
         present = np.flatnonzero(tracks.valid[:, t])
@@ -79,7 +79,7 @@ def test_the_expert_stays_on_the_road(index):
 
 
 @pytest.mark.parametrize("index", range(COUNT))
-def test_nobody_runs_a_red_light(index):
+def test_no_vehicle_runs_a_red_light(index):
     recording = drawn(index).recording
     tracks = recording.tracks
     lanes = {f.feature_id: f for f in recording.features}
@@ -256,7 +256,7 @@ def test_the_others_are_recorded_with_errors_and_ego_and_the_mask_are_exact():
         ({"noise": NoiseConfig(level=2.0)}, "noise.level 2.0 could make a recorded vehicle touch ego"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused(settings, message):
+def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(UsageError) as error:
         WorldConfig(**settings).check()
     assert message in str(error.value)

@@ -12,8 +12,8 @@ from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.paths import Sway, lane_path
-from drivax.synthetic.traffic.population import Density, drawn_drivers
-from drivax.synthetic.traffic.roles import Cast
+from drivax.synthetic.traffic.population import Density, draw_drivers
+from drivax.synthetic.traffic.roles import Roles
 from drivax.synthetic.traffic.simulation import Traffic
 
 CARS = Density(van_share=0.0, truck_share=0.0, bus_share=0.0, cyclist_share=0.0)
@@ -21,7 +21,7 @@ CARS = Density(van_share=0.0, truck_share=0.0, bus_share=0.0, cyclist_share=0.0)
 
 def drivers(count, seed=0, **values):
     """Cars whose drivers act at once; some of their values set for all."""
-    table = drawn_drivers(count, CARS, np.random.default_rng(seed))
+    table = draw_drivers(count, CARS, np.random.default_rng(seed))
     values = {"reaction_s": 0.0, **values}
     return dataclasses.replace(table, **{k: np.full(count, v) for k, v in values.items()})
 
@@ -31,15 +31,15 @@ def twins(count, **values):
     return drivers(1, **values).chosen(np.zeros(count, int))
 
 
-def cast(network, ways, table, at, speed, **more):
+def roles(network, ways, table, at, speed, **more):
     """Vehicles on the middle of their lanes."""
     paths = [lane_path(network, way, Sway()) for way in ways]
-    return Cast(network, paths, table, np.array(at, float), np.array(speed, float), ways[0], **more)
+    return Roles(network, paths, table, np.array(at, float), np.array(speed, float), ways[0], **more)
 
 
 def run(network, ways, table, at, speed, seconds, staging=None, ego=None, **more):
     times = np.arange(round(seconds * 10)) / 10
-    return Traffic(cast(network, ways, table, at, speed, **more), times).run(staging, ego)
+    return Traffic(roles(network, ways, table, at, speed, **more), times).run(staging, ego)
 
 
 def road(length_m=600.0, limit=15.0, lanes=1, sections=1, width_m=3.5):

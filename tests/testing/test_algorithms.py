@@ -73,10 +73,10 @@ class ToyLearner:
     ("fault", "words"),
     {
         "steps": "counts 0 steps per iteration", "learner": "builds no Learner",
-        "state": "without parameters or iteration", "form": "changes the form of its state", "idle": "learns nothing",
+        "state": "without parameters or iteration", "form": "changes the shape of its state", "idle": "learns nothing",
         "count": "from iteration 0 to 2", "host": "does not repeat an iteration", "nan": "is not finite",
-        "vector": "logs 'loss/toy' as", "infinite": "logs 'loss/toy' as inf", "driver": "makes no Planner",
-        "mode": "at random by the mode",
+        "vector": "logs 'loss/toy' as", "infinite": "logs 'loss/toy' as inf", "driver": "returns no Planner",
+        "mode": "uses randomness in its mode",
     }.items(),
 )  # fmt: skip
 def test_invalid_algorithms_fail(fault, words):

@@ -1,4 +1,4 @@
-"""The free checks: our own terms pass them, and each rule has a term that breaks it and is told so."""
+"""Checks for users: built-in components pass, and each rule has a component that breaks it."""
 
 import itertools
 import re
@@ -29,7 +29,7 @@ def refused(check, term, words):
 
 @pytest.mark.slow
 def test_check_worlds_cover_the_facts_of_terms():
-    found = moments().found
+    found = moments().situation
     facts = found.facts
     for name in ("collision", "offroad", "off_route", "ttc_defined", "straddling", "wrong_way"):
         assert 0 < float(getattr(facts, name).mean()) < 1, name
@@ -57,18 +57,18 @@ count = itertools.count()
 #: Each breaks one rule.
 WRONG_TERMS = {
     "cannot be compiled": lambda b, n, a: jnp.ones(()) if n.speed_mps > 3 else jnp.zeros(()),
-    "another result every time": lambda b, n, a: n.speed_mps * 0.0 + float(next(count)),
+    "is not deterministic": lambda b, n, a: n.speed_mps * 0.0 + float(next(count)),
     "instead of one float32 number": lambda b, n, a: n.collision,
     r"float32\[4\] instead of one": lambda b, n, a: jnp.stack([n.speed_mps] * 4),
     "is not finite": lambda b, n, a: 1.0 / n.speed_mps,
-    "rows hold something else": lambda b, n, a: jnp.max(jnp.abs(a.frame.velocity)),
-    "more empty slots": lambda b, n, a: a.frame.valid.mean(dtype=jnp.float32),
-    "in another order": lambda b, n, a: a.frame.valid[5].astype(jnp.float32),
-    "turned and shifted": lambda b, n, a: jnp.abs(a.frame.box[0, 2]),
+    "rows of absent agents change": lambda b, n, a: jnp.max(jnp.abs(a.frame.velocity)),
+    "empty slots are added": lambda b, n, a: a.frame.valid.mean(dtype=jnp.float32),
+    "order of agents changes": lambda b, n, a: a.frame.valid[5].astype(jnp.float32),
+    "rotated and shifted": lambda b, n, a: jnp.abs(a.frame.box[0, 2]),
 }
 
 
-@pytest.mark.parametrize("words", some(WRONG_TERMS, "cannot be compiled", "turned and shifted"))
+@pytest.mark.parametrize("words", some(WRONG_TERMS, "cannot be compiled", "rotated and shifted"))
 def test_invalid_reward_terms_fail(words):
     def term(before, now, around):
         return WRONG_TERMS[words](before, now, around)
@@ -81,7 +81,7 @@ def test_batched_terms_fail():
         inside = jnp.ndim(now.speed_mps) == 0 and isinstance(now.speed_mps, jax.core.Tracer)
         return now.speed_mps if inside else now.speed_mps + 1.0
 
-    refused(check_reward, term, "when it is compiled")
+    refused(check_reward, term, "differs when compiled")
 
 
 @pytest.mark.parametrize("name", some(METRICS, "own_terms:nearest_other"))
@@ -96,14 +96,16 @@ def metric(read, reads=frozenset(), **more):
 
 
 def test_invalid_metrics_fail():
-    refused(check_metric, metric(lambda m: (m.facts.speed_mps, True)), "'reads' does not name")
-    refused(check_metric, metric(lambda m: (m.facts.speed_mps, True), frozenset({"speed"})), "is no fact")
+    refused(check_metric, metric(lambda m: (m.facts.speed_mps, True)), "'reads' does not declare")
+    refused(check_metric, metric(lambda m: (m.facts.speed_mps, True), frozenset({"speed"})), "unknown fact")
     divided = metric(lambda m: (1.0 / m.facts.speed_mps, True), frozenset({"speed_mps"}))
     refused(check_metric, divided, "is not finite")
     guarded = metric(lambda m: (1.0 / m.facts.speed_mps, m.facts.speed_mps > 0), frozenset({"speed_mps"}))
     check_metric(guarded)
     refused(
-        check_metric, metric(lambda m: (m.situation.surroundings.frame.box[0, 0], True)), "turned and shifted"
+        check_metric,
+        metric(lambda m: (m.situation.surroundings.frame.box[0, 0], True)),
+        "rotated and shifted",
     )
     refused(
         check_metric, Metric("m", "low", "text", compute=lambda e, v, k: v.value), "does not compute a Value"
@@ -124,13 +126,13 @@ WRONG_FEATURES = {
     r"bool\[2\] as the mask of \[1, 2\]": lambda b, s, f: (s.history[-1:, 2:] * 0.0, jnp.ones(2, bool)),
     "is not finite": lambda b, s, f: jnp.log(s.history[-1:, 3:]),
     r"reaches \d+": lambda b, s, f: s.history[-1:, 3:] * 100.0,
-    "rows hold something else": lambda b, s, f: jnp.max(f(0).velocity)[None] / 100.0,
-    "more empty slots": lambda b, s, f: jnp.where(f(0).valid, 1.0, 0.0).mean()[None],
-    "in another order": lambda b, s, f: jnp.where(f(0).valid, f(0).box[:, 4], 0.0)[1:9],
+    "rows of absent agents change": lambda b, s, f: jnp.max(f(0).velocity)[None] / 100.0,
+    "empty slots are added": lambda b, s, f: jnp.where(f(0).valid, 1.0, 0.0).mean()[None],
+    "order of agents changes": lambda b, s, f: jnp.where(f(0).valid, f(0).box[:, 4], 0.0)[1:9],
     "the log's future changes": lambda b, s, f: (
         View.of(s).point(b.agents[s.index, s.step + 5, 0, :2])[None] / 50.0
     ),
-    "turned and shifted": lambda b, s, f: s.history[-1:, 2] / 3.0,
+    "rotated and shifted": lambda b, s, f: s.history[-1:, 2] / 3.0,
 }
 
 
@@ -201,9 +203,9 @@ class WrongConfig:
 @pytest.mark.parametrize(
     ("fault", "words"),
     {
-        "width": "its width being 3", "state": "no parameters", "seed": "other parameters every time",
-        "batch": "alone and in a batch", "constant": "all observations alike", "mask": "what masked rows hold",
-        "nobody": "without any row is not finite", "gradient": "gradients that are not finite",
+        "width": "with width 3", "state": "not parameters", "seed": "other initial parameters",
+        "batch": "differs in a batch", "constant": "all observations equally", "mask": "changes with masked rows",
+        "nobody": "without rows is not finite", "gradient": "non-finite gradients",
     }.items(),
 )  # fmt: skip
 def test_invalid_encoders_fail(fault, words):

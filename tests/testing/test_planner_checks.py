@@ -1,4 +1,4 @@
-"""The free check of planners: ours pass it, and each rule has a planner that breaks it and is told so."""
+"""Check of planners: built-in planners pass, and each rule has a planner that breaks it."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def refused(planner, words):
 
 
 def test_forms_are_checked_before_anything_runs():
-    refused(ConstantVelocity, "is no planner")
-    refused(Wrong(fault="size"), r"gives float32\[3\] as an action; give float32\[2\]")
-    refused(Wrong(fault="form"), "changes the form of what it carries")
+    refused(ConstantVelocity, "is not a planner")
+    refused(Wrong(fault="size"), r"gives float32\[3\] as an action; return float32\[2\]")
+    refused(Wrong(fault="form"), "changes the shape of its carry")
     refused(Wrong(fault="python"), "cannot be compiled")
 
 
@@ -75,8 +75,8 @@ def test_experts_pass_as_privileged_planners():
 @pytest.mark.parametrize(
     ("fault", "words"),
     {
-        "finite": "is not finite", "random": "or every time", "litter": "rows hold something else",
-        "order": "in another order", "padding": "more empty slots", "turn": "turned and shifted",
+        "finite": "is not finite", "random": "or every time", "litter": "rows of absent agents change",
+        "order": "order of agents changes", "padding": "empty slots are added", "turn": "rotated and shifted",
         "future": "the log goes on in another way",
     }.items(),
 )  # fmt: skip

@@ -67,10 +67,11 @@ class Wrong(own_terms.Drift):
 @pytest.mark.parametrize(
     ("fault", "words"),
     {
-        "form": "changes the form of its state", "size": "carries 36000 bytes", "random": "another result every time",
-        "shape": r"float32\[40, 7\]", "nan": "is not finite", "half": "half valid", "unit": "directions of length 1.1",
-        "past": "says another thing of the past", "leap": "moves an agent by", "order": "in another order",
-        "padding": "more empty slots", "litter": "rows hold something else", "turn": "turned and shifted",
+        "form": "changes the shape of its state", "size": "carries 36000 bytes", "random": "is not deterministic",
+        "shape": r"float32\[40, 7\]", "nan": "is not finite", "half": "fractional valid",
+        "unit": "directions of length 1.1",
+        "past": "changes past rows", "leap": "moves an agent by", "order": "order of agents changes",
+        "padding": "empty slots are added", "litter": "rows of absent agents change", "turn": "rotated and shifted",
     }.items(),
 )  # fmt: skip
 def test_invalid_traffic_fails(fault, words):

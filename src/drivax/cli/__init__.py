@@ -14,9 +14,10 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import metadata
 from pathlib import Path
+from typing import Any, TypeVar
 
 from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
 
@@ -50,7 +51,7 @@ COMMANDS = {
         "drivax.cli.train", "Train", "train a planner from a configuration file", overrides=True
     ),
     "evaluate": Command(
-        "drivax.cli.evaluate", "Evaluate", "drive a planner through a scenario set and judge it"
+        "drivax.cli.evaluate", "Evaluate", "evaluate a planner on a scenario set", overrides=True
     ),
     "compare": Command(
         "drivax.cli.compare", "Compare", "is one planner better than another? a tested answer"
@@ -63,6 +64,15 @@ COMMANDS = {
         "drivax.cli.bench", "Bench", "simulation speed on this machine, by part", overrides=True
     ),
 }
+
+
+Record = TypeVar("Record")
+
+
+def record_of(cls: type[Record], args: Any, **values: Any) -> Record:
+    """Return a configuration record from the flags of the same names; ``values`` replace flags."""
+    names = [field.name for field in fields(cls) if field.name not in values]  # type: ignore[arg-type]
+    return cls(**{name: getattr(args, name) for name in names}, **values)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -136,7 +146,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
-        raise UsageError(f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS))
+        raise UsageError(
+            f"unknown {kind} {name!r}", cure=did_you_mean(name, COMMANDS, otherwise="see drivax --help")
+        )
     return _run(name, COMMANDS[name], rest)
 
 

@@ -6,27 +6,31 @@ import json
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from drivax import settings
+from drivax.cli import record_of
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.bench import BenchConfig, bench, bench_metrics, use_all_cores
 from drivax.studies.bench_encoders import EncoderBench, bench_encoders
 from drivax.synthetic.generate import Generation, generate
+from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(BenchConfig):
     """Time environment steps with observation, reward, metrics and resets, and each part alone; IDM drives.
 
-    Without --data, scenarios of the built-in world are generated for it. What is simulated can be given behind as
-    --task.key VALUE, as --task.metrics training.
+    Without --data, scenarios of the built-in world are generated. Set the task with --task.KEY VALUE, as
+    --task.metrics training.
 
-    With --encoders, what encoders take instead, on the observation `optimal`, and behind it the settings of that, as
+    With --encoders, time encoders on the observation `optimal` instead; their settings follow, as
     --only "[lq small]" --batches "[1, 512]".
 
     Example: drivax bench --batch 512 --json
@@ -35,17 +39,12 @@ class Bench:
     data: Path | None = None
     """Scenario set to step through."""
     scenarios: int = 1024
-    """How many scenarios to generate without --data."""
-    batch: int = 256
-    """Environments side by side."""
-    repeats: int = 7
-    """Timed runs; the median counts."""
+    """Number of scenarios to generate without --data."""
+    task: tyro.conf.Suppress[tyro.conf.Fixed[Task]] = field(default_factory=Task)
     metrics: bool = False
     """Compare the metric sets none, training and full at batch 32, 128 and the best one, instead of parts."""
     encoders: bool = False
     """Count the parameters of the encoders and time them, instead of the simulator."""
-    traffic: str = "log"
-    """How the others move: log, idm, package.module:name, a run folder or zoo:NAME."""
     json: bool = False
     """Print one JSON object instead of text."""
 
@@ -53,11 +52,10 @@ class Bench:
 def run(args: Bench, overrides: Sequence[str] = ()) -> int:
     """Time and print."""
     if args.encoders:
-        found = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
-        print(json.dumps(found, indent=1) if args.json else _encoders(found))
+        times = bench_encoders(settings.load(EncoderBench, {"repeats": args.repeats}, overrides))
+        print(json.dumps(times, indent=1) if args.json else _encoders(times))
         return 0
-    given = {"batch": args.batch, "repeats": args.repeats, "traffic": args.traffic}
-    config = settings.load(BenchConfig, given, overrides)
+    config = settings.load(BenchConfig, settings.plain(record_of(BenchConfig, args)), overrides)
     use_all_cores()
     if args.data is not None:
         bank = ScenarioBank.from_scenarios(ScenarioSet.open(args.data))

@@ -32,9 +32,9 @@ class Compare:
     primary: str | None = None
     """The metric that decides."""
     secondary: tuple[str, ...] | None = None
-    """Metrics that are told beside it."""
+    """Further metrics to report."""
     minimum_scenarios: int | None = None
-    """With fewer scenarios nothing is decided."""
+    """Fewer scenarios give no verdict."""
     data: Path | None = None
     """Scenario set that was driven, where it has moved since (for a stratified split)."""
     save: Path | None = None
@@ -77,10 +77,14 @@ def run(args: Compare) -> int:
         raise UsageError("no runs are named", cure="write drivax compare A B, or name a and b in the plan")
     a, b = EpisodeTable.read_seeds(plan.a), EpisodeTable.read_seeds(plan.b)
     entries = a[0].open_set(args.data).entries if plan.split == "stratified" else ()
-    found = compare(plan, a, b, entries)
-    print(json.dumps(found.as_dict(), indent=1, allow_nan=False) if args.json else comparison_text(found))
+    comparison = compare(plan, a, b, entries)
+    print(
+        json.dumps(comparison.as_dict(), indent=1, allow_nan=False)
+        if args.json
+        else comparison_text(comparison)
+    )
     if args.html is not None:
-        write_comparison(found, args.html, args.overwrite)
+        write_comparison(comparison, args.html, args.overwrite)
         if not args.json:
             print(f"wrote {args.html}")
     return 0

@@ -6,29 +6,32 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from drivax.datasets.convert import Conversion, Converted, Plan, convert
+from drivax.cli import record_of
+from drivax.datasets.conversion import Conversion, Converted, Plan, convert
 from drivax.datasets.estimate import counted
+from drivax.datasets.formats import READERS
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
 from drivax.files import can_resume
+from drivax.scenario.schema import CAPACITIES
 from drivax.tracking.progress import Progress
 
 _SHOWN = 20
 
 
-@dataclass(frozen=True)
-class Convert:
-    """Convert recordings of a public data set to a scenario set.
+@dataclass(frozen=True, kw_only=True)
+class Convert(Conversion):  # noqa: D101
+    __doc__ = f"""Convert recordings of a public data set to a scenario set.
 
-    Reads one file, or all files of known formats in a folder, and says which records had to be skipped, and why.
-    A conversion that was killed is continued by the same command.
+    Reads one file, or all files of known formats in a folder, and says which records it skipped, and why.
+    The same command resumes an interrupted conversion.
 
-    Formats: womd-scenario, womd-example, scenariomax, scenarionet, av2-motion, av2-sensor, nuplan, nuscenes, gpudrive
-    (docs/data/index.md says how to get them). drivax doctor SRC tells what SRC is.
+    Formats: {", ".join(reader.name for reader in READERS)}.
+    docs/data/index.md says how to get them; drivax doctor SRC recognises the format of SRC.
 
     Example: drivax convert womd/training sets/womd --workers 8 --split 80/10/10
     """
@@ -37,42 +40,16 @@ class Convert:
     """File or folder to read."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Scenario set to write (a folder)."""
-    format: str = "auto"
-    """Format of the files; auto looks into each file."""
-    capacity: Literal["default", "large"] = "default"
-    """Padded sizes; large for scenes with more than 80 moving agents or very dense maps."""
-    limit: int | None = None
-    """Stop when the set holds so many scenarios."""
-    filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Keep only scenarios for which this holds (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
-    routes: Literal["graph", "published"] = "graph"
-    """How routes are found: our generator, or the published breadth-first one."""
-    stride: int = 40
-    """Steps between the starts of two windows of a recording that is longer than 91 steps."""
-    split: str | None = None
-    """Write lists for train/validation/test to OUT/splits, by recording: percentages, as 80/10/10."""
-    workers: int | None = None
-    """Processes that read; as many as there are CPU cores by default."""
-    strict: bool = False
-    """Stop at the first record that cannot be read instead of skipping it."""
-    overwrite: bool = False
-    """Replace OUT if it is a scenario set; start anew if another conversion to OUT was begun."""
+    capacity: Annotated[str, tyro.conf.arg(metavar="|".join(CAPACITIES))] = "default"
+    filters: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="filter", metavar="NAME=VALUE")
+    ] = ()
+    workers: int = os.cpu_count() or 1
 
 
 def run(args: Convert) -> int:
     """Convert, print what was written and what was skipped."""
-    options = Conversion(
-        format=args.format,
-        capacity=args.capacity,
-        limit=args.limit,
-        filters=args.filter,
-        routes=args.routes,
-        stride=args.stride,
-        split=args.split,
-        workers=args.workers if args.workers is not None else os.cpu_count() or 1,
-        strict=args.strict,
-        overwrite=args.overwrite,
-    )
+    options = record_of(Conversion, args)
     with Progress("converting", "files") as bar:
 
         def report(done: int, files: int, scenarios: int) -> None:
@@ -93,8 +70,8 @@ def run(args: Convert) -> int:
 
 
 def _announce(plan: Plan) -> None:
-    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.found.formats.items())]
-    unknown = len(plan.found.inputs) - plan.found.formats.total()
+    parts = [f"{name} ({counted(number, 'file')})" for name, number in sorted(plan.data.formats.items())]
+    unknown = len(plan.data.inputs) - plan.data.formats.total()
     parts += [f"{counted(unknown, 'file')} of no known format"] if unknown else []
     print(f"found {', '.join(parts)}: {plan.estimate}", flush=True)
     if plan.written:

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from drivax.datasets.diagnosis import Diagnosis, Part, diagnose
+from drivax.datasets.doctor import Diagnosis, Part, diagnose
 from drivax.datasets.estimate import counted, free_bytes, gigabytes
 
 _COLUMNS = 100

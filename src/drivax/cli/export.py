@@ -33,7 +33,7 @@ class Export:
     ids: Path | None = None
     """Only scenarios that this file names: one id per line, or data set, tabulator and id (a split file)."""
     limit: int | None = None
-    """At most so many scenarios."""
+    """At most N scenarios."""
     paths: Literal["vmax", "published"] = "vmax"
     """Routes in tf.Examples: 10 of 300 points at 1 m, or 10 of 500 points at 0.5 m."""
     shard_size: int = 500
@@ -44,7 +44,7 @@ class Export:
 
 def run(args: Export) -> int:
     """Export, and say what the format had no room for."""
-    from drivax.datasets.export import subset as export
+    from drivax.datasets.export import writer as export
     from drivax.tracking.progress import Progress
 
     options = export.Export(

@@ -7,16 +7,18 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
 import tyro
 
 from drivax.errors import UsageError
 from drivax.evaluation.audit import audit
+from drivax.scenario.schema import CAPACITIES
 from drivax.scenario.select.splits import parse_shares, write_splits
 from drivax.scenario.store import ScenarioSet
 from drivax.settings import load
 from drivax.synthetic.benchmark import BENCHMARK_VERSION, generate_benchmark
+from drivax.synthetic.domains import DOMAINS
 from drivax.synthetic.generate import FamilyCount, GeneratedSet, Generation, generate
 from drivax.synthetic.world import WORLD_VERSION, WorldConfig
 from drivax.tracking.progress import Progress
@@ -40,7 +42,7 @@ class Generate:
     """How many scenarios, 256 by default; with --benchmark those of train, the other splits in proportion."""
     seed: int | None = None
     """Seed of the set, 0 by default; scenario i of a seed is the same whatever the number of scenarios."""
-    domain: Literal["grid", "ring"] | None = None
+    domain: Annotated[str | None, tyro.conf.arg(metavar="|".join(DOMAINS))] = None
     """Statistics of roads and drivers: wide lanes, lights and higher speeds, or narrow, dense and roundabouts."""
     rare_rate: float | None = None
     """Share of scenarios with a labelled rare event."""
@@ -50,7 +52,7 @@ class Generate:
     """Write the fixed, versioned splits OUT/train, validation, test and test-rare."""
     workers: int | None = None
     """Processes; as many as there are CPU cores by default."""
-    capacity: Literal["default", "large"] = "default"
+    capacity: Annotated[str, tyro.conf.arg(metavar="|".join(CAPACITIES))] = "default"
     """Padded sizes; sets that are used together need the same."""
     split: str | None = None
     """Write lists for train/validation/test to OUT/splits, by map: percentages, as 80/10/10."""
@@ -63,7 +65,7 @@ def run(args: Generate) -> int:
     if args.benchmark and (args.seed is not None or args.split is not None):
         raise UsageError("the benchmark has seeds and splits of its own", cure="leave out --seed and --split")
     if args.benchmark and (args.rare_rate is not None or args.config is not None):
-        raise UsageError("the benchmark is the same for everybody", cure="leave out --rare-rate and --config")
+        raise UsageError("the benchmark has a fixed world", cure="leave out --rare-rate and --config")
     shares = None if args.split is None else parse_shares(args.split)
     options = Generation(
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,

@@ -66,7 +66,7 @@ def run(args: Inspect) -> int:
         raise UsageError("no scenario set is named", cure="write drivax inspect SET")
     if args.json and args.html is not None:
         raise UsageError("--json and --html exclude each other", cure="call drivax inspect twice")
-    _refuse_misfits(args)
+    _check_flags(args)
     selection = Selection.parse(args.filter)
     opened = [Inspection.open(path, selection, not args.no_check) for path in args.sets]
     if args.observations:
@@ -113,7 +113,7 @@ def _console() -> Console:
     return Console(width=width, highlight=False, markup=False)
 
 
-def _refuse_misfits(args: Inspect) -> None:
+def _check_flags(args: Inspect) -> None:
     from drivax.errors import UsageError
     from drivax.tracking.zoo import is_policy
 

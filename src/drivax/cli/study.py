@@ -12,7 +12,7 @@ import tyro
 
 from drivax import settings
 from drivax.studies.longtail import study
-from drivax.studies.longtail_plan import LongtailConfig, Sets
+from drivax.studies.longtail_drives import LongtailConfig, Sets
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class Study:
     """Run an experiment and write its report.
 
     longtail: does training on critical moments more often make a safer driver? Scores, trains, drives and judges all
-    agents and controls; OUT/report.html has the verdicts.
+    arms and controls; OUT/report.html has the verdicts.
 
     A study that was stopped goes on where it was if it is called again. Settings can be given behind, as
-    --total_steps 500000 or --agents [baseline,bc,heuristic,random_matched].
+    --total_steps 500000 or --arms [baseline,bc,heuristic,random_matched].
 
     Example: drivax study longtail --data sets/bench --seeds 5 --out studies/longtail
     """
@@ -39,7 +39,7 @@ class Study:
     test: tuple[Path, ...] = ()
     """Scenario sets to drive in the end; where events are labelled, half of the scenarios taken have one."""
     seeds: int | None = None
-    """Trainings of each agent; 5 unless the configuration says otherwise."""
+    """Trainings of each arm; 5 unless the configuration says otherwise."""
     config: Path | None = None
     """YAML file with settings."""
     cores: int | None = None
@@ -59,7 +59,7 @@ def run(args: Study, overrides: Sequence[str] = ()) -> int:
         args.out,
         cores=args.cores,
         anyway=args.anyway,
-        say=lambda line: print(line, file=sys.stderr),
+        log=lambda line: print(line, file=sys.stderr),
     )
     for one in results["claims"]:
         needed = f" ({one['needed']})" if one["needed"] else ""

@@ -13,7 +13,7 @@ import tyro
 class View:
     """Write one self-contained HTML page in which the logs of a set are browsed and played.
 
-    Beside the player it shows each scenario's tags, flags and audit. Each scenario adds some tens of kilobytes.
+    In addition to the player it shows each scenario's tags, flags and audit. Each scenario adds some tens of kilobytes.
 
     Example: drivax view sets/world --limit 20 --out world.html
 
@@ -23,9 +23,9 @@ class View:
     set: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
     """The scenario set (a folder)."""
     out: Path | None = None
-    """HTML file to write; SET.html beside the set where it is left out."""
+    """HTML file to write; SET.html next to the set by default."""
     limit: int = 50
-    """Only the first so many."""
+    """Only the first N scenarios."""
     ids: tuple[str, ...] = ()
     """Only these scenarios, in this order."""
     scores: Path | None = None

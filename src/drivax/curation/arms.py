@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
+from drivax import settings
 from drivax.curation.controls import permute_scores
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import Scale, WeightConfig, sampling_weights
@@ -16,6 +17,8 @@ from drivax.errors import UsageError
 from drivax.learning.experience import WeightedSet
 from drivax.scenario.store import ScenarioSet
 
+#: Against the baseline, against the permuted control, by kind of scenario, other failures, between methods.
+ClaimGroup = Literal["baseline", "control", "where", "failures", "methods"]
 #: From the name of a method to its score table of a set.
 Tables = Callable[[str], ScoreTable]
 
@@ -39,52 +42,40 @@ class Arm:
     weights: WeightConfig | None = None
 
 
-#: For labels, which are 0 or 1: the share of the draws that goes to steps of an event, on top of uniform draws. On the
-#: benchmark's training set (one step in 40 is of an event) 0.115 gives the effective sample of rank weights, 0.66.
-_LABELS, _STRONG_LABELS = (
-    WeightConfig(normalise="none", temperature=1.0, most=math.inf, uniform=1.0 - share)
-    for share in (0.115, 0.3)
-)
-#: Default weights depend on ranks, so their distribution is the same for all methods at either scale. Steps of each
-#: method have a control of their own, since every method spreads its scores over scenarios differently.
-ARMS: Mapping[str, Arm] = MappingProxyType(
-    {
-        "bc": Arm("offline/bc"),
-        "baseline": Arm(),
-        "cql_bc": Arm("offline/cql_bc"),
-        "heuristic": Arm(method="kinematic"),
-        "heuristic_scenario": Arm(method="kinematic", scale="scenario"),
-        "ensemble": Arm(method="ensemble"),
-        "ensemble_scenario": Arm(method="ensemble", scale="scenario"),
-        "action_rarity": Arm(method="action_rarity"),
-        "action_rarity_scenario": Arm(method="action_rarity", scale="scenario"),
-        "random_matched": Arm(method="kinematic", permuted=True),
-        "random_matched_ensemble": Arm(method="ensemble", permuted=True),
-        "random_matched_action_rarity": Arm(method="action_rarity", permuted=True),
-        "random_matched_scenario": Arm(method="kinematic", scale="scenario", permuted=True),
-        "oracle": Arm(method="oracle", weights=_LABELS),
-        "oracle_strong": Arm(method="oracle", weights=_STRONG_LABELS),
-        "random_matched_oracle": Arm(method="oracle", permuted=True, weights=_LABELS),
-    }
-)
-#: Arms that are curated by a method without labels; no controls.
-CURATED = tuple(name for name in ARMS if name.startswith(("heuristic", "ensemble", "action_rarity")))
+@dataclass(frozen=True)
+class Claim:
+    """A claim about two arms.
 
-
-def control_of(name: str, arms: Mapping[str, Arm] = ARMS) -> str:
-    """Return the matched random control of an arm: weights of the same distribution, randomly permuted.
-
-    Raises:
-        StopIteration: There is none.
+    Attributes:
+        words: The claim.
+        one: The arm that is claimed to be better.
+        other: The arm that it is compared with.
+        group: Claims whose p-values are adjusted together.
+        metric: Metric of the comparison.
+        rows: ``ordinary``, ``common`` or ``rare`` scenarios.
+        change: Claimed relative change, at least; None: only its direction is claimed.
     """
-    arm = arms[name]
-    return next(
-        other
-        for other, control in arms.items()
-        if control.permuted
-        and (control.scale, control.weights) == (arm.scale, arm.weights)
-        and (arm.scale == "scenario" or control.method == arm.method)
-    )
+
+    words: str
+    one: str
+    other: str
+    group: ClaimGroup
+    metric: str = "collision"
+    rows: str = "ordinary"
+    change: float | None = None
+
+
+@dataclass(frozen=True)
+class StudyDefinition:
+    """Arms and claims of a study, as ``configs/studies/NAME.yaml`` declares them."""
+
+    arms: dict[str, Arm]
+    claims: tuple[Claim, ...]
+
+
+#: The long-tail study.
+LONGTAIL = settings.load(StudyDefinition, "studies/longtail")
+ARMS: Mapping[str, Arm] = MappingProxyType(LONGTAIL.arms)
 
 
 def weighted(

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from drivax import settings
 from drivax.curation.combining import Combination
 from drivax.curation.controls import event_steps, permute_scores
 from drivax.curation.ensemble import Ensemble, EnsembleConfig, train_ensemble
@@ -126,6 +127,10 @@ def check_current(table: ScoreTable, config: Any = None, file: Path | None = Non
     current: dict[str, Any] = {} if method.config is None else plain(config)
     if table.components:
         current["combination"] = asdict(method.combination(config))
+    if method.config is not None:  # fields of older tables by their present names
+        own = {name: stored[name] for name in current if name in stored and name != "combination"}
+        own = plain(settings.load(type(config), json.loads(json.dumps(own))))
+        stored |= {name: own[name] for name in own if name in stored}
     # Through JSON: a table that was read has lists instead of tuples.
     stored, current = (json.loads(json.dumps(values)) for values in (stored, current))
     for name, value in current.items():

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drivax.curation.scores import OWN_SCORES, ScoreTable, write_scores
-from drivax.datasets.export.subset import Exported, refuse_part, write_part
+from drivax.datasets.export.writer import Exported, refuse_part, write_part
 from drivax.errors import UsageError
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.stats.clusters import recordings_of

@@ -1,1 +1,5 @@
-"""One reader per public format, and conversion to scenario sets."""
+"""One reader per public format, conversion to scenario sets, and export to other formats."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

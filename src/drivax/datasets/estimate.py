@@ -13,7 +13,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.recording import STRIDE
 from drivax.scenario.schema import STEPS, Capacity, record_dtype
 
-#: So many files of a format are counted; where there are more, they stand for the others by their size.
+#: Files of a format that are counted; where there are more, the sample is scaled by file size.
 _SAMPLE = 48
 
 
@@ -43,9 +43,6 @@ class Estimate:
         Args:
             out: The set.
             written: How many of the scenarios are on the disk already.
-
-        Raises:
-            DataError: The disk has too little room.
         """
         needed = self.size_bytes * max(self.scenarios - written, 0) // max(self.scenarios, 1)
         if needed > self.free_bytes:
@@ -56,19 +53,19 @@ class Estimate:
             )
 
 
-def estimate(found: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
+def estimate(data: Survey, out: Path, capacity: Capacity, stride: int, limit: int | None) -> Estimate:
     """Estimates a conversion by counting, in a sample of the files where there are many.
 
     Args:
-        found: What is converted.
+        data: What is converted.
         out: Where the set will lie; the folder need not exist.
         capacity: Padded sizes.
         stride: Steps between the starts of two windows.
         limit: The most scenarios; None: all.
     """
     total, sampled = 0.0, False
-    for name in found.formats:
-        paths = [one.path for one in found.inputs if one.format == name]
+    for name in data.formats:
+        paths = [entry.path for entry in data.inputs if entry.format == name]
         step = -(-len(paths) // _SAMPLE)
         counted = paths[::step]
         sampled |= step > 1
@@ -121,4 +118,4 @@ def _size(paths: Sequence[Path]) -> int:
 
 def input_bytes(inputs: Sequence[Input]) -> int:
     """Bytes of the files to read, companions aside."""
-    return _size([one.path for one in inputs])
+    return _size([entry.path for entry in inputs])

@@ -1,6 +1,6 @@
 """Which formats drivax reads, and which of them a file is.
 
-A format is told by content, not by name: public data sets use the same names for different things.
+Formats are detected by content: public data sets use the same file names for different things.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Survey:
     @property
     def formats(self) -> Counter[str]:
         """Number of files by format, recognised ones only."""
-        return Counter(one.format for one in self.inputs if one.format is not None)
+        return Counter(entry.format for entry in self.inputs if entry.format is not None)
 
     def relative(self, path: Path) -> str:
         """A file's name for people and manifests: its path below the root, or its own name."""
@@ -158,8 +158,8 @@ def find_files(src: str | Path, name: str = AUTO) -> tuple[list[Path], int]:
         DataError: ``src`` does not exist, or the folder holds no file of a known format.
         UsageError: There is no such format.
     """
-    found = survey(src, name)
-    return [one.path for one in found.inputs], found.ignored
+    data = survey(src, name)
+    return [entry.path for entry in data.inputs], data.ignored
 
 
 def _input(path: Path, only: Reader | None) -> Input:
@@ -192,9 +192,9 @@ def _hidden(path: Path) -> bool:
 
 
 def _nothing_in(folder: Path, files: int, only: Reader | None) -> DataError:
-    found = unsupported.explain_folder(folder)
-    if found is not None:
-        return found
+    error = unsupported.explain_folder(folder)
+    if error is not None:
+        return error
     known = ", ".join(reader.name for reader in (READERS if only is None else (only,)))
     return DataError(
         f"none of the {files} files in it is of a known format ({known})",

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -35,11 +35,7 @@ _LARGEST = 1e7
 _SMALLEST_SIZE_M, _LARGEST_SIZE_M = 0.01, 1000.0
 #: Ids fit into the 31 bits that the public tools give them.
 _ID_END = 2**31
-_AGENTS = {
-    "vehicle": AgentKind.VEHICLE,
-    "pedestrian": AgentKind.PEDESTRIAN,
-    "cyclist": AgentKind.CYCLIST,
-}
+_AGENTS = {"vehicle": AgentKind.VEHICLE, "pedestrian": AgentKind.PEDESTRIAN, "cyclist": AgentKind.CYCLIST}
 #: Kind of a road whose ``map_element_id`` says nothing; the names of ``type``.
 _ROADS = {
     "lane": RoadKind.LANE_UNDEFINED,
@@ -74,11 +70,7 @@ class GpuDrive:
         return head.lstrip().startswith(b"{") and (objects or (b'"roads"' in head and b'"geometry"' in head))
 
     def describe(self, path: Path) -> Description:
-        """What the file is.
-
-        Raises:
-            DataError: It is damaged, or lacks what a recording needs.
-        """
+        """What the file is."""
         recording = decode(_load(path))
         notes = [
             f"{len(recording.tracks.kind)} objects, {len(recording.features)} road elements",
@@ -113,7 +105,7 @@ def _load(path: Path) -> Any:
             file=path,
             cure="name the folder of single scenes",
         )
-    return readings.load_json(path)
+    return parsing.load_json(path)
 
 
 def decode(scene: Any) -> Recording:
@@ -122,9 +114,6 @@ def decode(scene: Any) -> Recording:
     Positions stay in WOMD's map frame, metres, float64; invalid steps (-10000 in the file) are zeros; steps are 0.1 s
     apart, because the file has no timestamps; the current step is 10. ``goalPosition`` is an agent's last valid
     position and therefore not kept, ``mark_as_expert`` (GPUDrive's choice of agents to replay) is dropped.
-
-    Raises:
-        DataError: The scene lacks what a recording needs, or contradicts itself.
     """
     if not isinstance(scene, Mapping):
         raise DataError("is no GPUDrive scene", cure=_SKIP)
@@ -145,7 +134,7 @@ def decode(scene: Any) -> Recording:
     features, unknown = _features(roads)
     rows = {int(track): row for row, track in enumerate(tracks.track_id)}
     interest = [_whole(track, "objects_of_interest") for track in _listed(metadata, "objects_of_interest")]
-    wanted = [
+    predicted = [
         entry.get("track_index") if isinstance(entry, Mapping) else entry
         for entry in _listed(metadata, "tracks_to_predict")
     ]
@@ -159,13 +148,11 @@ def decode(scene: Any) -> Recording:
         tracks=tracks,
         features=features,
         lights=_lights(scene.get("tl_states"), steps),
-        to_predict=_row_numbers(wanted, count, "tracks_to_predict"),
+        to_predict=_row_numbers(predicted, count, "tracks_to_predict"),
         # These are ids, tracks_to_predict are rows.
         of_interest=tuple(rows[track] for track in interest if track in rows),
         tags={"source_format": "gpudrive"},
-        lost=readings.counted(
-            unknown_roads=unknown, one_point_features=readings.one_point_features(features)
-        ),
+        lost=parsing.nonzero(unknown_roads=unknown, one_point_features=parsing.one_point_features(features)),
         split_gap_m=_split_gap_m(features),
     )
 
@@ -191,7 +178,7 @@ def _whole(value: Any, what: str) -> int:
 
 
 def _row_numbers(values: Sequence[Any], count: int, what: str) -> tuple[int, ...]:
-    return readings.rows_within([_whole(value, what) for value in values], count, what)
+    return parsing.rows_within([_whole(value, what) for value in values], count, what)
 
 
 def _table(rows: Any, keys: Sequence[str], what: str) -> _Array:
@@ -292,7 +279,7 @@ def _features(roads: Sequence[Mapping[str, Any]]) -> tuple[tuple[MapFeature, ...
 
 def _split_gap_m(features: Sequence[MapFeature]) -> float | None:
     """Where to cut polylines; None for files whose points were thinned, where a jump looks like any other gap."""
-    spacing = readings.spacing_m(features)
+    spacing = parsing.spacing_m(features)
     return _SPLIT_GAP_M if spacing is not None and spacing <= _DENSE_M else None
 
 
@@ -302,11 +289,11 @@ def _lights(states: Any, steps: int) -> tuple[Light, ...]:
         return ()
     if not isinstance(states, Mapping):
         raise DataError("tl_states is no dictionary of lanes", cure=_SKIP)
-    lights = readings.Lights(steps)
+    lights = parsing.Lights(steps)
     for lane, seen in states.items():
         lane_id, what = _lane_id(lane), f"tl_states of lane {str(lane)[:40]}"
         times, seen_states, *place = _columns(seen, ("time_index", "state", "x", "y", "z"), what)
-        when = readings.rows_within([_whole(step, what) for step in times], steps, what)
+        when = parsing.rows_within([_whole(step, what) for step in times], steps, what)
         rows = [dict(zip("xyz", point, strict=True)) for point in zip(*place, strict=True)]
         points = _table(rows, "xyz", what)
         if not (np.abs(points) <= _LARGEST).all():

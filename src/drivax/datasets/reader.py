@@ -49,7 +49,7 @@ class Description:
         version: Its version, as far as the file tells.
         recordings: How many recordings the file holds; None where only reading all of it would tell.
         notes: What the file holds or lacks that its user should know, one short sentence each.
-        missing: Files that must lie beside it before it can be converted, and are not there.
+        missing: Files that must lie next to it before it can be converted, and are not there.
     """
 
     dataset: str
@@ -66,7 +66,7 @@ class Reader(Protocol):
 
     Readers hold no state and no open files: worker processes receive them by name. The unit that is read at once is
     one file, the one that names the recording or recordings (a shard, a pickle, a parquet or a database); what
-    belongs to it (a map, poses) is found beside it. Packages of extras are imported when they are needed.
+    belongs to it (a map, poses) is found next to it. Packages of extras are imported when they are needed.
     """
 
     @property

@@ -8,14 +8,13 @@ nuPlan, nuScenes, ...) is not in the file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets import readings
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets import parsing
+from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
 from drivax.datasets.womd import tf_example
 from drivax.datasets.womd.tfrecord import count_records
@@ -24,24 +23,18 @@ from drivax.scenario.schema import Flag, LightState
 
 
 @dataclass(frozen=True)
-class ScenarioMax:
+class ScenarioMax(womd.TfRecordReader):
     """Reads ScenarioMax's tf.Examples: tracks, map with limits, lights by lane."""
 
     name: str = womd.SCENARIOMAX_FORMAT
-    patterns: tuple[str, ...] = womd.PATTERNS
-    companions: tuple[str, ...] = ()
 
-    def recognise(self, path: Path) -> bool:
-        """Whether the first readable record was written by ScenarioMax (``womd.scenariomax_signs``)."""
-        return womd.recognise(path, self.name)
+    def decode(self, payload: bytes) -> Recording:
+        """Return the recording in a payload."""
+        return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows.
-
-        Raises:
-            DataError: It is damaged or of another form.
-        """
-        recording = womd.first_recording(path, self.name, decode)
+        """What the first record shows."""
+        recording = self.first(path)
         notes = [*womd.notes_of(recording), "the file does not say which data set its scenarios come from"]
         limited = sum(feature.limit_mps is not None for feature in recording.features)
         notes.append(f"{limited} lanes have a speed limit; no lane graph: lanes are chained by geometry")
@@ -49,7 +42,7 @@ class ScenarioMax:
             notes.append("the list of map points is full, the map is cut off")
         if "paths" in recording.lost:
             notes.append(
-                "path_samples are not used (they were ranked by the log's future): routes are made anew"
+                "path_samples are not used (they were ranked by the log's future): routes are computed again"
             )
         return Description(
             dataset="ScenarioMax",
@@ -58,50 +51,25 @@ class ScenarioMax:
             notes=tuple(notes),
         )
 
-    def count(self, path: Path) -> int:
-        """Records times windows of the first; 0 where it cannot be read."""
-        return womd.count(path, decode)
-
-    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recordings of one file, and in their place the records that cannot be read."""
-        return womd.read(path, self.name, decode)
-
 
 def decode(payload: bytes) -> Recording:
-    """The recording in a serialised tf.Example of ScenarioMax.
+    """Return the recording in a serialised tf.Example of ScenarioMax.
 
     Rows that are never valid are padding. Speed limits become m/s by lane, -1 mph is unknown; missing times are
     10 Hz; velocities that are missing (-1 throughout) are differentiated from positions.
-
-    Raises:
-        DataError: The payload is no such tf.Example, or a feature is missing or has the wrong length.
     """
     table = tf_example.features_of(payload)
     rows = np.arange(table.numbers("state/id").size)
     used = np.flatnonzero((table.over_time("valid", rows) == 1).any(axis=1))
-    tracks = tf_example.tracks(table, used, tf_example.track_ids(table, used))
-    times = tf_example.timestamps(table, used, tracks.valid)
-    tracks, differentiated = _with_velocities(tracks, times)
-    features, truncated = tf_example.map_features(table)
-    lights, dark = _known(tf_example.lights(table))
-    scenario_id = table.scenario_id(payload)
-    flags = Flag.TRUNCATED_MAP if truncated else Flag.NONE
-    return Recording(
-        scenario_id=scenario_id,
-        dataset=womd.SCENARIOMAX_FORMAT,
-        segment=scenario_id,
-        timestamps_s=times,
-        current_step=table.spans["past"],
-        ego=tf_example.ego_row(table, used),
+    recording = tf_example.recording(table, payload, used, womd.SCENARIOMAX_FORMAT, womd.SCENARIOMAX_FORMAT)
+    tracks, differentiated = _with_velocities(recording.tracks, recording.timestamps_s)
+    lights, unknown = _known(recording.lights)
+    return replace(
+        recording,
         tracks=tracks,
-        features=features,
         lights=lights,
-        to_predict=table.marked("state/tracks_to_predict", used),
-        of_interest=table.marked("state/objects_of_interest", used),
-        tags={"source_format": womd.SCENARIOMAX_FORMAT},
-        lost=tf_example.lost(table, features) | readings.counted(lights_without_state=dark),
-        flags=flags | (Flag.DIFFERENTIATED_VELOCITY if differentiated else Flag.NONE),
-        split_gap_m=tf_example.split_gap_m(features),
+        lost={**recording.lost, **parsing.nonzero(lights_without_state=unknown)},
+        flags=recording.flags | (Flag.DIFFERENTIATED_VELOCITY if differentiated else Flag.NONE),
     )
 
 
@@ -109,7 +77,7 @@ def _with_velocities(tracks: Tracks, times: tf_example.Array) -> tuple[Tracks, b
     """The tracks, and whether their velocities had to be made from positions because the file has none."""
     if not tracks.valid.any() or (tracks.velocity[tracks.valid] != -1.0).any():
         return tracks, False
-    return replace(tracks, velocity=readings.differentiate(tracks.xy, tracks.valid, times)), True
+    return replace(tracks, velocity=parsing.differentiate(tracks.xy, tracks.valid, times)), True
 
 
 def _known(lights: tuple[Light, ...]) -> tuple[tuple[Light, ...], int]:

@@ -50,9 +50,6 @@ def converted_ahead(
 
     Yields:
         The scenarios and bad records of one task; read them before asking for the next.
-
-    Raises:
-        DataError: A worker died.
     """
     spool = folder / f"spool-{os.getpid()}"
     spool.mkdir()
@@ -61,7 +58,7 @@ def converted_ahead(
     todo = iter(enumerate(tasks))
     try:
         while True:
-            # Two ahead keep everyone busy and bound what waits on the disk.
+            # Two tasks ahead keep all workers busy and bound the space on the disk.
             while len(waiting) < workers + 2 and (following := next(todo, None)) is not None:
                 path = spool / f"{following[0]}.records"
                 waiting.append((path, pool.submit(_spool, following[1], convert, capacity, path)))
@@ -71,7 +68,7 @@ def converted_ahead(
             yield _unspool(future, path, capacity)
             path.unlink(missing_ok=True)
     finally:
-        shutil.rmtree(spool, ignore_errors=True)  # tells workers that nobody waits for the rest
+        shutil.rmtree(spool, ignore_errors=True)  # signals workers to stop
         pool.shutdown(wait=True, cancel_futures=True)
 
 

@@ -1,6 +1,6 @@
 """Data that drivax does not read, and what to use instead: the wrong flavours of public data sets, archives, sets.
 
-Told by a few bytes and by the names of files, with the standard library alone.
+Detection reads a few bytes and file names, with the standard library alone.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _MAGIC = (
         0,
         b"ARROW1",
         "a feather file that is no table of annotations of Argoverse 2",
-        "give the folder of the log (annotations.feather beside city_SE3_egovehicle.feather and map/)",
+        "give the folder of the log (annotations.feather next to city_SE3_egovehicle.feather and map/)",
     ),
     (
         0,
         b"SQLite format 3",
         "a SQLite file without nuPlan's tables (a map, perhaps)",
-        "give the logs of nuPlan (splits/*/*.db), with maps/ beside",
+        "give the logs of nuPlan (splits/*/*.db), with maps/ next to them",
     ),
 )
 _NEEDED = 262 + 64
@@ -85,7 +85,7 @@ def _json(path: Path) -> DataError:
         head = file.read(1 << 16)
     if b'"objects"' in head or b'"roads"' in head:
         return DataError(
-            "looks like a GPUDrive scene but has no metadata, so nobody knows which object is the ego",
+            "looks like a GPUDrive scene but has no metadata, so the ego is unknown",
             file=path,
             cure="convert the scenes again with a GPUDrive that writes metadata",
         )
@@ -159,19 +159,19 @@ def _varint(payload: bytes, at: int) -> tuple[int, int]:
 
 def _is_frame(payload: bytes) -> bool:
     """Whether it is a ``Frame`` of WOMD perception: context with a name (1), timestamp (2), images or lasers."""
-    found = dict(fields(payload))
-    context = found.get(1)
-    if not isinstance(context, bytes) or not isinstance(found.get(2), int):
+    message = dict(fields(payload))
+    context = message.get(1)
+    if not isinstance(context, bytes) or not isinstance(message.get(2), int):
         return False
     name = dict(fields(context)).get(1)
-    return isinstance(name, bytes) and name.isascii() and bool({3, 4, 5} & found.keys())
+    return isinstance(name, bytes) and name.isascii() and bool({3, 4, 5} & message.keys())
 
 
 def _is_end_to_end(payload: bytes) -> bool:
     """Whether it is an ``E2EDFrame``: a ``Frame`` (1) with past or future states of ego (2, 3)."""
-    found = dict(fields(payload))
-    frame = found.get(1)
-    states = (found.get(2), found.get(3))
+    message = dict(fields(payload))
+    frame = message.get(1)
+    states = (message.get(2), message.get(3))
     if not isinstance(frame, bytes) or not any(isinstance(state, bytes) for state in states):
         return False
     inner = dict(fields(frame))
@@ -182,8 +182,8 @@ def _is_example(payload: bytes) -> bool:
     """Whether it is a ``tf.Example``: features (1) with entries (1) that have a key (1) and a value (2)."""
     features = dict(fields(payload)).get(1)
     entry = dict(fields(features)).get(1) if isinstance(features, bytes) else None
-    found = dict(fields(entry)) if isinstance(entry, bytes) else {}
-    return isinstance(found.get(1), bytes) and isinstance(found.get(2), bytes)
+    message = dict(fields(entry)) if isinstance(entry, bytes) else {}
+    return isinstance(message.get(1), bytes) and isinstance(message.get(2), bytes)
 
 
 _RECORDS: tuple[tuple[Callable[[bytes], bool], str, str], ...] = (
@@ -254,7 +254,7 @@ _FOLDERS: _Folders = (
     (
         lambda folder, names: _inside(folder, "*.gpkg") and not _inside(folder, "*.db"),
         "maps of nuPlan without logs",
-        "put the logs (splits/*/*.db) beside maps/ and name the folder of both",
+        "put the logs (splits/*/*.db) next to maps/ and name the folder of both",
     ),
     (
         lambda folder, names: _inside(folder, "sample_annotation.json", "ego_pose.json"),

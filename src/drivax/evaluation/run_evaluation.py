@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,22 @@ class EvaluationConfig:
     """What is evaluated; stored as ``config.yaml``.
 
     Attributes:
-        planner, traffic: Their names.
-        noisy_start, start_step: How episodes start, and at which step of the log.
-        filter, scenarios, limit: Which scenarios are evaluated (``scenario.select.selection``).
-        seed: Seed of all random numbers.
-        metrics: Metrics to print in addition to the headline; user-defined ones are added to all built-in ones.
-        sample: Whether a trained policy samples its actions.
-        batch: Scenarios loaded at a time; None: as many as memory allows.
+        planner: Planner to evaluate: a name, module:name of your own, the run folder of a training run (RUN or
+            RUN@STEP for an earlier checkpoint), or zoo:NAME.
+        traffic: Traffic model: log replays the log, idm lets vehicles react to ego, a run folder or zoo:NAME drives
+            the vehicles near ego (with +idm appended the others react), or module:name of your own.
+        noisy_start: Start after a second of perturbed driving, drawn per scenario from the seed
+            (docs/guide/dynamics.md).
+        start_step: Step of the log at which episodes start.
+        filter: Only scenarios that meet this condition (NAME=A|B, NAME!=A, NAME>=N); repeat it to combine several.
+        scenarios: Only scenarios with these ids, or with the ids in a file, one per line.
+        limit: Only the first N scenarios that remain after filtering.
+        metrics: Metrics to print in addition to the headline: a set (training, full), names, or module:name of your
+            own (docs/guide/custom.md). All built-in metrics are always computed and written.
+        seed: Seed of all random numbers: noisy starts and planners that sample.
+        sample: Let a trained policy sample its actions instead of taking the mode.
+        batch: Scenarios loaded at a time; as many as memory allows by default. Results do not depend on it.
+        task: Action space and observation of the planner.
     """
 
     planner: str
@@ -58,6 +67,7 @@ class EvaluationConfig:
     metrics: tuple[str, ...] = ()
     sample: bool = False
     batch: int | None = None
+    task: Task = field(default_factory=Task)
 
 
 def run_evaluation(
@@ -66,7 +76,6 @@ def run_evaluation(
     data: ScenarioSet,
     out: str | Path,
     *,
-    task: Task | None = None,
     traffic: Traffic | None = None,
     sizes: Sizes | None = None,
     overwrite: bool = False,
@@ -74,11 +83,10 @@ def run_evaluation(
     """Evaluate a planner on a scenario set, and write the run folder.
 
     Args:
-        config: Scenarios, starts, seed, and the names of planner and traffic.
+        config: Task, scenarios, starts, seed, and the names of planner and traffic.
         planner: The planner.
         data: Scenario set, from which ``config`` selects.
         out: Run folder; it appears once all episodes are done.
-        task: Action space and observation of the planner.
         traffic: Traffic model; by default the built-in one named ``config.traffic``.
         sizes: Sizes that the whole set uses, if they are known already.
         overwrite: Replace an existing run folder.
@@ -89,7 +97,7 @@ def run_evaluation(
         table = evaluate(
             planner,
             scenarios,
-            task=with_metrics(task or Task(), config.metrics),
+            task=with_metrics(config.task, config.metrics),
             traffic=traffic or make_traffic(config.traffic),
             start=NoisyStart() if config.noisy_start else LogStart(),
             start_step=config.start_step,

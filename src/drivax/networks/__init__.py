@@ -1,1 +1,5 @@
-"""Encoders, heads and distributions; knows arrays, not driving."""
+"""Encoders, heads and action distributions (flax nnx)."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from drivax.errors import UsageError
@@ -11,6 +12,7 @@ from drivax.planners.pdm.planner import PdmPlanner
 from drivax.planners.planner import Planner
 from drivax.planners.simple import ConstantVelocity, Expert, RandomActions
 from drivax.plugins import check_arguments, find_named, is_dotted
+from drivax.tasks.actions import ActionSpace
 
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "expert": Expert,
@@ -22,19 +24,19 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
 }
 
 
-def make_planner(name: str) -> Planner:
-    """The planner of a name, for the default action space.
+def make_planner(name: str, actions: ActionSpace | None = None) -> Planner:
+    """Return the planner of a name.
 
     Args:
-        name: One of :data:`PLANNERS`, or ``package.module:name`` of a planner of your own, or of what makes one.
+        name: One of :data:`PLANNERS`, or ``package.module:name`` of your own planner or of a function that makes one.
+        actions: Action space for a planner that has a field ``actions``; None: the planner's own.
 
     Raises:
         KeyError: If there is none.
         UsageError: If a dotted name leads to no planner.
     """
-    if not is_dotted(name):
-        return PLANNERS[name]()
-    return as_planner(find_named(name), name)
+    planner = as_planner(find_named(name), name) if is_dotted(name) else PLANNERS[name]()
+    return replace(planner, actions=actions) if actions and hasattr(planner, "actions") else planner  # type: ignore
 
 
 def as_planner(thing: Any, name: str) -> Planner:

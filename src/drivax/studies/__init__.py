@@ -1,1 +1,5 @@
-"""The experiments that the documentation quotes, and the demo."""
+"""The study runner, the speed measurements of ``drivax bench``, and the demo."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -43,21 +43,21 @@ from drivax.tracking.run_folder import versions
 METRIC_SETS, BATCHES, LARGER = ("none", "training", "full"), (32, 128), (256, 512, 1024)
 #: Environments of which the compiler counts operations and bytes.
 _COUNTED = 16384
-#: Actions, observations and everyone now; and states, whose episodes are over, what was earned, and the former.
+#: Actions, observations and frame; and the carry: states, which episodes ended, rewards, and the former.
 _Driven = tuple[Array, Mapping[str, Array], Frame]
 _Carry = tuple[SimState, Bool[Array, " B"], Float[Array, " B"], _Driven]
 
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """What is timed.
+    """Settings of a benchmark.
 
     Attributes:
-        batch: Environments side by side, a multiple of the number of devices.
+        batch: Parallel environments, a multiple of the number of devices.
         steps: Steps per timed call.
-        repeats: Timed calls; the median counts.
+        repeats: Timed calls; the median is reported.
         task: Observation, reward, metrics.
-        traffic: How the others move.
+        traffic: Traffic model: log, idm, package.module:name, a run folder or zoo:NAME.
     """
 
     batch: int = 256
@@ -152,7 +152,7 @@ class Program:
         steps: Environment steps of a run that count; those that only begin an episode do not.
         compile_seconds: From the traced function to the program.
         state_bytes: State of one environment.
-        temporary_bytes: What the program needs beside bank and states, per environment.
+        temporary_bytes: What the program needs in addition to bank and states, per environment.
     """
 
     run: Callable[[], Any]
@@ -255,7 +255,7 @@ def _run(
         # As in training: metrics are computed when some episode of the batch ends.
         total += jax.lax.cond(done.any(), judged, lambda _: jnp.zeros(()), states)
         total += transition.reward
-        # Here, where everyone is at hand, and not at the beginning of the next round.
+        # Here, where all agents are at hand, and not at the beginning of the next round.
         return (states, done, total, _driven(simulator, config, bank, states)), (~over).sum()
 
     begins = jax.random.randint(key, (config.steps, batch), 0, len(bank))
@@ -264,7 +264,7 @@ def _run(
 
 
 def _driven(simulator: Simulator, config: BenchConfig, bank: ScenarioBank, states: SimState) -> _Driven:
-    """The driver's actions, the task's observations and everyone now."""
+    """The driver's actions, the task's observations and all agents at the step."""
     driver = IdmPlanner(config.task.actions)
 
     def one(state: SimState) -> _Driven:

@@ -41,10 +41,11 @@ class DemoConfig:
     """Sizes of the demo.
 
     Attributes:
-        training, held_out: Numbers of scenarios.
+        training: Scenarios to train on.
+        held_out: Scenarios to evaluate on.
         preset: Training configuration.
         overrides: Changes to it, as on the command line.
-        workers: Processes that generate.
+        workers: Processes that generate; one per CPU core by default.
     """
 
     training: int = 256
@@ -109,15 +110,13 @@ def run_demo(
     run = train(training_config, training, out / "training" / "policy", overwrite=True).path
     say("3/4  driving the held-out scenarios")
     runs, results = [], {}
-    planners: dict[str, tuple[Planner, Task | None]] = {
-        name: (make_planner(name), None) for name in REFERENCES
-    }
+    planners: dict[str, tuple[Planner, Task]] = {name: (make_planner(name), Task()) for name in REFERENCES}
     planners["policy"] = load_policy(run, ScenarioBank.from_scenarios(held_out[:1]))
     for name, (planner, task) in planners.items():
         folder = out / "evaluation" / name
         folder.parent.mkdir(exist_ok=True)
-        named = EvaluationConfig(planner=name if name in REFERENCES else str(run))
-        results[name] = run_evaluation(named, planner, held_out, folder, task=task, overwrite=True)
+        named = EvaluationConfig(planner=name if name in REFERENCES else str(run), task=task)
+        results[name] = run_evaluation(named, planner, held_out, folder, overwrite=True)
         runs.append(folder)
     say("4/4  writing the report")
     report = write_report([run, *runs], out / "report.html", overwrite=True)

@@ -31,35 +31,32 @@ from drivax.learning.training_log import rank
 from drivax.report.pages.viewer import criticality_html, write_player
 from drivax.scenario.store import ScenarioSet
 from drivax.studies.longtail_drives import (
-    MEAN_Q,
-    Say,
-    clusters,
-    drive,
-    drive_references,
-    driven,
-    has_driven,
-    ordinary_share,
-    rare_rows,
-    test_set,
-)
-from drivax.studies.longtail_page import write_page
-from drivax.studies.longtail_plan import (
     BY_MEAN_Q,
     CRITICAL,
     DRIVES,
     FIRST,
+    MEAN_Q,
     REFERENCES,
     REPORT,
     RESULTS,
     SCORES,
     Job,
+    Log,
     LongtailConfig,
     Sets,
     Usable,
-    drive_of,
+    clusters,
+    episodes,
+    evaluate_arm,
+    evaluate_references,
+    evaluation_of,
+    is_evaluated,
+    ordinary_share,
+    rare_rows,
     run_of,
+    test_set,
 )
-from drivax.studies.longtail_rankings import rankings
+from drivax.studies.longtail_page import write_page
 from drivax.studies.longtail_results import (
     METRICS,
     Condition,
@@ -67,6 +64,7 @@ from drivax.studies.longtail_results import (
     cost_of_rule,
     detectable,
     judge,
+    rankings,
     rates,
     summary,
 )
@@ -80,21 +78,21 @@ _PROGRESS = "validation/progress_ratio"
 _SHOWN, _TOP = ("kinematic", "ensemble", "action_rarity"), 3
 
 
-def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
+def open_study(config: LongtailConfig, sets: Sets, out: Path) -> None:
     """Makes the folder of a study, or finds that it is of this very study.
 
     Raises:
-        UsageError: It is of another one, or an agent needs labels that the training set does not have.
+        UsageError: It is of another one, or an arm needs labels that the training set does not have.
         DataError: A set is no scenario set.
     """
     data = [ScenarioSet.open(path) for path in (sets.train, sets.validation, *sets.test)]
     if not out.exists():
-        rest = [name for name in config.agents if ARMS[name].method != "oracle"]
-        if len(rest) < len(config.agents) and not event_kinds(data[0]).any():
+        rest = [name for name in config.arms if ARMS[name].method != "oracle"]
+        if len(rest) < len(config.arms) and not event_kinds(data[0]).any():
             raise UsageError(
-                "has no labelled events, which the oracle and its lot learn from",
+                "has no labelled events, which the oracle and its control need",
                 file=sets.train,
-                cure=f"pass --agents [{','.join(rest)}]",
+                cure=f"pass --arms [{','.join(rest)}]",
             )
         RunFolder.create(out, config, data, kind="longtail")
         return
@@ -106,32 +104,32 @@ def begin(config: LongtailConfig, sets: Sets, out: Path) -> None:
         )
 
 
-def score(config: LongtailConfig, sets: Sets, out: Path, say: Say) -> dict[str, ScoreTable]:
-    """The tables of all methods that the agents ask for, of the training set; read where they are there already."""
+def score(config: LongtailConfig, sets: Sets, out: Path, log: Log) -> dict[str, ScoreTable]:
+    """The tables of all methods that the arms ask for, of the training set; read where they are there already."""
     data, tables = ScenarioSet.open(sets.train), {}
-    for method in dict.fromkeys(ARMS[agent].method for agent in config.agents):
+    for method in dict.fromkeys(ARMS[arm].method for arm in config.arms):
         file = out / SCORES / f"{method}.npz"
-        own = config.scouts if method == "ensemble" else None
+        own = config.ensemble if method == "ensemble" else None
         if not file.is_file():
-            say(f"scoring by {method}")
+            log(f"scoring by {method}")
             write_scores(curate(method, Request(data, config=own)), file)
         tables[method] = read_scores(file, data)
         check_current(tables[method], own, file)
     return tables
 
 
-def make_all(jobs: Sequence[Job], cores: int | None, say: Say) -> None:
-    """Trains agents that are not trained yet and drives the test set with them, each seed by itself on one core."""
+def make_all(jobs: Sequence[Job], cores: int | None, log: Log) -> None:
+    """Trains arms that are not trained yet and drives the test set with them, each seed by itself on one core."""
     waiting = [job for job in jobs if not _done(job)]
     for number, (job, took) in enumerate(one_core_each(_make, waiting, cores), start=1):
-        say(f"trained and drove {job.agent}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
+        log(f"trained and evaluated {job.arm}, seed {job.seed} in {took:.0f} s ({number} of {len(waiting)})")
 
 
 def _done(job: Job) -> bool:
-    """Whether an agent has driven.
+    """Whether an arm has episodes.
 
     Raises:
-        UsageError: It was trained otherwise, or anew since.
+        UsageError: It was trained otherwise, or again since.
     """
     if not (job.run / "config.yaml").is_file():
         return False
@@ -140,9 +138,9 @@ def _done(job: Job) -> bool:
     if folder.config(TrainConfig) != config or any(folder.info.get(name) != one for name, one in now.items()):
         raise UsageError(
             "was trained with other settings or weights than this study asks for", file=job.run,
-            cure=f"remove it and {drive_of(job.out, job.agent, job.seed)}; both are made anew",
+            cure=f"remove it and {evaluation_of(job.out, job.arm, job.seed)}; both are made again",
         )  # fmt: skip
-    return has_driven(job.out, job.agent, job.seed)
+    return is_evaluated(job.out, job.arm, job.seed)
 
 
 def _weighted(job: Job) -> WeightedSet:
@@ -151,17 +149,17 @@ def _weighted(job: Job) -> WeightedSet:
     def table(method: str) -> ScoreTable:
         return read_scores(job.out / SCORES / f"{method}.npz", data)
 
-    return weighted(ARMS[job.agent], data, table, job.config.weights, job.usable, job.seed)
+    return weighted(ARMS[job.arm], data, table, job.config.weights, job.usable, job.seed)
 
 
 def _make(job: Job) -> float:
-    began, config = time.perf_counter(), job.train_config
+    started, config = time.perf_counter(), job.train_config
     steps = Checkpoints(job.run / "checkpoints").steps()
     if config.iterations * config.algorithm.steps_per_iteration not in steps:
         validation = ScenarioSet.open(job.sets.validation)
         train(config, _weighted(job), job.run, validation=validation, resume=bool(steps), overwrite=not steps)
-    drive(job.out, job.agent, job.seed)
-    return time.perf_counter() - began
+    evaluate_arm(job.out, job.arm, job.seed)
+    return time.perf_counter() - started
 
 
 def study(
@@ -171,7 +169,7 @@ def study(
     *,
     cores: int | None = None,
     anyway: bool = False,
-    say: Say = print,
+    log: Log = print,
 ) -> dict[str, Any]:
     """Runs a study from wherever it is to its end; see the module.
 
@@ -181,7 +179,7 @@ def study(
         out: Its folder.
         cores: How many trainings run side by side; None: one on every core.
         anyway: Go on where the conditions for a comparison are not met; the report says so.
-        say: Called with a line about every step.
+        log: Called with a line about every step.
 
     Returns:
         What ``results.json`` holds.
@@ -189,46 +187,44 @@ def study(
     Raises:
         UsageError: ``baseline`` or ``bc`` do not drive well enough, or ``out`` holds another study.
     """
-    begin(config, sets, out)
-    tables = score(config, sets, out, say)
+    open_study(config, sets, out)
+    tables = score(config, sets, out, log)
     data, test = ScenarioSet.open(sets.train), test_set(sets, out)
-    # Of one observation and one action space: whichever agent is asked.
+    # Of one observation and one action space: whichever arm is asked.
     usable = usable_steps(config.train_config(FIRST[0], 0), data)
-    drive_references(out, test, say)
-    jobs = [
-        Job(config, sets, out, agent, seed, usable) for seed in range(config.seeds) for agent in config.agents
-    ]
-    make_all([job for job in jobs if job.agent in FIRST], cores, say)
+    evaluate_references(out, test, log)
+    jobs = [Job(config, sets, out, arm, seed, usable) for seed in range(config.seeds) for arm in config.arms]
+    make_all([job for job in jobs if job.arm in FIRST], cores, log)
     met, least = conditions(config, out, FIRST), _detectable(config, sets, out)
     for one in met:
-        say(one.words())
-    say(
+        log(one.words())
+    log(
         "smallest difference that will be found: " + ", ".join(f"{name} {x:.3f}" for name, x in least.items())
     )
     if not all(one.met for one in met) and not anyway:
         raise UsageError(
-            "the baseline does not drive well enough, so that a comparison would say little",
+            "the baseline does not drive well enough, so that a comparison would log little",
             file=out,
             cure="train longer, choose other settings, or pass --anyway",
         )
-    make_all(jobs, cores, say)
+    make_all(jobs, cores, log)
     results = findings(config, sets, out, tables, usable) | {
-        "conditions": [asdict(one) for one in conditions(config, out, config.agents)],
+        "conditions": [asdict(one) for one in conditions(config, out, config.arms)],
         "detectable": least,
     }
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
     _show(results, data, tables, out)
-    say(f"wrote {out / REPORT}")
+    log(f"wrote {out / REPORT}")
     return results
 
 
 def _detectable(config: LongtailConfig, sets: Sets, out: Path) -> dict[str, float]:
     """See :func:`detectable`: of the claims against the baseline."""
     test = test_set(sets, out)
-    drove, imitated = (driven(config, out, name) for name in FIRST)
-    together = max([claim.group for claim in claims(config.agents)].count("baseline"), 1)
+    evaluated, imitated = (episodes(config, out, name) for name in FIRST)
+    together = max([claim.group for claim in claims(config.arms)].count("baseline"), 1)
     return detectable(
-        drove, imitated, clusters(test), rare_rows(config, test), ordinary_share(sets), together
+        evaluated, imitated, clusters(test), rare_rows(config, test), ordinary_share(sets), together
     )
 
 
@@ -246,19 +242,19 @@ def _show(results: Mapping[str, Any], data: ScenarioSet, tables: Mapping[str, Sc
     )
 
 
-def conditions(config: LongtailConfig, out: Path, agents: Sequence[str]) -> list[Condition]:
-    """Whether agents drive well, and no longer learn; what everything is compared with has to."""
+def conditions(config: LongtailConfig, out: Path, arms: Sequence[str]) -> list[Condition]:
+    """Whether arms drive well, and no longer learn; what everything is compared with has to."""
     found = []
-    for agent in agents:
-        found.append(Condition.of(agent, validations(config, out, agent), config.progress, config.flat))
+    for arm in arms:
+        found.append(Condition.of(arm, validations(config, out, arm), config.progress, config.flat))
     return found
 
 
-def validations(config: LongtailConfig, out: Path, agent: str) -> list[dict[str, list[float]]]:
+def validations(config: LongtailConfig, out: Path, arm: str) -> list[dict[str, list[float]]]:
     """Of each seed ``score``, ``progress`` and, if there are critics, ``mean_q`` at its validations in their order."""
     found = []
     for seed in range(config.seeds):
-        rows = [row for row in read_rows(run_of(out, agent, seed) / "metrics.jsonl") if _PROGRESS in row]
+        rows = [row for row in read_rows(run_of(out, arm, seed) / "metrics.jsonl") if _PROGRESS in row]
         found.append(
             {
                 "score": [_score(row) for row in rows],
@@ -281,10 +277,10 @@ def findings(
     """Everything that the study found in the end, as plain values."""
     data, test = ScenarioSet.open(sets.train), test_set(sets, out)
     rare, labels, share = rare_rows(config, test), clusters(test), ordinary_share(sets)
-    drives = {name: driven(config, out, name) for name in (*config.agents, BY_MEAN_Q)}
+    drives = {name: episodes(config, out, name) for name in (*config.arms, BY_MEAN_Q)}
     for name in REFERENCES:
-        drove = EpisodeTable.read(out / DRIVES / name).metrics
-        drives[name] = {metric: drove[metric][None] for metric in METRICS}
+        evaluated = EpisodeTable.read(out / DRIVES / name).metrics
+        drives[name] = {metric: evaluated[metric][None] for metric in METRICS}
     by_mean_q = drives[BY_MEAN_Q]
     return {
         "about": {
@@ -295,15 +291,15 @@ def findings(
             "labelled": share is not None,
             "share": share,
         },
-        "claims": [summary(one) for one in judge(drives, labels, rare, config.agents, share)],
-        "rates": {name: rates(drives[name], labels, rare, share) for name in (*REFERENCES, *config.agents)},
+        "claims": [summary(one) for one in judge(drives, labels, rare, config.arms, share)],
+        "rates": {name: rates(drives[name], labels, rare, share) for name in (*REFERENCES, *config.arms)},
         "draws": {
             name: asdict(
                 draw_statistics(
                     weighted(ARMS[name], data, tables.__getitem__, config.weights, usable).weights, usable
                 )
             )
-            for name in config.agents
+            for name in config.arms
         },
         "rankings": rankings(tables, clusters(data)),
         "mean_q": cost_of_rule(by_mean_q, drives["baseline"], labels, rare, share),

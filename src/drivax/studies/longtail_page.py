@@ -14,9 +14,8 @@ from drivax.curation.scores import ScoreTable
 from drivax.files import write_text
 from drivax.report.charts.distributions import histogram
 from drivax.report.pages.page import page
-from drivax.studies.longtail_plan import FIRST
-from drivax.studies.longtail_rankings import RELATED, UNRELATED
-from drivax.studies.longtail_results import METRICS
+from drivax.studies.longtail_drives import FIRST
+from drivax.studies.longtail_results import METRICS, RELATED, UNRELATED
 
 _SHORT = {
     "collision": "collision", "at_fault_collision": "at fault", "offroad": "off-road", "accuracy": "accuracy",
@@ -25,7 +24,7 @@ _SHORT = {
 _KINDS = {"ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios"}
 _GROUPS = {
     "baseline": "Better than the baseline?",
-    "lot": "Better than the same weights dealt out by lot?",
+    "control": "Better than the matched random control?",
     "where": "In common, and in rare scenarios?",
     "failures": "Fewer failures of any kind?",
     "methods": "One method better than another?",
@@ -62,7 +61,7 @@ def write_page(
     sections = [
         _section("Before the comparison", _conditions(results)),
         _section("Verdicts", _verdicts(results)),
-        _section("How the agents drove", "".join(_rates(results, kind) for kind in _KINDS)),
+        _section("How the arms evaluated", "".join(_rates(results, kind) for kind in _KINDS)),
         _section("How the weights lie", _table(*draws(results), "dense")),
         _section("Are the methods different?", _rankings(results)),
         _section("Choosing checkpoints by the highest mean Q", _mean_q(results)),
@@ -76,13 +75,13 @@ def _lead(results: Mapping[str, Any]) -> str:
     verdicts = [one["verdict"] for one in results["claims"]]
     counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _SIGNS)
     about = results["about"]
-    gate = [one["met"] for one in results["conditions"] if one["agent"] in FIRST]
+    gate = [one["met"] for one in results["conditions"] if one["arm"] in FIRST]
     caution = "" if all(gate) else (
-        "<p><b>The conditions of the comparison are not met</b>: read its verdicts as those of agents that do not "
+        "<p><b>The conditions of the comparison are not met</b>: read its verdicts as those of arms that do not "
         "drive well.</p>"
     )  # fmt: skip
     return (
-        f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['draws'])} agents, {about['seeds']} seeds, "
+        f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['draws'])} arms, {about['seeds']} seeds, "
         f"{about['train']:,} training and {about['test']:,} test scenarios ({about['rare']:,} of them rare, "
         f"{'labelled' if about['labelled'] else 'by the kinematic heuristic'}).</p>{caution}"
     )
@@ -109,10 +108,10 @@ Cells = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
 def conditions(results: Mapping[str, Any]) -> Cells:
-    """How well every agent drives before the test, and whether it no longer learns."""
+    """How well every arm drives before the test, and whether it no longer learns."""
     rows = [
         (
-            one["agent"],
+            one["arm"],
             f"{one['progress']:.1%}",
             f"{one['least']:.1%}",
             f"{one['change']:+.3f}",
@@ -122,7 +121,7 @@ def conditions(results: Mapping[str, Any]) -> Cells:
         for one in results["conditions"]
     ]
     heads = (
-        "agent", "progress of the expert's", "worst seed", "score, third to last quarter", "either way", "good enough"
+        "arm", "progress of the expert's", "worst seed", "score, third to last quarter", "either way", "good enough"
     )  # fmt: skip
     return heads, rows
 
@@ -134,24 +133,22 @@ def verdicts(results: Mapping[str, Any], group: str) -> Cells:
 
 
 def rates(results: Mapping[str, Any], kind: str) -> Cells:
-    """How every agent drove scenarios of a kind."""
+    """How every arm evaluated scenarios of a kind."""
     found = {name: rates[kind] for name, rates in results["rates"].items() if kind in rates}
     metrics = [name for name in METRICS if any(name in rates for rates in found.values())]
     rows = [(name, *(_mean(rates.get(metric)) for metric in metrics)) for name, rates in found.items()]
-    return ("agent", *(_SHORT[name] for name in metrics)), rows
+    return ("arm", *(_SHORT[name] for name in metrics)), rows
 
 
 def draws(results: Mapping[str, Any]) -> Cells:
-    """How the weights of every agent lie."""
+    """How the weights of every arm lie."""
     names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
-    heads = ("agent", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
-    return heads, [
-        (agent, *(f"{one[name]:.2f}" for name in names)) for agent, one in results["draws"].items()
-    ]
+    heads = ("arm", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
+    return heads, [(arm, *(f"{one[name]:.2f}" for name in names)) for arm, one in results["draws"].items()]
 
 
 def rankings(results: Mapping[str, Any]) -> Cells:
-    """How alike methods rank scenarios."""
+    """How similar methods rank scenarios."""
     rows = [
         (
             f"{one['one']} and {one['other']}",
@@ -174,7 +171,7 @@ def mean_q(results: Mapping[str, Any]) -> Cells:
 
 
 def mean_q_curve(results: Mapping[str, Any]) -> Cells:
-    """What the baseline's critics expected of it, and how it drove, at each validation."""
+    """What the baseline's critics expected of it, and how it evaluated, at each validation."""
     mean_q, score = (np.array([one[name] for one in results["validations"]]) for name in ("mean_q", "score"))
     places = range(mean_q.shape[1])
     rows = [
@@ -189,10 +186,10 @@ def mean_q_curve(results: Mapping[str, Any]) -> Cells:
 def _conditions(results: Mapping[str, Any]) -> str:
     found = ", ".join(f"{_SHORT[name]} {value:.3f}" for name, value in results["detectable"].items())
     return _table(*conditions(results), "dense") + (
-        "<p>The smallest difference in ordinary traffic that so many seeds and scenarios find with a probability of "
+        "<p>The smallest difference in ordinary traffic that these seeds and scenarios find with a probability of "
         "80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
         f"{escape(found)}. A score that stands still is that of this budget and these learning rates. Baseline and bc "
-        "had to be good enough before the others learned; the others are shown beside them.</p>"
+        "had to be good enough before the others learned; the others are shown next to them.</p>"
     )
 
 
@@ -204,8 +201,8 @@ def _verdicts(results: Mapping[str, Any]) -> str:
         "drawn by chance (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). "
         "A claim is supported or contradicted below 0.05, otherwise undecided; how many seeds or recordings would "
         "decide is reckoned as if the difference were the one found, at the strictest level of its group. A claim "
-        "about a size is tested against that size. How alike the weights of a method and of its lot are, stands under "
-        "how the weights lie. Scores are made once: claims are about these scores, at this strength of "
+        "about a size is tested against that size. Compare the weights of a method and of its "
+        "control in the table of weights. Scores are computed once: claims are about these scores, at this strength of "
         "weighting.</small></p>"
     )
 
@@ -239,7 +236,7 @@ def _rankings(results: Mapping[str, Any]) -> str:
     return _table(*rankings(results)) + (
         "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. Rankings are called "
         f"unrelated where all of the interval is within ±{UNRELATED}, related where all of it is beyond ±{RELATED}. "
-        "Two rankings by lot have 5 % of their top 5 % in common.</small></p>"
+        "Two random rankings have 5 % of their top 5 % in common.</small></p>"
     )
 
 

@@ -5,39 +5,78 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from drivax.curation.arms import CURATED, control_of
+from drivax.curation.arms import LONGTAIL, Claim
+from drivax.curation.scores import ScoreTable
+from drivax.curation.subset import top_rows
+from drivax.stats.ranking import correlation_interval, rank_correlation
 from drivax.stats.seeds import Crossed, crossed_difference, crossed_mean, log_ratio, seeds_interval
 from drivax.stats.significance import holm
 
+#: Two rankings below this correlation (and above its negative) are called unrelated, above the other one related.
+UNRELATED, RELATED = 0.1, 0.3
+#: Share of the scenarios that are compared as the most critical ones of two methods.
+_TOP = 0.05
+
+
+def rankings(tables: Mapping[str, ScoreTable], clusters: Sequence[str]) -> list[dict[str, Any]]:
+    """How similar the rankings of scenarios are: rank correlation, and how many of the most critical are the same.
+
+    They are unrelated or related only where all of the correlation's interval is.
+
+    Args:
+        tables: By method, of one set.
+        clusters: Recording of every scenario, which are drawn again for the interval.
+    """
+    found = []
+    for one, other in combinations([name for name in tables if name not in ("uniform", "oracle")], 2):
+        first, second = tables[one].scenarios, tables[other].scenarios
+        count = max(round(_TOP * len(first)), 1)
+        tops = [set(top_rows(tables[name], count)) for name in (one, other)]
+        low, high = correlation_interval(first, second, clusters)
+        verdict = "undecided"
+        if max(-low, high) < UNRELATED:
+            verdict = "supported"
+        elif low > RELATED or high < -RELATED:
+            verdict = "contradicted"
+        found.append(
+            {
+                "one": one,
+                "other": other,
+                "rho": rank_correlation(first, second),
+                "interval": [low, high],
+                "overlap": len(tops[0] & tops[1]) / count,
+                "orthogonal": verdict,
+            }
+        )
+    return found
+
+
 Values = Float[np.ndarray, "seed scenario"]
 #: By metric.
-Driven = Mapping[str, Values]
+Episodes = Mapping[str, Values]
 Rows = Bool[np.ndarray, " scenario"]
 Counts = Float[np.ndarray, " scenario"]
 Verdict = Literal["supported", "contradicted", "undecided"]
-#: Against the baseline, against a lot, in common and in rare scenarios, in other failures, between methods.
-ClaimGroup = Literal["baseline", "lot", "where", "failures", "methods"]
 
-#: What is reported of every agent, and whether more of it is better.
+#: What is reported of every arm, and whether more of it is better.
 METRICS = {
     "collision": -1, "at_fault_collision": -1, "offroad": -1, "accuracy": 1, "progress_ratio": 1, "vmax_score": 1,
 }  # fmt: skip
 _LEVEL = 0.05
-#: What the published study reports of its best agent: 16.0 % of collisions to 5.5 %.
-PUBLISHED_CHANGE = 5.5 / 16.0 - 1.0
 
 
 @dataclass(frozen=True)
 class Condition:
-    """How well an agent drives before anything is compared.
+    """How well an arm drives before anything is compared.
 
     Attributes:
-        agent: Its name.
+        arm: Its name.
         progress: Share of the expert's progress on the validation set at the chosen checkpoints, mean over seeds.
         least: The same of the worst seed.
         change: Of the validation score, from the third to the last quarter of the validations, mean over seeds.
@@ -45,7 +84,7 @@ class Condition:
         met: Whether every seed makes progress enough, and seeds move little.
     """
 
-    agent: str
+    arm: str
     progress: float
     least: float
     change: float
@@ -54,7 +93,7 @@ class Condition:
 
     @classmethod
     def of(
-        cls, agent: str, curves: Sequence[Mapping[str, Sequence[float]]], least: float, flat: float
+        cls, arm: str, curves: Sequence[Mapping[str, Sequence[float]]], least: float, flat: float
     ) -> Condition:
         """From the validations of every seed: ``score`` and ``progress`` in their order."""
         progress, changes = [], []
@@ -65,7 +104,7 @@ class Condition:
             changes.append(scores[-quarter:].mean() - scores[-2 * quarter : -quarter].mean())
         moved = float(np.abs(changes).mean())
         return cls(
-            agent,
+            arm,
             progress=float(np.mean(progress)),
             least=min(progress),
             change=float(np.mean(changes)),
@@ -76,87 +115,23 @@ class Condition:
     def words(self) -> str:
         """One line."""
         return (
-            f"{self.agent}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score moves by "
+            f"{self.arm}: {self.progress:.0%} of the expert's progress (worst seed {self.least:.0%}), score moves by "
             f"{self.change:+.3f} ({self.moved:.3f} either way): {'good enough' if self.met else 'NOT good enough'}"
         )
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim about two agents.
-
-    Attributes:
-        words: The claim.
-        one: The agent that is said to be better.
-        other: The one that it is compared with.
-        group: Claims whose p-values are adjusted together.
-        metric: In what.
-        rows: ``ordinary``, ``common`` or ``rare`` scenarios.
-        change: Relative change that is claimed, at least; None: only the direction is.
-    """
-
-    words: str
-    one: str
-    other: str
-    group: ClaimGroup
-    metric: str = "collision"
-    rows: str = "ordinary"
-    change: float | None = None
-
-
-def claims(agents: Sequence[str]) -> list[Claim]:
-    """All claims about these agents: those of the published study, and those that its controls would have asked."""
-    found = []
-    curated = [name for name in CURATED if name in agents]
-    for name in (*curated, "cql_bc", "oracle", "oracle_strong"):
-        found.append(Claim(f"{name} collides less than the baseline", name, "baseline", "baseline"))
-    # A third of the collisions, or fewer: the ratio of the published rates.
-    found.append(
-        Claim(
-            f"ensemble has {1 + PUBLISHED_CHANGE:.0%} of the baseline's collisions or fewer",
-            "ensemble",
-            "baseline",
-            "baseline",
-            change=PUBLISHED_CHANGE,
-        )
-    )
-    for name in (*curated, "oracle"):
-        lot = control_of(name)
-        found.append(
-            Claim(f"{name} collides less than weights as strong, dealt out by lot", name, lot, "lot")
-        )
-    for name in (*curated, "oracle"):
-        for rows in ("common", "rare"):
-            words = f"{name} collides less than the baseline in {rows} scenarios"
-            found.append(Claim(words, name, "baseline", "where", rows=rows))
-        words = f"{name} collides less than weights as strong, dealt out by lot, in rare scenarios"
-        found.append(Claim(words, name, control_of(name), "where", rows="rare"))
-    for name in curated:
-        words = f"{name} fails less than the baseline"
-        found.append(Claim(words, name, "baseline", "failures", "accuracy"))
-    for one, other in (
-        ("ensemble", "heuristic"),
-        ("ensemble", "action_rarity"),
-        ("ensemble", "cql_bc"),
-        ("action_rarity", "heuristic"),
-    ):
-        found.append(Claim(f"{one} collides less than {other}", one, other, "methods"))
-    for name in ("heuristic", "ensemble", "action_rarity"):
-        whole = f"{name}_scenario"
-        words = f"{name} by step collides less at fault than by scenario"
-        found.append(Claim(words, name, whole, "methods", "at_fault_collision"))
-        words = f"{name} by scenario gets further than by step"
-        found.append(Claim(words, whole, name, "methods", "progress_ratio"))
-    return [claim for claim in found if claim.one in agents and claim.other in agents]
+def claims(arms: Sequence[str]) -> list[Claim]:
+    """Return the claims of the long-tail study about these arms."""
+    return [claim for claim in LONGTAIL.claims if claim.one in arms and claim.other in arms]
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedClaim:
     """A claim and what became of it.
 
     Attributes:
         claim: The claim.
-        found: What is tested against 0: the difference, one agent minus the other; of a claim about a size the
+        found: What is tested against 0: the difference, one arm minus the other; of a claim about a size the
             logarithm of the ratio over the claimed one. None where a kind of scenario, or a ratio, does not exist.
         difference: The difference.
         change: The relative change with its interval, where there is one.
@@ -175,26 +150,26 @@ class Judged:
 
 
 def judge(
-    driven: Mapping[str, Driven],
+    episodes: Mapping[str, Episodes],
     clusters: Sequence[str],
     rare: Rows,
-    agents: Sequence[str],
+    arms: Sequence[str],
     share: float | None = None,
-) -> list[Judged]:
+) -> list[JudgedClaim]:
     """Judges every claim.
 
     Args:
-        driven: What every agent did, by metric.
+        episodes: What every arm did, by metric.
         clusters: Recording of every scenario.
         rare: Which scenarios are rare.
-        agents: Whom claims are about.
+        arms: Whom claims are about.
         share: Of rare scenarios in ordinary traffic (:func:`counts`).
     """
     labels = np.asarray(clusters)
-    made = []
-    for claim in claims(agents):
+    tested = []
+    for claim in claims(arms):
         weights = counts(claim.rows, rare, share)
-        one, other = (driven[name][claim.metric] for name in (claim.one, claim.other))
+        one, other = (episodes[name][claim.metric] for name in (claim.one, claim.other))
         difference = ratio = None
         if _several(np.concatenate([one, other]), labels, weights):
             difference = crossed_difference(one, other, labels, weights)
@@ -202,16 +177,16 @@ def judge(
         found = difference
         if claim.change is not None:
             found = ratio and replace(ratio, difference=ratio.difference - math.log1p(claim.change))
-        made.append((claim, found, difference, ratio))
-    groups = [claim.group for claim, *_ in made]
+        tested.append((claim, found, difference, ratio))
+    groups = [claim.group for claim, *_ in tested]
     adjusted: dict[int, float | None] = {}
     for group in set(groups):
         places = [place for place, name in enumerate(groups) if name == group]
-        ps = holm([None if made[place][1] is None else made[place][1].p for place in places])
+        ps = holm([None if tested[place][1] is None else tested[place][1].p for place in places])
         adjusted |= dict(zip(places, ps, strict=True))
     return [
         _judged(claim, found, difference, ratio, adjusted[place], groups.count(claim.group))
-        for place, (claim, found, difference, ratio) in enumerate(made)
+        for place, (claim, found, difference, ratio) in enumerate(tested)
     ]
 
 
@@ -222,19 +197,19 @@ def _judged(
     ratio: Crossed | None,
     p: float | None,
     together: int,
-) -> Judged:
+) -> JudgedClaim:
     change = None
     if ratio is not None:
         low, high = ratio.interval()
         change = (math.expm1(ratio.difference), math.expm1(low), math.expm1(high))
     if found is None or p is None:
         why = "there are no such scenarios" if difference is None else "one of them never collides: no ratio"
-        return Judged(claim, found, difference, change, p, "undecided", why)
+        return JudgedClaim(claim, found, difference, change, p, "undecided", why)
     verdict: Verdict = "undecided"
     if p < _LEVEL:
         verdict = "supported" if METRICS[claim.metric] * found.difference > 0 else "contradicted"
     words = "" if verdict != "undecided" else needed(found, together)
-    return Judged(claim, found, difference, change, p, verdict, words)
+    return JudgedClaim(claim, found, difference, change, p, verdict, words)
 
 
 def needed(found: Crossed, together: int) -> str:
@@ -255,16 +230,21 @@ def needed(found: Crossed, together: int) -> str:
 
 
 def level(together: int) -> float:
-    """Confidence at which the first of so many claims is tested (Holm)."""
+    """Confidence at which the first of ``together`` claims is tested (Holm)."""
     return 1.0 - _LEVEL / together
 
 
 def detectable(
-    baseline: Driven, other: Driven, clusters: Sequence[str], rare: Rows, share: float | None, together: int
+    baseline: Episodes,
+    other: Episodes,
+    clusters: Sequence[str],
+    rare: Rows,
+    share: float | None,
+    together: int,
 ) -> dict[str, float]:
     """The smallest differences that a study finds with a probability of 80 %, known before the others learn.
 
-    As if two kinds of agents had seeds that vary as the baseline's, and differed by scenario as the baseline and ``bc``
+    As if two kinds of arms had seeds that vary as the baseline's, and differed by scenario as the baseline and ``bc``
     do; at the level of the first of the claims that are adjusted together.
 
     Args:
@@ -280,8 +260,8 @@ def detectable(
         if _several(np.concatenate([baseline[name], other[name]]), labels, weights):
             two = crossed_difference(baseline[name], other[name], labels, weights)
             (seeds, _), (both, _) = two.seeds, two.both
-            alike = replace(two, seeds=(seeds, seeds), both=(both, both))
-            found[name] = alike.detectable(confidence=level(together))
+            equal = replace(two, seeds=(seeds, seeds), both=(both, both))
+            found[name] = equal.detectable(confidence=level(together))
     return found
 
 
@@ -302,14 +282,14 @@ def counts(rows: str, rare: Rows, share: float | None) -> Counts:
 
 
 def _several(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> bool:
-    """Whether more than one recording counts in which everybody's value is defined."""
+    """Whether more than one recording counts in which all values are defined."""
     return np.unique(labels[(weights > 0.0) & ~np.isnan(values).any(axis=0)]).size > 1
 
 
 def rates(
-    driven: Driven, clusters: Sequence[str], rare: Rows, share: float | None = None
+    episodes: Episodes, clusters: Sequence[str], rare: Rows, share: float | None = None
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Of one agent: by kind of scenario and metric the mean over seeds and scenarios, with its interval.
+    """Of one arm: by kind of scenario and metric the mean over seeds and scenarios, with its interval.
 
     Metrics that hardly any scenario defines are left out.
     """
@@ -317,7 +297,7 @@ def rates(
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for kind in ("ordinary", "common", "rare"):
         weights = counts(kind, rare, share)
-        defined = {name: driven[name] for name in METRICS if _several(driven[name], labels, weights)}
+        defined = {name: episodes[name] for name in METRICS if _several(episodes[name], labels, weights)}
         if defined:
             found[kind] = {name: _rate(one, labels, weights) for name, one in defined.items()}
     return found
@@ -329,7 +309,7 @@ def _rate(values: Values, labels: np.ndarray[Any, Any], weights: Counts) -> dict
     return {"scenarios" if name == "n" else name: value for name, value in found.items()}
 
 
-def summary(judged: Judged) -> dict[str, Any]:
+def summary(judged: JudgedClaim) -> dict[str, Any]:
     """As plain values."""
     difference = judged.difference
     return {
@@ -345,7 +325,7 @@ def summary(judged: Judged) -> dict[str, Any]:
 
 
 def cost_of_rule(
-    chosen: Driven, best: Driven, clusters: Sequence[str], rare: Rows, share: float | None
+    chosen: Episodes, best: Episodes, clusters: Sequence[str], rare: Rows, share: float | None
 ) -> dict[str, Any]:
     """What other checkpoints of the very same runs cost, in pairs: by metric the difference and its interval.
 

@@ -1,8 +1,8 @@
 """The fixed splits of the built-in world that tables quote, together with the world's version.
 
 A map is drawn from (seed, number of the map), so sets of different seeds share no map. Each split has a seed of its
-own, from a range that ``generate`` refuses to users: nobody trains on a benchmark's maps by accident. Both domains
-have the same seeds, since the same draws make other roads there.
+own, from a range that ``generate`` refuses to users: training on a benchmark's maps by accident is impossible. Both
+domains have the same seeds, since the same draws make other roads there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from drivax.synthetic.generate import (
     GeneratedSet,
     Generation,
     Progress,
-    written,
+    write_set,
 )
 from drivax.synthetic.world import WorldConfig
 
@@ -74,7 +74,7 @@ def generate_benchmark(
     progress: Progress | None = None,
     audit: Audit | None = None,
 ) -> dict[str, GeneratedSet]:
-    """Writes ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
+    """Write ``OUT/train``, ``OUT/validation``, ``OUT/test`` and ``OUT/test-rare``.
 
     Args:
         out: A folder.
@@ -95,7 +95,7 @@ def generate_benchmark(
         )
     counts, done = sizes(train), 0
     total = sum(counts.values())
-    made: dict[str, GeneratedSet] = {}
+    sets: dict[str, GeneratedSet] = {}
     for name, split in SPLITS.items():
         world = options.world
         if split.rare_rate is not None:
@@ -103,18 +103,18 @@ def generate_benchmark(
         notes = {"benchmark": BENCHMARK_VERSION, "split": name}
         before = done
 
-        def further(here: int, _: int, before: int = before) -> None:
+        def report(here: int, _: int, before: int = before) -> None:
             if progress is not None:
                 progress(before + here, total)
 
-        made[name] = written(
+        sets[name] = write_set(
             Path(out) / name,
             counts[name],
             split.seed,
             dataclasses.replace(options, world=world),
             notes,
-            further,
+            report,
             audit,
         )
         done += counts[name]
-    return made
+    return sets

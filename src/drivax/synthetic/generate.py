@@ -8,12 +8,14 @@ audit that needs it is handed in.
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import os
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,13 +24,37 @@ from drivax.errors import DrivaxError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES, Scenario
 from drivax.scenario.store import ScenarioWriter
-from drivax.synthetic.portable import portable_workers
 from drivax.synthetic.world import UNSUITED, WORLD_VERSION, WorldConfig, generate_one
 from drivax.tracking.workers import await_interrupt, worker_pool
 
+#: What NumPy was built for beyond the oldest processor, and what of it this one has.
+_umath = importlib.import_module("numpy._core._multiarray_umath")
+#: Tells NumPy which of them to leave alone.
+_FEATURES = "NPY_DISABLE_CPU_FEATURES"
+
+
+@contextmanager
+def portable_workers() -> Iterator[None]:
+    """Start worker processes within that compute the same bits on any x86-64 processor."""
+    # Features disabled in this process are missing here, but workers would use them.
+    disabled = os.environ.get(_FEATURES, "").split()
+    newer = [name for name in _umath.__cpu_dispatch__ if _umath.__cpu_features__[name] or name in disabled]
+    settings = {_FEATURES: " ".join(newer), "OPENBLAS_CORETYPE": "Prescott"}
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
 #: Scenarios that are audited together, and that a worker draws at a time.
 _BATCH, _CHUNK = 64, 4
-#: Chunks per worker that may wait to be written: so many keep workers busy while the audit is compiled.
+#: Finished chunks per worker that may wait: enough to keep workers busy while the audit compiles.
 _AHEAD = 12
 _EVENT = "event"
 
@@ -59,7 +85,7 @@ class Generation:
     world: WorldConfig = field(default_factory=WorldConfig)
 
     def check(self) -> None:
-        """Refuses options that cannot be meant.
+        """Check the options.
 
         Raises:
             UsageError: The first of them.
@@ -75,12 +101,12 @@ class Generation:
 
 @dataclass(frozen=True)
 class FamilyCount:
-    """How the draws of one family went.
+    """Counts of one road family.
 
     Attributes:
         kept: Scenarios.
         rejected: Draws that were thrown away because of what ego or others did, by cause.
-        unsuited: Draws that gave no occasion for the event that was wanted.
+        unsuited: Draws in which the requested event could not happen.
         events: How many of the scenarios have which labelled event.
     """
 
@@ -107,7 +133,7 @@ class GeneratedSet:
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _Draw:
     scenario: Scenario
     family: str
     rejected: dict[tuple[str, str], int]
@@ -122,15 +148,15 @@ class _Counts:
         self._rejected: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._events: defaultdict[str, Counter[str]] = defaultdict(Counter)
 
-    def add(self, one: _Drawn) -> None:
-        self._kept[one.family] += 1
-        for (family, cause), times in one.rejected.items():
+    def add(self, draw: _Draw) -> None:
+        self._kept[draw.family] += 1
+        for (family, cause), times in draw.rejected.items():
             if cause in UNSUITED:
                 self._unsuited[family] += times
             else:
                 self._rejected[family][cause] += times
-        if _EVENT in one.scenario.tags:
-            self._events[one.family][one.scenario.tags[_EVENT]] += 1
+        if _EVENT in draw.scenario.tags:
+            self._events[draw.family][draw.scenario.tags[_EVENT]] += 1
 
     def families(self) -> dict[str, FamilyCount]:
         """Sorted by name; also those of which no draw was kept."""
@@ -150,7 +176,7 @@ def generate(
     progress: Progress | None = None,
     audit: Audit | None = None,
 ) -> GeneratedSet:
-    """Generates a scenario set.
+    """Generate a scenario set.
 
     Args:
         out: The scenario set to write; it appears when it is complete.
@@ -169,10 +195,10 @@ def generate(
         raise UsageError(f"scenarios is {scenarios}", cure="use 1 or more")
     if not 0 <= seed < RESERVED_SEED:
         raise UsageError(f"seed is {seed}", cure=f"use 0 to {RESERVED_SEED - 1:,}".replace(",", ""))
-    return written(out, scenarios, seed, options, {}, progress, audit)
+    return write_set(out, scenarios, seed, options, {}, progress, audit)
 
 
-def written(
+def write_set(
     out: str | Path,
     scenarios: int,
     seed: int,
@@ -189,11 +215,11 @@ def written(
     batch: list[Scenario] = []
     with (
         ScenarioWriter(out, CAPACITIES[options.capacity], source, overwrite=options.overwrite) as writer,
-        closing(_drawn(scenarios, seed, options)) as drawn,
+        closing(_draws(scenarios, seed, options)) as draws,
     ):
-        for done, one in enumerate(drawn, start=1):
-            counts.add(one)
-            batch.append(one.scenario)
+        for done, draw in enumerate(draws, start=1):
+            counts.add(draw)
+            batch.append(draw.scenario)
             if len(batch) == _BATCH or done == scenarios:
                 _write(writer, batch, audit)
                 batch = []
@@ -208,29 +234,29 @@ def _write(writer: ScenarioWriter, batch: list[Scenario], audit: Audit | None) -
         writer.add(dataclasses.replace(scenario, audit={**scenario.audit, **finding}))
 
 
-def _draw(first: int, last: int, seed: int, options: Generation) -> list[_Drawn]:
+def _draw_chunk(first: int, last: int, seed: int, options: Generation) -> list[_Draw]:
     """Scenarios ``first`` to ``last - 1``; runs in workers."""
     capacity, result = CAPACITIES[options.capacity], []
     for index in range(first, last):
-        one = generate_one(seed, index, options.world)
-        scenario = assemble(one.recording, capacity)
-        result.append(_Drawn(scenario, one.family, one.rejected))
+        draw = generate_one(seed, index, options.world)
+        scenario = assemble(draw.recording, capacity)
+        result.append(_Draw(scenario, draw.family, draw.rejected))
     return result
 
 
-def _drawn(scenarios: int, seed: int, options: Generation) -> Generator[_Drawn, None, None]:
+def _draws(scenarios: int, seed: int, options: Generation) -> Generator[_Draw, None, None]:
     """All scenarios in order."""
     spans = [(at, min(at + _CHUNK, scenarios)) for at in range(0, scenarios, _CHUNK)]
     if options.workers == 0:
         for first, last in spans:
-            yield from _draw(first, last, seed, options)
+            yield from _draw_chunk(first, last, seed, options)
         return
     pool = worker_pool(min(options.workers, len(spans)))
-    waiting: deque[Future[list[_Drawn]]] = deque()
+    waiting: deque[Future[list[_Draw]]] = deque()
     try:
         for first, last in spans:
             with portable_workers():  # processes are started as they are needed
-                waiting.append(pool.submit(_draw, first, last, seed, options))
+                waiting.append(pool.submit(_draw_chunk, first, last, seed, options))
             if len(waiting) > _AHEAD * options.workers:
                 yield from waiting.popleft().result()
         while waiting:

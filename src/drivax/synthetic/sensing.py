@@ -1,4 +1,4 @@
-"""What ego's sensors would see of the others, and how exactly: lines of sight, and the tremble of recorded tracks."""
+"""Visibility of other users from ego, and measurement noise of recorded tracks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Tracks
 from drivax.scenario.schema import AgentKind
 
-#: Users that move slower than this tremble less, m/s; those that stand by this share of the full noise.
+#: Noise falls below this speed, m/s, to this share at standstill.
 _FULL_NOISE_MPS, _STANDING_SHARE = 2.0, 0.25
-#: No error is larger than this many standard deviations, so that nobody is pushed into somebody else.
+#: Errors are clipped at this many standard deviations: noise must not make users overlap.
 _MOST_SIGMA = 3.0
-#: Looks at others that are traced together.
+#: Lines of sight per batch.
 _LOOKS = 512
 
 
@@ -43,7 +43,7 @@ class SensorConfig:
     above_roof_m: float = 0.2
 
     def check(self) -> None:
-        """Refuses what cannot be meant.
+        """Check the settings.
 
         Raises:
             UsageError: The first wrong setting.
@@ -77,7 +77,7 @@ class NoiseConfig:
     speed_correlation: float = 0.0
 
     def check(self) -> None:
-        """Refuses what cannot be meant.
+        """Check the settings.
 
         Raises:
             UsageError: The first wrong setting.
@@ -89,7 +89,7 @@ class NoiseConfig:
 
 
 def sight(tracks: Tracks, ego: int, config: SensorConfig) -> Bool[np.ndarray, "track time"]:
-    """Which steps of which tracks ego's sensor sees (:func:`visible`); vehicles hide what is behind them.
+    """Return the visibility mask of tracks (:func:`visible`); vehicles occlude what is behind them.
 
     Args:
         tracks: The truth.
@@ -114,7 +114,7 @@ def visible(
     blocks: Bool[np.ndarray, " user"],
     config: SensorConfig,
 ) -> Bool[np.ndarray, "user time"]:
-    """Which users ego's sensor sees: those in range of whom a corner or the centre lies in free view.
+    """Return which users ego's sensor sees: in range, with a corner or the centre in free view.
 
     Rays run in space, from the sensor to half the height of the other's box. Another user's box hides what is behind
     it where the ray passes below its roof.
@@ -123,7 +123,7 @@ def visible(
         box: ``geometry.boxes`` of all users; row 0 is ego.
         height_m: Of the boxes, all standing on level ground.
         valid: Which users are there.
-        blocks: Users that can hide somebody: vehicles; people are too slim.
+        blocks: Users that can occlude others: vehicles only.
         config: The sensor.
 
     Returns:
@@ -140,7 +140,7 @@ def visible(
         return seen
     points = np.concatenate((corners(box[target, step]), box[target, step, None, :2]), axis=1)
     hidden = np.zeros(points.shape[:2], bool)
-    row, other = _in_the_way(box, valid & blocks[:, None], target, step)
+    row, other = _occluders(box, valid & blocks[:, None], target, step)
     eye = height_m[0] + config.above_roof_m
     cut = _cuts(
         box[0, step[row], :2],
@@ -154,42 +154,42 @@ def visible(
     return seen
 
 
-def _in_the_way(
+def _occluders(
     box: Float64[np.ndarray, "user time 6"],
     blocking: Bool[np.ndarray, "user time"],
     target: Int64[np.ndarray, " look"],
     step: Int64[np.ndarray, " look"],
 ) -> tuple[Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]]:
-    """Pairs of a look at somebody and a user whose circumscribed circle meets the stripe between the two."""
+    """Pairs of a line of sight and a user whose circumscribed circle meets it."""
     offset = box[..., :2] - box[:1, :, :2]
     x, y = (np.ascontiguousarray(offset[..., k]) for k in (0, 1))
     ray_x, ray_y = x[target, step], y[target, step]
     length = np.maximum(np.hypot(ray_x, ray_y), 1e-9)
     ray_x, ray_y = ray_x / length, ray_y / length
     radius = np.hypot(box[..., LENGTH], box[..., WIDTH]).max(axis=1) / 2
-    # Who never comes near to any ray hides nobody.
+    # Users far from all rays cannot occlude.
     farthest = length.max() + 2.0 * (radius.max() + radius)
     near = (blocking & (x**2 + y**2 < farthest[:, None] ** 2)).any(axis=1)
     near[0] = False
-    who = np.flatnonzero(near)
+    near_rows = np.flatnonzero(near)
     pairs = []
-    # So few looks at a time that the tables stay in the processor's cache.
+    # Batches keep the tables in the processor's cache.
     for first in range(0, len(target), _LOOKS):
-        part = slice(first, first + _LOOKS)
-        at, to, ax, ay = step[part], target[part], ray_x[part], ray_y[part]
-        to_x, to_y = x[who].take(at, axis=1), y[who].take(at, axis=1)
+        batch = slice(first, first + _LOOKS)
+        at, to, ax, ay = step[batch], target[batch], ray_x[batch], ray_y[batch]
+        to_x, to_y = x[near_rows].take(at, axis=1), y[near_rows].take(at, axis=1)
         ahead = to_x * ax + to_y * ay
         to_y *= ax
         to_x *= ay
         to_y -= to_x
-        reach = radius[who, None] + radius[to]
-        meets = blocking[who].take(at, axis=1) & (np.abs(to_y, out=to_y) < reach)
-        meets &= ahead > -radius[who, None]
-        reach += length[part]
+        reach = radius[near_rows, None] + radius[to]
+        meets = blocking[near_rows].take(at, axis=1) & (np.abs(to_y, out=to_y) < reach)
+        meets &= ahead > -radius[near_rows, None]
+        reach += length[batch]
         meets &= ahead < reach
-        meets &= who[:, None] != to
+        meets &= near_rows[:, None] != to
         other, row = np.nonzero(meets)
-        pairs.append((row + first, who[other]))
+        pairs.append((row + first, near_rows[other]))
     row, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return row, other
 
@@ -208,8 +208,8 @@ def _cuts(
     return (enters < leaves) & (lowest < top_m[:, None])
 
 
-def farthest_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
-    """How far :func:`noisy` can move a corner of a box: all errors at their largest, and with the worse signs.
+def largest_shift_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
+    """Return how far :func:`noisy` can move a corner of a box at most, m.
 
     Args:
         config: How large the errors are.
@@ -225,8 +225,8 @@ def farthest_m(config: NoiseConfig, length_m: float, width_m: float) -> float:
 def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfig) -> Tracks:
     """Tracks as a perception system would have recorded them; ego's own row is exact.
 
-    Errors are AR(1) processes of zero mean, at most three standard deviations large. Who stands keeps speed 0 and
-    trembles by a few millimetres. Sizes are left alone.
+    Errors are zero-mean AR(1) processes, clipped at three standard deviations. Standing users keep speed 0 and jitter
+    by a few millimetres. Sizes are exact.
 
     Args:
         tracks: The truth.
@@ -243,12 +243,12 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
     deviations = (config.along_m, config.across_m, config.heading_rad, config.speed_mps)
     correlations = (config.position_correlation,) * 2 + (config.heading_correlation, config.speed_correlation)
     along, across, turn, faster = (
-        config.level * sigma * share * _tremble(tracks.valid.shape, correlation, rng)
+        config.level * sigma * share * _jitter(tracks.valid.shape, correlation, rng)
         for sigma, correlation in zip(deviations, correlations, strict=True)
     )
     cos, sin = np.cos(tracks.heading), np.sin(tracks.heading)
     heading = np.where(tracks.valid, wrap(tracks.heading + turn), 0.0)
-    # A standing user is not seen to move, and nobody is seen to change direction.
+    # Noise neither moves standing users nor reverses moving ones.
     speed = np.sign(speed) * np.maximum(np.abs(speed) + np.where(np.abs(speed) > 0.0, faster, 0.0), 0.0)
     velocity = speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     heading[ego], velocity[ego] = tracks.heading[ego], tracks.velocity[ego]
@@ -260,7 +260,7 @@ def noisy(tracks: Tracks, ego: int, rng: np.random.Generator, config: NoiseConfi
     )
 
 
-def _tremble(
+def _jitter(
     shape: tuple[int, ...], correlation: float, rng: np.random.Generator
 ) -> Float64[np.ndarray, "track time"]:
     """Unit-variance AR(1) noise x(t+1) = c x(t) + sqrt(1 - c^2) e(t), stationary from the first step on."""

@@ -36,11 +36,10 @@ from drivax.synthetic.expert.violations import EGO_SKIN_M
 from drivax.synthetic.roads.families import RoadFamily
 from drivax.synthetic.roads.network import RoadNetwork, feature_id, map_features
 from drivax.synthetic.roads.signals import light_states
-from drivax.synthetic.sensing import NoiseConfig, SensorConfig, farthest_m, noisy, sight
-from drivax.synthetic.traffic.conflicts import met_on
+from drivax.synthetic.sensing import NoiseConfig, SensorConfig, largest_shift_m, noisy, sight
 from drivax.synthetic.traffic.population import LONGEST_M
-from drivax.synthetic.traffic.role_assignment import SignalTiming, draw_cast
-from drivax.synthetic.traffic.roles import Cast, Motion, Staging
+from drivax.synthetic.traffic.role_assignment import SignalTiming, assign_roles, conflicts_on
+from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 from drivax.synthetic.traffic.simulation import Traffic
 
 #: Raised whenever the same seed gives another world; part of every scenario id.
@@ -48,7 +47,7 @@ WORLD_VERSION = 2
 #: Traffic runs this long before the recording begins, s.
 _WARM_UP_S = 4.0
 _WARM_UP = round(_WARM_UP_S / DT_S)
-#: A recording of a critical moment begins so early or so much later, and at one of every so many steps.
+#: Candidate first steps of a critical recording: earliest, latest delay, stride.
 _EARLIEST, _LATER, _EVERY = 28, 16, 4
 #: Ego may act on an event this many steps before it begins.
 _FORESEEN = 8
@@ -56,23 +55,23 @@ _FORESEEN = 8
 _LIGHTS_M = 95.0
 #: Draws before a scenario is given up, draws on one map, and draws before a kind of event is given up.
 _ATTEMPTS, _PER_MAP, _PER_KIND = 400, 12, 60
-#: Causes that say nothing against anybody's driving: the event that was wanted cannot happen, or comes to nothing.
+#: Causes that are no driving violation: the requested event cannot happen, or has no effect.
 UNSUITED = ("no_occasion", "no_threat")
-#: Events that are tried with the same cast.
+#: Events that are tried with the same roles.
 _STAGINGS = 3
-#: Of the others, so many that come nearest to ego are recorded.
+#: Number of recorded users, nearest to ego first.
 _RECORDED = 76
 
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """What the world is like.
+    """Settings of the world.
 
     Attributes:
         domain: Name of the domain (``grid`` or ``ring``), a tag of every scenario.
         rare_rate: Share of scenarios in which a rare event is staged.
-        critical_share: Share of the others in which ego's way leads it where it has to give way, if the roads have
-            such a place; they are recorded from when on somebody comes, if somebody does.
+        critical_share: Share of the others in which ego's route leads where it must give way, if the roads allow it;
+            the recording begins when another user approaches.
         lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
         signal_timing: Shares of what the light does for ego: green on arrival, turning green, turning red.
         scenarios_per_map: How many scenarios, one after the other, take place on the same roads; they share a segment.
@@ -90,7 +89,7 @@ class WorldConfig:
     sensor: SensorConfig = field(default_factory=SensorConfig)
 
     def check(self) -> Domain:
-        """Refuses what cannot be meant; returns the domain.
+        """Check the settings and return the domain.
 
         Raises:
             UsageError: The first wrong setting.
@@ -108,7 +107,7 @@ class WorldConfig:
         self.sensor.check()
         if self.scenarios_per_map < 1:
             raise UsageError(f"scenarios_per_map is {self.scenarios_per_map}", cure="use 1 or more")
-        if farthest_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
+        if largest_shift_m(self.noise, *LONGEST_M) > EGO_SKIN_M:
             raise UsageError(
                 f"noise.level {self.noise.level} could make a recorded vehicle touch ego that did not",
                 cure="use a smaller one",
@@ -118,7 +117,7 @@ class WorldConfig:
 
 @dataclass(frozen=True)
 class Generated:
-    """A recording and how it came about.
+    """A recording with its origin.
 
     Attributes:
         recording: The log.
@@ -134,7 +133,7 @@ class Generated:
 
 
 def generate_recording(seed: int, index: int, config: WorldConfig | None = None) -> Recording:
-    """The recording of this seed and index.
+    """Generate the recording of a seed and index.
 
     Args:
         seed: Seed of the set, not negative.
@@ -145,7 +144,7 @@ def generate_recording(seed: int, index: int, config: WorldConfig | None = None)
 
 
 def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
-    """Like :func:`generate_recording`, and tells the family and what was rejected.
+    """Generate a recording with its family and rejected attempts.
 
     Whether a scenario is rare, and the kind of its event, are drawn first, so that no kind is rarer because its draws
     fail more often. A rare scenario has roads of its own, and others where those give no occasion for its event.
@@ -219,55 +218,57 @@ class _Draw:
 
 
 def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Generator) -> Recording | str:
-    """One draw: the recording, or why it was thrown away."""
+    """Return the recording of one draw, or the cause of its rejection."""
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
-    cast = draw_cast(
+    roles = assign_roles(
         draw.network, domain, times, config.lane_change_share, config.signal_timing, rng, draw.aims, critical
     )
-    traffic = Traffic(cast, times)
+    traffic = Traffic(roles, times)
     if not draw.event:
         motion, first = traffic.run(), None
         if critical:
             first = _critical_step(traffic, motion, rng)
         begin, tags = first or _WARM_UP, {} if first is None else {"critical": "yes"}
         traffic, motion = traffic.until(begin + STEPS), motion.until(begin + STEPS)
-        motion, cause = expert.drive(cast, traffic.times_s, Staging(), begin, traffic.run, begun=motion)
-        return cause or _perceived(replace(_recorded(cast, motion, begin, None), tags=tags), config, rng)
-    scene, cause = Scene(cast, traffic.run(), _WARM_UP), UNSUITED[0]
+        motion, cause = expert.drive_ego(
+            roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
+        )
+        return cause or _perceived(replace(_recorded(roles, motion, begin, None), tags=tags), config, rng)
+    scene, cause = Scene(roles, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
         staged = stage(draw.event, scene, draw.severity_mps2, rng)
         if staged is None:
             break
         # Ego may foresee an event a little: an attentive driver sees it coming.
         aware = staged.first_step - _FORESEEN
-        motion, cause = expert.drive(cast, times, staged.staging, _WARM_UP, traffic.run, aware)
+        motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
         if not cause and threatens(scene, motion, staged):
-            return _perceived(_recorded(cast, motion, _WARM_UP, staged), config, rng)
+            return _perceived(_recorded(roles, motion, _WARM_UP, staged), config, rng)
         cause = cause or UNSUITED[1]
     return cause
 
 
 def _perceived(recording: Recording, config: WorldConfig, rng: np.random.Generator) -> Recording:
-    """With the errors of a perception system, and the mask of what ego's sensors see."""
+    """Add perception noise and the visibility mask."""
     tracks, ego = recording.tracks, recording.ego
-    seen = sight(tracks, ego, config.sensor)
-    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=seen)
+    visible = sight(tracks, ego, config.sensor)
+    return replace(recording, tracks=noisy(tracks, ego, rng, config.noise), seen=visible)
 
 
 def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -> int | None:
-    """Where a recording begins in which ego has to give way, if there is such a step."""
-    network = traffic.cast.network
-    if not met_on(network, motion.paths[0]):
+    """Draw the first step of a recording in which ego has to give way, if there is one."""
+    network = traffic.roles.network
+    if not conflicts_on(network, motion.paths[0]):
         return None
     steps = np.arange(_EARLIEST, _WARM_UP + _LATER + 1, _EVERY)
-    found = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
-    return int(steps[rng.choice(found)]) if len(found) else None
+    candidates = np.flatnonzero(critical_steps(network, motion, traffic.colour, steps))
+    return int(steps[rng.choice(candidates)]) if len(candidates) else None
 
 
-def _recorded(cast: Cast, motion: Motion, first: int, staged: Staged | None) -> Recording:
+def _recorded(roles: Roles, motion: Motion, first: int, staged: Staged | None) -> Recording:
     """The log from a step on, without names."""
-    network, motion = cast.network, motion.since(first)
+    network, motion = roles.network, motion.since(first)
     times = np.arange(STEPS) * DT_S
     lights: tuple[Light, ...] = ()
     if network.signals is not None:
@@ -310,7 +311,7 @@ def _recorded(cast: Cast, motion: Motion, first: int, staged: Staged | None) -> 
 
 
 def _route(motion: Motion) -> tuple[int, ...]:
-    """The lanes that ego drove and would go on to, each once."""
+    """Return the lanes of ego's path, each once."""
     return tuple(dict.fromkeys(span.lane for span in motion.paths[0].spans))
 
 
@@ -319,23 +320,23 @@ def _track_id(user: int) -> int:
 
 
 def _tracks(motion: Motion, actors: tuple[int, ...]) -> Tracks:
-    """Ego, the actors of an event and the nearest others; zeros where they were not."""
+    """Return tracks of ego, an event's actors and the nearest others; zeros where invalid."""
     valid = motion.valid
     apart = np.hypot(*np.moveaxis(motion.xy - motion.xy[:1], -1, 0))
     nearest = np.where(valid, apart, np.inf).min(axis=1)
     nearest[[0, *actors]] = -1.0
-    seen = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
-    seen = seen[np.isfinite(nearest[seen])]
-    valid = valid[seen]
-    heading = np.where(valid, wrap(motion.heading[seen]), 0.0)
-    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[seen], 0.0)
+    nearest_rows = np.sort(np.argsort(nearest, kind="stable")[: _RECORDED + 1])
+    nearest_rows = nearest_rows[np.isfinite(nearest[nearest_rows])]
+    valid = valid[nearest_rows]
+    heading = np.where(valid, wrap(motion.heading[nearest_rows]), 0.0)
+    speed: Float64[np.ndarray, "v t"] = np.where(valid, motion.speed[nearest_rows], 0.0)
     return Tracks(
-        xy=np.where(valid[..., None], motion.xy[seen], 0.0),
+        xy=np.where(valid[..., None], motion.xy[nearest_rows], 0.0),
         z=np.zeros(valid.shape),
         heading=heading,
         velocity=speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1),
-        size=np.where(valid[..., None], motion.size_m[seen, None], 0.0),
+        size=np.where(valid[..., None], motion.size_m[nearest_rows, None], 0.0),
         valid=valid,
-        kind=motion.kind[seen],
-        track_id=(seen + 1).astype(np.int64),
+        kind=motion.kind[nearest_rows],
+        track_id=(nearest_rows + 1).astype(np.int64),
     )

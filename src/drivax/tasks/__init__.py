@@ -1,1 +1,5 @@
-"""What makes it a learning problem: observations, rewards, action spaces, termination."""
+"""Driving tasks: action spaces, observations, rewards and termination."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,7 @@
-"""Free checks of a user's own terms: call one in a test; in one line it tells which rule is broken and how to mend it.
+"""Checks for users' own components: call one in a test; the error names the broken rule and the cure.
 
 ``check_reward``, ``check_metric``, ``check_feature``, ``check_traffic``, ``check_planner``, ``check_encoder`` and
-``check_algorithm`` take the term itself or its dotted name. Our own terms pass them too.
+``check_algorithm`` take an object or its dotted name. The built-in components pass them too.
 """
 
 from drivax.testing.algorithms import check_algorithm

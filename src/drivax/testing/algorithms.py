@@ -28,37 +28,36 @@ _ITERATIONS = 4
 
 
 def check_algorithm(config: AlgorithmConfig | str) -> None:
-    """Whether an algorithm keeps to the rules.
+    """Check an algorithm.
 
-    It builds a learner whose state is a pytree with ``parameters`` and ``iteration`` that keeps structure, shapes and
-    types; iterations are pure functions that give the same bit for bit, also when the state was stored in between;
-    they change the parameters and log finite numbers; and the planner drives within [-1, 1], by the mode always alike.
-    Give it small sizes: the check runs three iterations.
+    Its learner has a state with ``parameters`` and ``iteration`` of constant structure, shapes and types. Iterations
+    are pure, bit-for-bit repeatable after storing the state, change the parameters and log finite numbers. The planner
+    acts within [-1, 1], deterministically by the mode. Use small sizes: the check runs three iterations.
 
     Args:
         config: The algorithm's settings, or the dotted name of such a class or instance.
 
     Raises:
-        BrokenContract: It does not; the message says which rule and what to do.
+        BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    found: Any = find_named(config) if isinstance(config, str) else config
-    found = found() if isinstance(found, type) else found
-    what = f"algorithm {type(found).__name__}"
+    settings: Any = find_named(config) if isinstance(config, str) else config
+    settings = settings() if isinstance(settings, type) else settings
+    what = f"algorithm {type(settings).__name__}"
     expect(
-        isinstance(found, AlgorithmConfig),
+        isinstance(settings, AlgorithmConfig),
         f"{what} lacks build or steps_per_iteration",
         "see AlgorithmConfig",
     )
     expect(
-        isinstance(found.steps_per_iteration, int) and found.steps_per_iteration > 0,
-        f"{what} counts {found.steps_per_iteration!r} steps per iteration",
+        isinstance(settings.steps_per_iteration, int) and settings.steps_per_iteration > 0,
+        f"{what} counts {settings.steps_per_iteration!r} steps per iteration",
         "count environment steps as a whole number",
     )
     bank, simulator = worlds.worlds(), Simulator(_TASK)
     environment = Driving(simulator)
-    learner = found.build(environment, bank, _ITERATIONS)
+    learner = settings.build(environment, bank, _ITERATIONS)
     expect(isinstance(learner, Learner), f"{what} builds no Learner", "give it init, iterate and planner")
-    state = _check_iterations(what, learner, training_data(found, environment, bank))
+    state = _check_iterations(what, learner, training_data(settings, environment, bank))
     _check_planner(what, learner, bank, simulator, state.parameters)
 
 
@@ -66,17 +65,19 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     init, iterate = jax.jit(learner.init), jax.jit(learner.iterate, donate_argnums=1)
     first = init(data, jax.random.key(0))
     expect(
-        isinstance(first, LearnerState), f"{what} has a state without parameters or iteration", "name them so"
+        isinstance(first, LearnerState),
+        f"{what} has a state without parameters or iteration",
+        "add these fields",
     )
     expect(
         _forms(jax.eval_shape(learner.init, data, jax.random.key(1))) == _forms(first),
-        f"{what} has a state whose form depends on the key",
-        "let shapes follow from the configuration only",
+        f"{what} has a state whose shape depends on the key",
+        "let shapes depend on the configuration only",
     )
-    following, _ = jax.eval_shape(learner.iterate, data, first)
+    next_state, _ = jax.eval_shape(learner.iterate, data, first)
     expect(
-        _forms(following) == _forms(first),
-        f"{what} changes the form of its state in an iteration",
+        _forms(next_state) == _forms(first),
+        f"{what} changes the shape of its state in an iteration",
         "return the same record with the same shapes and types",
     )
     stored = _stored(first)
@@ -96,7 +97,7 @@ def _check_iterations(what: str, learner: Learner, data: Any) -> Any:
     expect(
         same(_numbers(again), _numbers(second), 0.0),
         f"{what} does not repeat an iteration bit for bit",
-        "keep keys and everything else that an iteration needs in the state",
+        "keep keys and all other inputs of an iteration in the state",
     )
     third, logs = iterate(data, second)
     _check_logs(what, logs)
@@ -126,15 +127,17 @@ def _check_planner(
     keys = jax.random.key(0), jax.random.key(1)
     for samples in (False, True):
         planner = learner.planner(parameters, "checked", samples)
-        expect(isinstance(planner, Planner), f"{what} makes no Planner", "see planners.planner.Planner")
-        one, other = (np.asarray(act(planner, bank, key)) for key in keys)
+        expect(isinstance(planner, Planner), f"{what} returns no Planner", "see planners.planner.Planner")
+        first, second = (np.asarray(act(planner, bank, key)) for key in keys)
         expect(
-            one.shape == (2,) and np.isfinite(one).all() and (np.abs(one) <= 1.0).all(),
-            f"{what} acts by {one}",
-            "give two numbers in [-1, 1]",
+            first.shape == (2,) and np.isfinite(first).all() and (np.abs(first) <= 1.0).all(),
+            f"{what} returns action {first}",
+            "return two numbers in [-1, 1]",
         )
         if not samples:
-            expect((one == other).all(), f"{what} acts at random by the mode", "use the key only to sample")
+            expect(
+                (first == second).all(), f"{what} uses randomness in its mode", "use the key only to sample"
+            )
 
 
 def _forms(tree: Any) -> Any:
@@ -143,12 +146,12 @@ def _forms(tree: Any) -> Any:
 
 
 def _stored(tree: Any) -> Any:
-    """A copy that a donated state does not take along."""
+    """Return a copy that survives donation of the state."""
     return jax.tree.map(jnp.copy, tree)
 
 
 def _numbers(tree: Any) -> Any:
-    """Random keys as numbers, everything on the host."""
+    """Return all leaves on the host, random keys as numbers."""
 
     def number(leaf: Any) -> Any:
         key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)

@@ -1,4 +1,4 @@
-"""What every check asks: the rules that any pure function of the graph keeps, and how a broken one is told."""
+"""Rules of pure functions that all checks share, and their error messages."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 
 from drivax.errors import DrivaxError
 
-#: Of what is compared: sums in another order, and maps that were turned in float32.
+#: Tolerances: sums in another order; maps rotated in float32.
 CLOSE, TURNED = 1e-4, 5e-3
-#: A threshold may fall on the other side in a turned world; more than this share of the moments means another thing.
+#: Share of moments at which a threshold may flip in a rotated world.
 _FLIPS = 0.05
 _PYTHON = (
     jax.errors.TracerBoolConversionError,
@@ -26,71 +26,68 @@ _PYTHON = (
 
 
 class BrokenContract(DrivaxError, AssertionError):
-    """A term of the user's own does not keep to a rule; one line that says which and what to do."""
+    """A component breaks a rule; one line with the rule and the cure."""
 
 
-def expect(kept: Any, problem: str, cure: str) -> None:
-    """Refuses what does not keep to a rule.
+def expect(condition: Any, problem: str, cure: str) -> None:
+    """Raise unless a condition holds.
 
     Raises:
-        BrokenContract: ``kept`` is false.
+        BrokenContract: ``condition`` is false.
     """
-    if not kept:
+    if not condition:
         raise BrokenContract(problem, cure=cure)
 
 
 @contextlib.contextmanager
-def _told(what: str) -> Iterator[None]:
-    """Tells in one line what JAX says of code that asks for the value of an array."""
+def _tracing_errors(what: str) -> Iterator[None]:
+    """Turn JAX's tracing errors into one line."""
     try:
         yield
     except _PYTHON as error:
         raise BrokenContract(
-            f"{what} cannot be compiled: it asks Python for the value of an array",
+            f"{what} cannot be compiled: Python needs the value of a traced array",
             cure="use jnp.where instead of if, and jnp instead of numpy, float() or int()",
         ) from error
 
 
 def compiled(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a function under ``jit``, freshly traced, as numpy arrays.
+    """Return the result of a function under ``jit``, freshly traced, as numpy arrays.
 
     Raises:
-        BrokenContract: It cannot be compiled.
+        BrokenContract: The function cannot be compiled.
     """
     return program(what, function)(*arguments)
 
 
 def program(what: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function under ``jit``, traced once for all arguments of one form, that gives numpy arrays.
-
-    It raises :class:`BrokenContract` where the function cannot be compiled.
-    """
+    """Return a jitted function with numpy results; calls raise :class:`BrokenContract` if it cannot be compiled."""
     run = jax.jit(lambda *values: function(*values))
 
     def call(*arguments: Any) -> Any:
-        with _told(what):
+        with _tracing_errors(what):
             return jax.device_get(run(*arguments))
 
     return call
 
 
 def forms(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Shapes and types of what a function gives.
+    """Return the shapes and types of a function's results.
 
     Raises:
-        BrokenContract: It cannot be compiled.
+        BrokenContract: The function cannot be compiled.
     """
-    with _told(what):
+    with _tracing_errors(what):
         return jax.eval_shape(function, *arguments)
 
 
 class Program:
-    """A function of one row, batched; compiled once for all arguments of one form.
+    """A function of one row, batched and compiled.
 
     Args:
-        what: What messages call it.
+        what: Name in messages.
         function: The function.
-        in_axes: 0 for arguments with rows, None for those that all rows share.
+        in_axes: 0 for batched arguments, None for shared ones.
     """
 
     def __init__(
@@ -104,40 +101,40 @@ class Program:
         return jax.jit(lambda *arguments: batched(*arguments))
 
     def __call__(self, *arguments: Any) -> Any:
-        """The results for all rows, as numpy arrays.
+        """Return the results for all rows as numpy arrays.
 
         Raises:
-            BrokenContract: It cannot be compiled.
+            BrokenContract: The function cannot be compiled.
         """
-        with _told(self.what):
+        with _tracing_errors(self.what):
             return jax.device_get(self._run(*arguments))
 
     def check_pure(self, *arguments: Any) -> Any:
-        """Whether it gives the same compiled or not, batched or not, and every time; and its results for all rows."""
+        """Check that results do not depend on compilation, batching or repetition, and return them."""
         what, results = self.what, self(*arguments)
         expect(
             same(results, jax.device_get(self._compiled()(*arguments)), 0.0),
-            f"{what} gives another result every time",
-            "take randomness from a key, and keep nothing between calls",
+            f"{what} is not deterministic",
+            "take randomness from a key, and keep no state between calls",
         )
         pairs = zip(arguments, self.in_axes, strict=True)
-        row = [one if axis is None else jax.tree.map(lambda leaf: leaf[0], one) for one, axis in pairs]
+        row = [value if axis is None else jax.tree.map(lambda leaf: leaf[0], value) for value, axis in pairs]
         first = jax.tree.map(lambda leaf: leaf[0], results)
         expect(
             same(first, compiled(what, self.function, *row), CLOSE),
-            f"{what} gives another result in a batch than alone",
-            "write it for one agent in one scenario; batches are made by vmap",
+            f"{what} differs in a batch",
+            "write it for one agent in one scenario; vmap adds the batch",
         )
         expect(
             same(first, jax.device_get(self.function(*row)), CLOSE),
-            f"{what} gives another result when it is compiled",
+            f"{what} differs when compiled",
             "let the result depend on the arguments only",
         )
         return results
 
 
 def check_numbers(what: str, values: Any, reads: str = "a division, a root or a logarithm") -> None:
-    """Whether everything is finite."""
+    """Check that all values are finite."""
     for leaf in jax.tree.leaves(values):
         broken = ~np.isfinite(leaf)
         if broken.any():
@@ -148,33 +145,33 @@ def check_numbers(what: str, values: Any, reads: str = "a division, a root or a 
             )
 
 
-def check_same(what: str, one: Any, other: Any, cause: str, cure: str) -> None:
-    """Whether two results agree at every moment.
+def check_same(what: str, result: Any, changed: Any, cause: str, cure: str) -> None:
+    """Check that two results agree at all moments.
 
     Raises:
-        BrokenContract: They do not; ``cause`` completes "changes when".
+        BrokenContract: They differ; ``cause`` completes "changes when".
     """
-    expect(same(one, other, CLOSE), f"{what} changes when {cause}", cure)
+    expect(same(result, changed, CLOSE), f"{what} changes when {cause}", cure)
 
 
-def check_turned(what: str, one: Any, other: Any) -> None:
-    """Whether the results of a turned world agree with those of the world, but for a few thresholds."""
-    close = np.ones(len(jax.tree.leaves(one)[0]), bool)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+def check_turned(what: str, result: Any, turned: Any) -> None:
+    """Check that results agree in a rotated and shifted world, except for a few thresholds."""
+    close = np.ones(len(jax.tree.leaves(result)[0]), bool)
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(turned), strict=True):
         near = np.isclose(a, b, rtol=TURNED, atol=TURNED)
         close &= near.reshape(len(close), -1).all(axis=1)
     expect(
         (~close).mean() <= _FLIPS,
-        f"{what} changes when the world is turned and shifted, at {int((~close).sum())} of {len(close)} moments",
+        f"{what} changes when the world is rotated and shifted, at {int((~close).sum())} of {len(close)} moments",
         "use the ego frame (tasks.observations.View), distances and differences of headings",
     )
 
 
-def same(one: Any, other: Any, tolerance: float) -> bool:
-    """Whether two trees hold the same values: equal structure, shapes, and values within a tolerance."""
-    if jax.tree.structure(one) != jax.tree.structure(other):
+def same(left: Any, right: Any, tolerance: float) -> bool:
+    """Whether two trees have equal structure and shapes, and values within a tolerance."""
+    if jax.tree.structure(left) != jax.tree.structure(right):
         return False
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    pairs = zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True)
     return all(
         np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
         for a, b in pairs
@@ -182,10 +179,10 @@ def same(one: Any, other: Any, tolerance: float) -> bool:
 
 
 def check_scalar(what: str, value: Any) -> None:
-    """Whether every row gives one float32 number."""
+    """Check that each row is one float32 number."""
     leaf = np.asarray(value)
     expect(
         leaf.ndim == 1 and leaf.dtype == jnp.float32,
         f"{what} gives {leaf.dtype}{list(leaf.shape[1:])} instead of one float32 number",
-        "reduce it to a scalar, and turn booleans into numbers with .astype(jnp.float32)",
+        "reduce it to a scalar, and convert booleans with .astype(jnp.float32)",
     )

@@ -31,64 +31,66 @@ from drivax.testing.contract import (
 )
 from drivax.testing.terms import ANGLE
 
-#: Steps at which the planner takes over, and the one after whose successor another story is told.
-_LOOKS, _FORGETS = (12, 20, 28, 36, 45, 52, 60, 70), 45
+#: Steps at which the planner starts; step after whose successor the log is changed.
+_STARTS, _CHANGES = (12, 20, 28, 36, 45, 52, 60, 70), 45
 
 
 def check_planner(planner: Planner | str, *, task: Task | None = None, privileged: bool = False) -> None:
-    """Whether a planner keeps to the rules.
+    """Check a planner.
 
-    Its actions are finite and have the size of the task's; what it carries keeps its form; it does the same batched or
-    alone and every time; and its actions do not change with the turn and place of the world, the order of the agents,
-    padding, what rows hold where nobody is, or what the log holds of the future.
+    Its actions are finite and have the task's shape; its carry keeps its shape. Actions do not depend on batching,
+    repetition, rotation and shift of the world, the order of agents, padding, rows of absent agents, or the log's
+    future.
 
     Args:
         planner: The planner, its name, or its dotted name.
-        task: What it was made for; the default one otherwise.
-        privileged: It may look at the log's future.
+        task: The planner's task; the default task otherwise.
+        privileged: Whether it may read the log's future.
 
     Raises:
-        BrokenContract: It does not; the message says which rule and what to do.
+        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     planner = make_planner(planner) if isinstance(planner, str) else planner
     expect(
         isinstance(planner, Planner) and not isinstance(planner, type),
-        f"{planner!r} is no planner",
+        f"{planner!r} is not a planner",
         "give it name, replays, init and act (planners.planner.Planner)",
     )
     what = f"planner {planner.name!r}"
     simulator, bank = Simulator(judging(task or Task())), worlds.worlds()
     _check_forms(what, simulator, planner, bank)
-    index, step = (part.ravel() for part in np.meshgrid(np.arange(len(bank)), _LOOKS, indexing="ij"))
+    index, step = (part.ravel() for part in np.meshgrid(np.arange(len(bank)), _STARTS, indexing="ij"))
     program = Program(what, _driven(simulator, planner), (None, 0, 0))
-    asked = program(bank, index, step)
-    check_numbers(what, asked)
-    check_numbers(what, program(worlds.deserted(bank), index, step))
+    actions = program(bank, index, step)
+    check_numbers(what, actions)
+    check_numbers(what, program(worlds.without_others(bank), index, step))
     alone = compiled(what, _driven(simulator, planner), bank, jnp.asarray(index[0]), jnp.asarray(step[0]))
     expect(
-        same(asked[0], alone, CLOSE),
-        f"{what} acts otherwise in a batch than alone, or every time",
-        "write it for one agent in one scenario, take randomness from the key, and keep nothing between calls",
+        same(actions[0], alone, CLOSE),
+        f"{what} differs in a batch or is not deterministic",
+        "write it for one agent in one scenario, take randomness from the key, and keep no state between calls",
     )
 
-    def told(bank: ScenarioBank, cause: str, cure: str) -> None:
-        check_same(what, asked, program(bank, index, step), cause, cure)
+    def check_variant(bank: ScenarioBank, cause: str, cure: str) -> None:
+        check_same(what, actions, program(bank, index, step), cause, cure)
 
-    told(worlds.littered(bank), "rows hold something else where nobody is", "mask with frame.valid first")
-    told(worlds.shuffled(bank), "the agents stand in another order", "let nothing follow from a slot")
-    told(worlds.padded(bank), "there are more empty slots", "mask with frame.valid, also before a mean")
-    check_turned(what, asked, program(worlds.worlds(ANGLE), index, step))
+    check_variant(worlds.scattered(bank), "the rows of absent agents change", "mask with frame.valid first")
+    check_variant(worlds.shuffled(bank), "the order of agents changes", "let no action depend on a slot")
+    check_variant(worlds.padded(bank), "empty slots are added", "mask with frame.valid, also before a mean")
+    check_turned(what, actions, program(worlds.worlds(ANGLE), index, step))
     if not privileged:
-        at = np.full_like(step, _FORGETS)
+        at = np.full_like(step, _CHANGES)
         expect(
-            same(program(bank, index, at), program(worlds.forgotten(bank, _FORGETS + 1), index, at), CLOSE),
-            f"{what} changes when the log goes on in another way",
-            "look at nothing later than context.step, or say privileged=True",
+            same(
+                program(bank, index, at), program(worlds.other_future(bank, _CHANGES + 1), index, at), CLOSE
+            ),
+            f"{what} changes with the log's future",
+            "read nothing later than context.step, or pass privileged=True",
         )
 
 
 def _driven(simulator: Simulator, planner: Planner) -> Callable[..., Array]:
-    """The actions of two steps on end."""
+    """Return the actions of two consecutive steps."""
 
     def drive(bank: ScenarioBank, index: Any, step: Any) -> Array:
         state, key = simulator.reset(bank, index, step), jax.random.key(3)
@@ -110,7 +112,7 @@ def _act(
 
 
 def _check_forms(what: str, simulator: Simulator, planner: Planner, bank: ScenarioBank) -> None:
-    """Whether the action has its size, and the carry keeps its form."""
+    """Check the shape of action and carry."""
 
     def once(bank: ScenarioBank) -> Any:
         state = simulator.reset(bank, 0)
@@ -123,11 +125,11 @@ def _check_forms(what: str, simulator: Simulator, planner: Planner, bank: Scenar
             jax.tree.map(jnp.asarray, after),
         )
 
-    wanted, action, before, after = forms(what, once, bank)
+    expected, action, before, after = forms(what, once, bank)
     expect(
-        action.shape == wanted.shape and action.dtype == wanted.dtype,
+        action.shape == expected.shape and action.dtype == expected.dtype,
         f"{what} gives {action.dtype}{list(action.shape)} as an action",
-        f"give {wanted.dtype}{list(wanted.shape)}",
+        f"return {expected.dtype}{list(expected.shape)}",
     )
     carried = [
         (jax.tree.structure(carry), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(carry)])
@@ -135,6 +137,6 @@ def _check_forms(what: str, simulator: Simulator, planner: Planner, bank: Scenar
     ]
     expect(
         carried[0] == carried[1],
-        f"{what} changes the form of what it carries",
-        "return from act what init returned: the same structure, shapes and types",
+        f"{what} changes the shape of its carry",
+        "return from act the same structure, shapes and types as from init",
     )

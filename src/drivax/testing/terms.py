@@ -1,4 +1,4 @@
-"""Checks of what is read off measured moments: reward terms and metrics."""
+"""Checks of reward terms and metrics."""
 
 from __future__ import annotations
 
@@ -27,59 +27,59 @@ from drivax.testing.contract import (
 )
 from drivax.testing.worlds import Moments
 
-#: The angle by which worlds are turned.
+#: Rotation of worlds, rad.
 ANGLE = 1.3
 
 
 def check_reward(term: Term | str) -> None:
-    """Whether a reward term keeps to the rules.
+    """Check a reward term.
 
-    It is a pure function of facts before, facts now and surroundings; one finite float32 number; the same compiled or
-    not, batched or alone, every time; and unchanged by turning and shifting the world, by the order of the agents, by
-    padding, and by what rows hold where nobody is.
+    It is a pure function of facts before, facts now and surroundings, and one finite float32 number. It does not
+    depend on compilation, batching, rotation and shift of the world, the order of agents, padding, or rows of absent
+    agents.
 
     Args:
         term: The term, or its dotted name.
 
     Raises:
-        BrokenContract: It does not; the message says which rule and what to do.
+        BrokenContract: It breaks a rule; the message names rule and cure.
     """
-    found: Any = find_named(term) if isinstance(term, str) else term
-    found = found() if isinstance(found, type) else found
-    what = f"reward term {name_of(found)!r}"
+    function: Any = find_named(term) if isinstance(term, str) else term
+    function = function() if isinstance(function, type) else function
+    what = f"reward term {name_of(function)!r}"
 
     def value(moment: Moments) -> Any:
-        return found(moment.before, moment.found.facts, moment.found.surroundings)
+        return function(moment.before, moment.situation.facts, moment.situation.surroundings)
 
     _check_moments(what, value, check_scalar)
 
 
 def check_metric(metric: Metric | str) -> None:
-    """Whether a metric keeps to the rules.
+    """Check a metric.
 
-    Its step value is a number and whether it is defined, under the rules of :func:`check_reward` wherever it is
-    defined; it says all facts that it looks at; unit, direction and text are there; what it computes at the end of an
-    episode is a finite ``Value`` where it is defined.
+    Its step value is a number and whether it is defined, under the rules of :func:`check_reward` where it is defined.
+    It declares all facts that it reads, has unit, direction and text, and computes a finite ``Value`` at the end of an
+    episode where it is defined.
 
     Args:
         metric: The metric, or its dotted name.
 
     Raises:
-        BrokenContract: It does not; the message says which rule and what to do.
+        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     what = f"metric {metric!r}" if isinstance(metric, str) else f"metric {metric.definition!r}"
-    found: Any = find_named(metric) if isinstance(metric, str) else metric
-    expect(isinstance(found, Metric), f"{what} is not a Metric", "see metrics.catalogue.Metric")
+    spec: Any = find_named(metric) if isinstance(metric, str) else metric
+    expect(isinstance(spec, Metric), f"{what} is not a Metric", "see metrics.catalogue.Metric")
     expect(
-        found.unit and found.definition,
+        spec.unit and spec.definition,
         f"{what} has no unit or definition",
-        "tables and reports print them; '-' is the unit of shares",
+        "tables and reports print them; '-' is the unit of fractions",
     )
-    if found.step_value is not None:
-        step = found.step_value
+    if spec.step_value is not None:
+        step = spec.step_value
 
         def value(moment: Moments) -> tuple[Any, Any]:
-            now = Moment(moment.found, moment.start, jnp.ones((), bool))
+            now = Moment(moment.situation, moment.start, jnp.ones((), bool))
             number, defined = step.read(now)
             number = jnp.asarray(number)
             defined = jnp.broadcast_to(jnp.asarray(defined, bool), number.shape)
@@ -87,8 +87,8 @@ def check_metric(metric: Metric | str) -> None:
 
         _check_moments(what, value, check_scalar if not step.delayed else _check_rows)
         _check_reads(what, value, step.reads)
-    if found.compute is not None:
-        _check_computed(what, found)
+    if spec.compute is not None:
+        _check_computed(what, spec)
 
 
 def _check_moments(
@@ -97,16 +97,16 @@ def _check_moments(
     moments, program = worlds.moments(), Program(what, value)
     results = program.check_pure(moments)
     check_shape(what, results[0] if isinstance(results, tuple) else results)
-    frame = moments.found.surroundings.frame
+    frame = moments.situation.surroundings.frame
     check_numbers(what, results)
     check_numbers(what, program(worlds.extremes(moments)))
-    check_numbers(what, program(worlds.with_frame(moments, worlds.deserted_frame(frame))))
+    check_numbers(what, program(worlds.with_frame(moments, worlds.frame_without_others(frame))))
     variants = (
-        (worlds.littered_frame, "rows hold something else where nobody is", "mask with frame.valid first"),
-        (worlds.padded_frame, "there are more empty slots", "mask with frame.valid, also before a mean"),
+        (worlds.scattered_frame, "the rows of absent agents change", "mask with frame.valid first"),
+        (worlds.padded_frame, "empty slots are added", "mask with frame.valid, also before a mean"),
         (
             worlds.shuffled_frame,
-            "the agents stand in another order",
+            "the order of agents changes",
             "reduce over all of them; slot 0 is ego",
         ),
     )
@@ -118,24 +118,24 @@ def _check_moments(
 def _check_rows(what: str, value: Any) -> None:
     expect(
         np.asarray(value).ndim == 2,
-        f"{what} is judged late but gives no row of numbers",
-        "give one number and one mask entry per step that is judged",
+        f"{what} is delayed but returns no row of numbers",
+        "return one number and one mask entry per step",
     )
 
 
 def _check_reads(what: str, value: Callable[[Moments], Any], reads: frozenset[str]) -> None:
-    """Whether a value computes when the facts that it does not name are missing, as they are in a lean run."""
+    """Check that a value computes without the facts that it does not declare."""
     unknown = sorted(reads - FACTS - ON_REQUEST)
-    expect(not unknown, f"{what} reads {unknown[:1]}, which is no fact", "see simulator.types.Facts")
+    expect(not unknown, f"{what} reads unknown fact {unknown[:1]}", "see simulator.types.Facts")
     moments = worlds.without_facts(worlds.moments(), reads)
     try:
         Program(what, value)(moments)
     except (AttributeError, TypeError, ValueError) as error:
-        expect(False, f"{what} looks at a fact that 'reads' does not name ({error})", "name it there")
+        expect(False, f"{what} reads a fact that 'reads' does not declare ({error})", "add it to reads")
 
 
 def _check_computed(what: str, metric: Metric) -> None:
-    """What is computed at the end, for inputs from 0 to 1 that are defined or not."""
+    """Check what is computed at the end, for inputs from 0 to 1, defined and undefined."""
     compute = metric.compute
     assert compute is not None
     bank = worlds.worlds()

@@ -31,17 +31,17 @@ from drivax.testing.contract import (
 )
 from drivax.testing.terms import ANGLE
 
-#: Steps at which the models begin, and how many they go on.
-_BEGIN, _STEPS = 20, 12
-#: Nobody moves further in one step, m.
-_LEAP_M = 8.0
-#: What the state of one environment may take with traffic that reacts, bytes.
+#: First step and number of steps.
+_START, _STEPS = 20, 12
+#: Largest movement in one step, m.
+_JUMP_M = 8.0
+#: Largest state of one environment with reactive traffic, bytes.
 _STATE_BYTES = 16_000
 
 
 @record
 class _Seen:
-    """What a model said over some steps: rows now, the same one step later, and the ego that they are seen from."""
+    """Rows of a model over some steps: now, the same one step later, and the ego frame."""
 
     rows: Any
     remembered: Any
@@ -49,18 +49,17 @@ class _Seen:
 
 
 def check_traffic(traffic: Traffic | str) -> None:
-    """Whether a traffic model keeps to the rules.
+    """Check a traffic model.
 
-    Its state keeps its form and is small; its rows are those of ``bank.agents``: finite, unit directions, valid 0 or 1;
-    what it says of the past is what it said then; nobody leaps; it is the same compiled or not, batched or alone, every
-    time; and it does not change with the turn and place of the world, the order of the agents, padding, or what rows
-    hold where nobody is.
+    Its state keeps its shape and is small. Its rows are like ``bank.agents``: finite, unit directions, valid 0 or 1.
+    Past rows are repeated unchanged; no agent jumps. It does not depend on compilation, batching, rotation and shift
+    of the world, the order of agents, padding, or rows of absent agents.
 
     Args:
         traffic: The model, its name, or the dotted name of such a class.
 
     Raises:
-        BrokenContract: It does not; the message says which rule and what to do.
+        BrokenContract: It breaks a rule; the message names rule and cure.
     """
     traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
     what = f"traffic {traffic.name!r}"
@@ -71,43 +70,43 @@ def check_traffic(traffic: Traffic | str) -> None:
     _check_rows(what, seen)
     there = seen.rows[..., AgentColumn.VALID] > 0
 
-    def told(change: Callable[[ScenarioBank], ScenarioBank]) -> Any:
+    def rows_of(change: Callable[[ScenarioBank], ScenarioBank]) -> Any:
         return program(prepare_bank(traffic, change(worlds.worlds())), index).rows
 
-    check_numbers(what, told(worlds.deserted))
+    check_numbers(what, rows_of(worlds.without_others))
     known = np.where(there[..., None], seen.rows, 0.0)
-    littered = told(worlds.littered)
-    valid = littered[..., AgentColumn.VALID :] > 0
+    scattered = rows_of(worlds.scattered)
+    valid = scattered[..., AgentColumn.VALID :] > 0
     check_same(
         what,
         known,
-        np.where(valid, littered, 0.0),
-        "rows hold something else where nobody is",
+        np.where(valid, scattered, 0.0),
+        "the rows of absent agents change",
         "mask with frame.valid first",
     )
-    longer = told(worlds.padded)[:, :, : there.shape[-1]]
+    longer = rows_of(worlds.padded)[:, :, : there.shape[-1]]
     check_same(
         what,
         known,
         np.where(longer[..., AgentColumn.VALID :] > 0, longer, 0.0),
-        "there are more empty slots",
+        "empty slots are added",
         "mask with frame.valid, also before a mean",
     )
-    mixed = told(worlds.shuffled)
-    wanted = known[:, :, worlds.order_of(there.shape[-1])]
+    mixed = rows_of(worlds.shuffled)
+    expected = known[:, :, worlds.order_of(there.shape[-1])]
     check_same(
         what,
-        wanted,
+        expected,
         np.where(mixed[..., AgentColumn.VALID :] > 0, mixed, 0.0),
-        "the agents stand in another order",
-        "let no agent's motion follow from its slot",
+        "the order of agents changes",
+        "let no motion depend on the slot",
     )
     turned = program(prepare_bank(traffic, worlds.worlds(ANGLE)), index)
     check_turned(what, _from_ego(seen), _from_ego(turned))
 
 
 def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
-    """Ego replays its log; everyone else is moved by the model."""
+    """Return rows over some steps: ego replays its log, the model moves all others."""
     simulator = Simulator(Task(), traffic)
 
     def drive(bank: ScenarioBank, index: Any) -> _Seen:
@@ -122,7 +121,7 @@ def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
             rows, remembered = traffic.agents(bank, context, 0), traffic.agents(bank, moved, 1)
             return moved, _Seen(rows, remembered, View.of(context))
 
-        return jax.lax.scan(step, simulator.context(bank, index, _BEGIN), None, _STEPS)[1]
+        return jax.lax.scan(step, simulator.context(bank, index, _START), None, _STEPS)[1]
 
     return drive
 
@@ -130,35 +129,35 @@ def _driven(traffic: Traffic) -> Callable[[ScenarioBank, Any], _Seen]:
 def _check_state(what: str, traffic: Traffic, bank: ScenarioBank) -> None:
     simulator = Simulator(Task(), traffic)
 
-    def told(bank: ScenarioBank) -> Any:
-        return traffic.agents(bank, simulator.context(bank, 0, _BEGIN), 0)
+    def first_rows(bank: ScenarioBank) -> Any:
+        return traffic.agents(bank, simulator.context(bank, 0, _START), 0)
 
-    rows, shape = jax.eval_shape(told, bank), bank.agents.shape[2:]
+    rows, shape = jax.eval_shape(first_rows, bank), bank.agents.shape[2:]
     expect(
         rows.shape == shape and rows.dtype == jnp.float32,
         f"{what} gives {rows.dtype}{list(rows.shape)} as the rows of {shape[0]} agents",
-        "give float32 rows as those of bank.agents[index, step]",
+        "return float32 rows like bank.agents[index, step]",
     )
 
-    def following(bank: ScenarioBank) -> tuple[Any, Any]:
-        context = simulator.context(bank, 0, _BEGIN)
+    def states(bank: ScenarioBank) -> tuple[Any, Any]:
+        context = simulator.context(bank, 0, _START)
         frame = simulator.frame(bank, context, alone(context), 0)
         return context.traffic, traffic.advance(bank, context, frame)
 
-    first, second = jax.eval_shape(following, bank)
+    first, second = jax.eval_shape(states, bank)
     forms = [
         (jax.tree.structure(s), [(x.shape, x.dtype) for x in jax.tree.leaves(s)]) for s in (first, second)
     ]
     expect(
         forms[0] == forms[1],
-        f"{what} changes the form of its state in a step",
-        "return from advance what start returned: the same structure, shapes and types",
+        f"{what} changes the shape of its state in a step",
+        "return from advance the same structure, shapes and types as from start",
     )
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(first))
     expect(
         size <= _STATE_BYTES,
         f"{what} carries {size} bytes per environment",
-        f"keep at most {_STATE_BYTES}; what follows from the bank alone belongs into prepare(bank)",
+        f"keep at most {_STATE_BYTES}; move what depends on the bank only to prepare(bank)",
     )
 
 
@@ -166,7 +165,7 @@ def _check_rows(what: str, seen: _Seen) -> None:
     check_numbers(what, seen.rows)
     rows, remembered = seen.rows[:, :, 1:], seen.remembered[:, :, 1:]
     valid = rows[..., AgentColumn.VALID]
-    expect(np.isin(valid, (0.0, 1.0)).all(), f"{what} has agents that are half valid", "let valid be 0 or 1")
+    expect(np.isin(valid, (0.0, 1.0)).all(), f"{what} has fractional valid", "let valid be 0 or 1")
     there = valid > 0
     length = np.hypot(rows[..., 3], rows[..., 4])
     expect(
@@ -177,20 +176,20 @@ def _check_rows(what: str, seen: _Seen) -> None:
     expect(
         (remembered[..., AgentColumn.VALID] == valid).all()
         and np.allclose(remembered[there], rows[there], rtol=CLOSE, atol=1e-2),
-        f"{what} says another thing of the past than it said then",
-        "let agents(bank, context, back) tell where everyone was 'back' steps ago",
+        f"{what} changes past rows",
+        "let agents(bank, context, back) return all agents 'back' steps ago",
     )
     both = there[:, 1:] & there[:, :-1]
-    leap = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1)[both]
+    jump = np.linalg.norm(np.diff(rows[..., :2], axis=1), axis=-1)[both]
     expect(
-        (leap <= _LEAP_M).all(),
-        f"{what} moves an agent by {leap.max(initial=0.0):.1f} m in a step",
-        "a step lasts 0.1 s; who goes is invalid before somebody else takes the slot",
+        (jump <= _JUMP_M).all(),
+        f"{what} moves an agent by {jump.max(initial=0.0):.1f} m in a step",
+        "a step lasts 0.1 s; a slot is invalid before another agent takes it",
     )
 
 
 def _from_ego(seen: _Seen) -> Any:
-    """Valid rows in the ego frame, one moment per row."""
+    """Return valid rows in the ego frame, one moment per row."""
     rows = np.asarray(seen.rows)[:, :, 1:]
     cos, sin = (np.asarray(part)[..., None] for part in (seen.view.cos, seen.view.sin))
 
@@ -205,5 +204,5 @@ def _from_ego(seen: _Seen) -> Any:
         ahead(rows[..., AgentColumn.VELOCITY]),
         rows[..., AgentColumn.VALID :],
     ]
-    told = np.concatenate(parts, axis=-1) * rows[..., AgentColumn.VALID :]
-    return told.reshape(-1, *told.shape[2:])
+    result = np.concatenate(parts, axis=-1) * rows[..., AgentColumn.VALID :]
+    return result.reshape(-1, *result.shape[2:])

@@ -1,7 +1,6 @@
-"""Small worlds in which a user's own terms are tried, and the same worlds told differently.
+"""Small worlds for checks, and variants of them that must not change results.
 
-What a term may not depend on is changed here: the frame of the map, the order of the agents, how much padding there
-is, what padding holds, and what happens later.
+Variants: rotation and shift of the map, order of agents, amount and content of padding, the future of the log.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ from drivax.tasks.task import Task
 
 #: Recordings of the built-in world: a roundabout, a crosswalk with people, a junction with lights.
 _RECORDINGS = (0, 6, 8)
-#: Steps at which each is looked at.
-_LOOKS = (30, 45, 60, 75)
-#: Where ego is against its log: to the left (m), turned (rad), and its speed as a share of the log's.
-_PLACES = ((0.0, 0.0, 1.0), (1.7, 0.2, 1.5), (-4.0, -0.3, 0.0), (3.6, 3.0, 1.0), (-9.0, 0.1, 2.5))
-#: What padding is filled with where it must not matter.
+#: Steps of the moments.
+_STEPS = (30, 45, 60, 75)
+#: Offsets of ego from its log: to the left (m), heading (rad), factor of speed.
+_OFFSETS = ((0.0, 0.0, 1.0), (1.7, 0.2, 1.5), (-4.0, -0.3, 0.0), (3.6, 3.0, 1.0), (-9.0, 0.1, 2.5))
+#: Content of padding that must not matter.
 GARBAGE = 777.0
 _CAPACITY = replace(CAPACITIES["default"], name="testing", agents=40, parked=24)
 
@@ -49,17 +48,17 @@ class Moments:
 
     Attributes:
         before: Facts of the step before.
-        found: The situation.
+        situation: The situation now.
         start: Step at which the episode began.
     """
 
     before: Facts
-    found: Situation
+    situation: Situation
     start: Array
 
 
 def turned(recording: Recording, angle: float, dx: float, dy: float) -> Recording:
-    """The same world, rotated about the origin and shifted."""
+    """Return the world rotated about the origin and shifted."""
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.array([[cos, sin], [-sin, cos]])
 
@@ -80,7 +79,7 @@ def turned(recording: Recording, angle: float, dx: float, dy: float) -> Recordin
 
 @cache
 def worlds(angle: float = 0.0) -> ScenarioBank:
-    """The worlds, all of them turned by an angle and shifted by some hundred metres."""
+    """Return the worlds, with an angle rotated and shifted by several hundred metres."""
     recordings = [generate_recording(seed=0, index=index) for index in _RECORDINGS]
     if angle:
         recordings = [turned(recording, angle, 300.0, -700.0) for recording in recordings]
@@ -90,14 +89,14 @@ def worlds(angle: float = 0.0) -> ScenarioBank:
 
 @cache
 def moments(angle: float = 0.0) -> Moments:
-    """Moments of the worlds: ego where the log has it, and beside, askew, fast and standing where it has not."""
+    """Return moments of the worlds: ego at its logged pose, and offset, rotated, fast and standing."""
     return jax.jit(_moments)(worlds(angle))
 
 
 def _moments(bank: ScenarioBank) -> Moments:
-    rows, steps, places = np.meshgrid(np.arange(len(bank)), _LOOKS, np.arange(len(_PLACES)), indexing="ij")
+    rows, steps, places = np.meshgrid(np.arange(len(bank)), _STEPS, np.arange(len(_OFFSETS)), indexing="ij")
     before = jax.vmap(partial(_measured, bank))
-    place = jnp.asarray(_PLACES)[places.ravel()]
+    place = jnp.asarray(_OFFSETS)[places.ravel()]
     index, step = jnp.asarray(rows.ravel()), jnp.asarray(steps.ravel())
     # One program measures both sides of the step.
     both = before(jnp.tile(index, 2), jnp.concatenate([step - 1, step]), jnp.tile(place, (2, 1)))
@@ -106,13 +105,13 @@ def _moments(bank: ScenarioBank) -> Moments:
 
 
 def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Situation:
-    """What is measured when ego has driven like its log, but aside, askew and at another speed."""
+    """Measure with ego's logged history offset, rotated and scaled in speed."""
     simulator = Simulator(Task())
     context = simulator.context(bank, index, step)
     x, y, heading, speed = jnp.moveaxis(context.history, -1, 0)
-    aside, askew, pace = place
-    shifted = jnp.stack([x - aside * jnp.sin(heading), y + aside * jnp.cos(heading)], axis=-1)
-    moved = jnp.stack([wrap(heading + askew), speed * pace], axis=-1)
+    left_m, turn_rad, pace = place
+    shifted = jnp.stack([x - left_m * jnp.sin(heading), y + left_m * jnp.cos(heading)], axis=-1)
+    moved = jnp.stack([wrap(heading + turn_rad), speed * pace], axis=-1)
     context = replace(context, history=jnp.concatenate([shifted, moved], axis=-1))
     now, previous = (simulator.frame(bank, context, alone(context), back) for back in (0, 1))
     apart = jnp.full(now.valid.shape, int(Contact.APART), jnp.int8)
@@ -120,13 +119,13 @@ def _measured(bank: ScenarioBank, index: Array, step: Array, place: Array) -> Si
 
 
 def shuffled_frame(frame: Frame, seed: int = 0) -> Frame:
-    """The same agents in other slots; the driven one (slot 0) stays."""
+    """Permute the slots of agents; the driven agent stays in slot 0."""
     order = order_of(frame.valid.shape[-1], seed)
     return _of_agents(lambda leaf: leaf[:, order], frame)
 
 
 def padded_frame(frame: Frame, slots: int = 8) -> Frame:
-    """The same agents with more empty slots, which hold garbage."""
+    """Append empty slots with garbage."""
 
     def pad(leaf: Array) -> Array:
         fill = False if leaf.dtype == bool else GARBAGE
@@ -136,8 +135,8 @@ def padded_frame(frame: Frame, slots: int = 8) -> Frame:
     return _of_agents(pad, frame)
 
 
-def littered_frame(frame: Frame) -> Frame:
-    """The same agents; slots that hold nobody hold garbage."""
+def scattered_frame(frame: Frame) -> Frame:
+    """Fill empty slots with garbage."""
 
     def fill(leaf: Array) -> Array:
         there = frame.valid.reshape(*frame.valid.shape, *(1,) * (leaf.ndim - 2))
@@ -146,64 +145,66 @@ def littered_frame(frame: Frame) -> Frame:
     return _of_agents(fill, frame)
 
 
-def deserted_frame(frame: Frame) -> Frame:
-    """Nobody but the driven agent."""
+def frame_without_others(frame: Frame) -> Frame:
+    """Keep only the driven agent."""
     return replace(frame, valid=frame.valid & (jnp.arange(frame.valid.shape[-1]) == 0))
 
 
 def _of_agents(change: Callable[[Array], Array], frame: Frame) -> Frame:
-    """The frame with what it says of agents changed; lights are no agents."""
+    """Apply a change to all fields of agents."""
     names = [field.name for field in fields(frame) if field.name != "lights"]
     return replace(frame, **{name: change(getattr(frame, name)) for name in names})
 
 
 def with_frame(moments: Moments, frame: Frame) -> Moments:
-    """The same moments with everyone's frame replaced."""
-    around = moments.found.surroundings
+    """Replace the frames of moments."""
+    around = moments.situation.surroundings
     around = Surroundings(frame, around.lanes, around.route)
-    return replace(moments, found=Situation(moments.found.context, moments.found.facts, around))
+    return replace(moments, situation=Situation(moments.situation.context, moments.situation.facts, around))
 
 
 def extremes(moments: Moments) -> Moments:
-    """The same moments with nothing to measure: standing, no limit known, no route, every number zero."""
+    """Set all facts to zero: standing, unknown limit, no route."""
 
     def nothing(facts: Facts) -> Facts:
         still = jax.tree.map(jnp.zeros_like, facts)
         return replace(still, limit_mps=jnp.full_like(facts.limit_mps, -1.0))
 
-    found = replace(moments.found, facts=nothing(moments.found.facts))
-    return replace(moments, before=nothing(moments.before), found=found)
+    situation = replace(moments.situation, facts=nothing(moments.situation.facts))
+    return replace(moments, before=nothing(moments.before), situation=situation)
 
 
 def without_facts(moments: Moments, reads: frozenset[str]) -> Moments:
-    """The same moments of a task that asks for these facts only."""
+    """Remove all facts but these."""
 
-    def kept(facts: Facts) -> Facts:
+    def only(facts: Facts) -> Facts:
         return jax.tree_util.tree_map_with_path(
             lambda path, fact: fact if path[0].name in reads else None, facts
         )
 
-    found = Situation(moments.found.context, kept(moments.found.facts), moments.found.surroundings)
-    return Moments(kept(moments.before), found, moments.start)
+    situation = Situation(
+        moments.situation.context, only(moments.situation.facts), moments.situation.surroundings
+    )
+    return Moments(only(moments.before), situation, moments.start)
 
 
 def shuffled(bank: ScenarioBank, seed: int = 0) -> ScenarioBank:
-    """The same scenarios with the agents in other slots; ego stays in slot 0."""
+    """Permute the slots of agents; ego stays in slot 0."""
     moving = order_of(bank.agents.shape[2], seed)
-    behind = np.random.default_rng(seed).permutation(np.arange(len(moving), bank.parked.shape[1]))
-    everyone = np.concatenate([moving, behind])
+    parked = np.random.default_rng(seed).permutation(np.arange(len(moving), bank.parked.shape[1]))
+    slots = np.concatenate([moving, parked])
     return replace(
         bank,
         agents=bank.agents[:, :, moving],
         extension=bank.extension[:, moving],
-        agent_box=bank.agent_box[:, everyone],
-        parked=bank.parked[:, everyone],
-        parked_when=bank.parked_when[:, :, everyone],
+        agent_box=bank.agent_box[:, slots],
+        parked=bank.parked[:, slots],
+        parked_when=bank.parked_when[:, :, slots],
     )
 
 
 def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
-    """The same scenarios with more empty slots for agents."""
+    """Append empty slots for agents."""
     n, steps = bank.agents.shape[:2]
     return replace(
         bank,
@@ -215,26 +216,23 @@ def padded(bank: ScenarioBank, slots: int = 8) -> ScenarioBank:
     )
 
 
-def littered(bank: ScenarioBank) -> ScenarioBank:
-    """The same scenarios; rows of agents that are not there hold garbage."""
+def scattered(bank: ScenarioBank) -> ScenarioBank:
+    """Fill the rows of absent agents with garbage."""
     there = bank.agents[..., AgentColumn.VALID] > 0
     agents = jnp.where(there[..., None], bank.agents, GARBAGE).at[..., AgentColumn.VALID].set(there)
     ever = (bank.parked_when > 0).any(axis=1)[..., None]
     return replace(bank, agents=agents, parked=jnp.where(ever, bank.parked, GARBAGE))
 
 
-def deserted(bank: ScenarioBank) -> ScenarioBank:
-    """The same roads with nobody on them but ego."""
+def without_others(bank: ScenarioBank) -> ScenarioBank:
+    """Remove all agents but ego."""
     others = jnp.arange(bank.agents.shape[2]) > 0
     agents = bank.agents.at[..., AgentColumn.VALID].multiply(~others)
     return replace(bank, agents=agents, parked_when=jnp.zeros_like(bank.parked_when))
 
 
-def forgotten(bank: ScenarioBank, step: int) -> ScenarioBank:
-    """The same scenarios up to ``step``; what the log holds of later steps is another story.
-
-    Others go somewhere else, lights turn, and the log's own path is gone. Route and goal remain: they are told to ego.
-    """
+def other_future(bank: ScenarioBank, step: int) -> ScenarioBank:
+    """Change the log after ``step``: other motions and lights, no log path. Route and goal stay: ego knows them."""
     later = jnp.arange(bank.steps) > step
     moved = bank.agents.at[..., AgentColumn.XY].add(13.0).at[..., AgentColumn.VELOCITY].multiply(-1.0)
     moved = moved.at[..., AgentColumn.VALID].set(1.0 - bank.agents[..., AgentColumn.VALID])
@@ -251,6 +249,6 @@ def forgotten(bank: ScenarioBank, step: int) -> ScenarioBank:
 
 
 def order_of(slots: int, seed: int = 0) -> Any:
-    """Which slot each slot of a shuffled world was before."""
+    """Return the former slot of each slot of a permuted world."""
     order = np.random.default_rng(seed).permutation(np.arange(1, slots))
     return np.concatenate([[0], order])

@@ -180,7 +180,7 @@ def add_lanes(layers: Mapping[str, Layer]) -> None:
     for number, xy in lane_lines().items():
         left, right = 2 * number - 1, 2 * number
         if number == SECOND:
-            left = 2 * IN["w"]  # shared with the lane beside it
+            left = 2 * IN["w"]  # shared with the lane next to it
         else:
             layers["boundaries"].add(left, line(shifted(xy, WIDTH / 2)), SOLID)
         kind = {IN["w"]: DASHED, OUT["e"]: ODD}.get(number, SOLID)
@@ -291,7 +291,7 @@ def still(x: float, y: float, yaw: float = 0.0) -> Callable[[float], tuple[float
 
 
 def walker(t: float) -> tuple[float, float, float] | None:
-    """Crosses the east arm; nobody sees it between 3 s and 4 s."""
+    """Crosses the east arm; unobserved between 3 s and 4 s."""
     return None if 3.0 <= t < 4.0 else (RADIUS + 2.5, -6.0 + 1.2 * t, math.pi / 2)
 
 
@@ -463,7 +463,7 @@ def write_log(path: Path, drive: Drive) -> None:
 
 
 def write_all(folder: Path, drive: Drive, layers: Mapping[str, Layer] | None = None) -> Path:
-    """A data set as one downloads it: ``maps`` beside ``nuplan-v1.1``. Returns the path of the log."""
+    """A data set as one downloads it: ``maps`` next to ``nuplan-v1.1``. Returns the path of the log."""
     maps = folder / "maps"
     write_map(maps / CITY / VERSION / "map.gpkg", map_layers() if layers is None else layers)
     (maps / "nuplan-maps-v1.0.json").write_text(json.dumps({CITY: {"version": VERSION, "layers": {}}}))

@@ -1,4 +1,4 @@
-"""Argoverse 2 maps: lane segments, drivable areas and crossings of one log, as JSON beside it."""
+"""Argoverse 2 maps: lane segments, drivable areas and crossings of one log, as JSON next to it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from drivax.datasets import readings
-from drivax.datasets.areas import Area, road_edges
-from drivax.datasets.argoverse.vehicle import FARTHEST_M
+from drivax.datasets import parsing
+from drivax.datasets.argoverse.tables import FARTHEST_M
+from drivax.datasets.road_edges import Area, road_edges
 from drivax.errors import DataError
 from drivax.geometry.polylines import arc_lengths
 from drivax.scenario.recording import MapFeature
@@ -20,7 +20,7 @@ from drivax.scenario.schema import RoadKind
 
 Array = np.ndarray[Any, Any]
 
-#: Name of a map beside a log.
+#: Name of a map next to a log.
 MAP_PATTERN = "log_map_archive_*.json"
 _AGAIN = "download the map again"
 #: A local map spans some hundred metres; a point this far from the others is damaged.
@@ -58,13 +58,9 @@ def read_map(path: Path) -> ArgoverseMap:
     """Reads a local map: lanes, painted lines (once each), road edges and crossings, in the city's frame, metres.
 
     Lanes keep their ids, their links (some lead outside the local map) and all neighbours, oncoming ones included.
-
-    Raises:
-        DataError: The file is missing or no such map.
-        UsageError: shapely is not installed.
     """
     try:
-        return _decode(readings.load_json(path))
+        return _decode(parsing.load_json(path))
     except DataError as error:
         raise DataError(error.problem, file=path, record=error.record, cure=error.cure or _AGAIN) from error
 
@@ -85,7 +81,7 @@ def _decode(content: Any) -> ArgoverseMap:
     free += len(edges)
     drawn = [*lines, *((RoadKind.CROSSWALK, walk) for walk in walks)]
     rest = [MapFeature(free + number, kind, points) for number, (kind, points) in enumerate(drawn)]
-    lost = readings.counted(lanes_without_length=len(segments) - len(lanes))
+    lost = parsing.nonzero(lanes_without_length=len(segments) - len(lanes))
     return ArgoverseMap((*lanes, *edges, *rest), lost)
 
 
@@ -94,7 +90,7 @@ def _lane(segment: Any) -> MapFeature | None:
     left, right = _points(segment, "left_lane_boundary"), _points(segment, "right_lane_boundary")
     if min(arc_lengths(left).max(initial=0.0), arc_lengths(right).max(initial=0.0)) < 1e-3:
         return None
-    left, right = _beside(left, right)
+    left, right = _resample_boundaries(left, right)
     return MapFeature(
         feature_id=_id(segment.get("id")),
         kind=_LANES.get(str(segment.get("lane_type")), RoadKind.LANE_UNDEFINED),
@@ -108,7 +104,7 @@ def _lane(segment: Any) -> MapFeature | None:
     )
 
 
-def _beside(
+def _resample_boundaries(
     left: Float[Array, "left 3"], right: Float[Array, "right 3"]
 ) -> tuple[Float[Array, "point 3"], Float[Array, "point 3"]]:
     """Both boundaries at the same fractions of their lengths, so that points of the same row face each other."""
@@ -140,7 +136,7 @@ def _centre(segment: Any, middle: Float[Array, "point 3"]) -> Float[Array, "cent
 
 
 def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]]:
-    """Painted boundaries, each once: lanes beside each other both name the line between them."""
+    """Painted boundaries, each once: adjacent lanes both name the line between them."""
     lines: dict[bytes, tuple[RoadKind, Array]] = {}
     for segment in segments:
         for side in ("left", "right"):
@@ -156,15 +152,11 @@ def _lines(segments: Sequence[Any]) -> list[tuple[RoadKind, Float[Array, "_ 3"]]
 
 
 def _points(record: Any, name: str) -> Float[Array, "point 3"]:
-    """A list of points of the map.
-
-    Raises:
-        DataError: It is missing, no list of points, or nowhere.
-    """
+    """A list of points of the map."""
     try:
         rows = [(point["x"], point["y"], point["z"]) for point in record[name]]
         points = np.array(rows, np.float64).reshape(-1, 3)
-        readings.check_within(FARTHEST_M, points)
+        parsing.check_within(FARTHEST_M, points)
     except (TypeError, KeyError, ValueError, OverflowError, IndexError) as error:
         raise DataError(f"{name} is no list of points", record=_name(record), cure=_AGAIN) from error
     return points

@@ -1,4 +1,4 @@
-"""Reader of Argoverse 2 motion forecasting: one parquet file per scenario, its map as JSON beside it."""
+"""Reader of Argoverse 2 motion forecasting: one parquet file per scenario, its map as JSON next to it."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int
 
-from drivax.datasets import readings
+from drivax.datasets import parsing
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import PARQUET_MAGIC, Kind, Table, Words, has_magic, read_table
-from drivax.datasets.argoverse.vehicle import (
+from drivax.datasets.argoverse.tables import (
     CENTRE_AHEAD_M,
     DATASET,
     EGO_SIZE,
     FARTHEST_M,
     FASTEST_MPS,
     MOST_STATES,
+    PARQUET_MAGIC,
+    Kind,
+    Table,
+    Words,
+    has_magic,
+    read_table,
 )
-from drivax.datasets.ground import lift
-from drivax.datasets.places import place_tags
+from drivax.datasets.elevation import lift
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -83,14 +88,10 @@ class ArgoverseMotion:
         return path.match(self.patterns[0]) and has_magic(path, PARQUET_MAGIC)
 
     def describe(self, path: Path) -> Description:
-        """Tracks, steps, city and split of one scenario.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """Tracks, steps, city and split of one scenario."""
         table = read_table(path, _COLUMNS)
         steps = 1 + int(table.numbers["timestep"].max())
-        beside = _map_path(path)
+        map_path = _map_path(path)
         return Description(
             dataset="Argoverse 2 Motion Forecasting",
             flavour=f"one scenario of {steps} steps in {table.texts['city'].text(0)}",
@@ -99,7 +100,7 @@ class ArgoverseMotion:
                 f"{len(table.texts['track_id'].words)} tracks",
                 "box sizes are those of the class; there are no speed limits, lights or stop signs",
             ),
-            missing=() if beside.is_file() else (beside.name,),
+            missing=() if map_path.is_file() else (map_path.name,),
         )
 
     def count(self, path: Path) -> int:
@@ -120,14 +121,10 @@ def _map_path(path: Path) -> Path:
 
 
 def decode(path: Path) -> Recording:
-    """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` beside it.
+    """The recording in ``scenario_<id>.parquet`` and ``log_map_archive_<id>.json`` next to it.
 
     The city's frame, metres. The ego (track AV) is moved from its rear axle to the middle of its box; heights are
     those of the map; sizes those of the class; velocities as given, smoothed by the source.
-
-    Raises:
-        DataError: One of them is missing, damaged, or contradicts itself.
-        UsageError: pyarrow or shapely is not installed.
     """
     table = read_table(path, _COLUMNS)
     local_map = read_map(_map_path(path))
@@ -151,7 +148,7 @@ def decode(path: Path) -> Recording:
         to_predict=tuple(row for row, word in enumerate(names.words) if word == focal),
         of_interest=tuple(row for row, code in enumerate(category) if code == _SCORED),
         tags={"source_format": "av2-motion"} | place_tags(table.texts["city"].text(0)),
-        lost=local_map.lost | readings.counted(repeated_rows=table.rows - int(tracks.valid.sum())),
+        lost=local_map.lost | parsing.nonzero(repeated_rows=table.rows - int(tracks.valid.sum())),
         flags=Flag.DEFAULT_SIZES,
     )
 
@@ -176,12 +173,12 @@ def _tracks(table: Table) -> tuple[Tracks, int]:
     states = np.zeros((len(names.words), int(step.max()) + 1, len(columns)))
     valid = np.zeros(states.shape[:2], bool)
     states[row, step], valid[row, step] = table.stacked(columns), True
-    readings.check_within(FARTHEST_M, states[..., :3])
-    readings.check_within(FASTEST_MPS, states[..., 3:])
+    parsing.check_within(FARTHEST_M, states[..., :3])
+    parsing.check_within(FASTEST_MPS, states[..., 3:])
     heading = np.where(valid, wrap(states[..., 2]), 0.0)
     xy = states[..., :2].copy()
     there = valid[ego]
-    xy[ego, there] = readings.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
+    xy[ego, there] = parsing.box_centre(xy[ego, there], heading[ego, there], CENTRE_AHEAD_M)
     kinds, sizes = _classes(table.texts["object_type"], names, ego)
     return Tracks(
         xy=xy,
@@ -219,5 +216,5 @@ def _timestamps(table: Table, steps: int) -> Float64[Array, " step"]:
     start, end = (float(table.numbers[f"{name}_timestamp"][0]) * 1e-9 for name in ("start", "end"))
     intervals = int(table.numbers["num_timestamps"][0]) - 1
     between = (end - start) / intervals if intervals > 0 else DT_S
-    readings.check_within(1e12, np.array([start, between]))
+    parsing.check_within(1e12, np.array([start, between]))
     return start + between * np.arange(steps)

@@ -10,19 +10,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.datasets import readings
+from drivax.datasets import parsing
 from drivax.datasets.argoverse.map import MAP_PATTERN, read_map
-from drivax.datasets.argoverse.tables import FEATHER_MAGIC, Kind, Table, has_magic, read_table
-from drivax.datasets.argoverse.vehicle import (
+from drivax.datasets.argoverse.tables import (
     AXLE_HEIGHT_M,
     CENTRE_AHEAD_M,
     DATASET,
     EGO_SIZE,
     FARTHEST_M,
+    FEATHER_MAGIC,
     LARGEST_M,
     MOST_STATES,
+    Kind,
+    Table,
+    has_magic,
+    read_table,
 )
-from drivax.datasets.places import place_tags
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.scenario.recording import Recording, Tracks
@@ -76,11 +80,7 @@ class ArgoverseSensor:
         return path.name in self.patterns and has_magic(path, FEATHER_MAGIC)
 
     def describe(self, path: Path) -> Description:
-        """Frames, tracks and city of a log.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """Frames, tracks and city of a log."""
         table = read_table(path, {"timestamp_ns": "whole", "track_uuid": "text"})
         frames, tracks = len(np.unique(table.numbers["timestamp_ns"])), len(table.texts["track_uuid"].words)
         map_path = _map_path(path)
@@ -102,7 +102,7 @@ class ArgoverseSensor:
             times = read_table(path, {"timestamp_ns": "whole"}).numbers["timestamp_ns"]
         except DataError:
             return 0
-        return readings.windows_of(len(np.unique(times)))
+        return parsing.windows_of(len(np.unique(times)))
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """The recording in a log, or why it cannot be read."""
@@ -128,17 +128,13 @@ def decode(path: Path) -> Recording:
 
     The city's frame, metres. Boxes are given in the car's frame and moved with its pose of the same time stamp; the
     ego is moved from its rear axle to the middle of its box; velocities are differences of positions.
-
-    Raises:
-        DataError: One of them is missing, damaged, or contradicts another.
-        UsageError: pyarrow or shapely is not installed.
     """
     boxes = read_table(path, _BOX_COLUMNS)
     poses = read_table(path.with_name(POSES), _POSE_COLUMNS)
     map_path = _map_path(path)
     if map_path is None:
         raise DataError(
-            f"has no map/{MAP_PATTERN} beside it", file=path, cure="download the folder map of the log"
+            f"has no map/{MAP_PATTERN} next to it", file=path, cure="download the folder map of the log"
         )
     local_map = read_map(map_path)
     log_id = path.resolve().parent.name
@@ -157,7 +153,7 @@ def decode(path: Path) -> Recording:
         tracks=tracks,
         features=local_map.features,
         tags={"source_format": "av2-sensor"} | _places(map_path),
-        lost=local_map.lost | readings.counted(frames_without_pose=lost_frames),
+        lost=local_map.lost | parsing.nonzero(frames_without_pose=lost_frames),
         flags=Flag.DIFFERENTIATED_VELOCITY,
     )
 
@@ -192,7 +188,7 @@ def _tracks(boxes: Table, poses: Table, clock: Int[Array, " step"]) -> Tracks:
         xy=states[..., :2].copy(),
         z=states[..., 2].copy(),
         heading=states[..., 3].copy(),
-        velocity=readings.differentiate(states[..., :2], valid, clock * 1e-9),
+        velocity=parsing.differentiate(states[..., :2], valid, clock * 1e-9),
         size=states[..., 4:].copy(),
         valid=valid,
         kind=np.array([AgentKind.VEHICLE, *kinds], np.int8),
@@ -204,7 +200,7 @@ def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
     """The pose of the car at every frame: quaternion (w, x, y, z) and translation in the city."""
     known, first = np.unique(poses.numbers["timestamp_ns"], return_index=True)
     pose = poses.stacked(_POSE)[first[np.searchsorted(known, clock)]]
-    readings.check_within(FARTHEST_M, pose[:, 4:])
+    parsing.check_within(FARTHEST_M, pose[:, 4:])
     pose[:, :4] = _unit(pose[:, :4])
     return pose
 
@@ -212,8 +208,8 @@ def _poses(poses: Table, clock: Int[Array, " step"]) -> Float[Array, "step 7"]:
 def _boxes(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "box 7"]) -> Float[Array, "box 7"]:
     """Boxes in the city's frame: x, y, z, heading, length, width, height."""
     table = boxes.stacked((*_POSE, *_SIZE))[rows]
-    readings.check_within(FARTHEST_M, table[:, 4:7])
-    readings.check_within(LARGEST_M, table[:, 7:])
+    parsing.check_within(FARTHEST_M, table[:, 4:7])
+    parsing.check_within(LARGEST_M, table[:, 7:])
     forward = rotate(pose[:, :4], rotate(_unit(table[:, :4]), np.array([1.0, 0.0, 0.0])))
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     return np.column_stack((rotate(pose[:, :4], table[:, 4:7]) + pose[:, 4:], heading, table[:, 7:]))
@@ -225,7 +221,7 @@ def _ego(boxes: Table, rows: Int[Array, " box"], pose: Float[Array, "step 7"]) -
     Some logs hold boxes of the car itself; their sizes are right, their centres are the rear axle again.
     """
     size = np.median(boxes.stacked(_SIZE)[rows], axis=0) if len(rows) else np.array(EGO_SIZE)
-    readings.check_within(LARGEST_M, size)
+    parsing.check_within(LARGEST_M, size)
     centre = rotate(pose[:, :4], np.array([CENTRE_AHEAD_M, 0.0, size[2] / 2 - AXLE_HEIGHT_M])) + pose[:, 4:]
     forward = rotate(pose[:, :4], np.array([1.0, 0.0, 0.0]))
     heading = np.arctan2(forward[:, 1], forward[:, 0])
@@ -240,7 +236,7 @@ def rotate(quaternion: Float[Array, "row 4"], vector: Float[Array, "*rows 3"]) -
 
 
 def _unit(quaternion: Float[Array, "row 4"]) -> Float[Array, "row 4"]:
-    readings.check_within(2.0, quaternion)
+    parsing.check_within(2.0, quaternion)
     length = np.linalg.norm(quaternion, axis=1, keepdims=True)
     if not (length > 0.5).all():
         raise DataError("a rotation is no quaternion")

@@ -10,7 +10,20 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int
 
-from drivax.errors import DataError, UsageError
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
+
+DATASET = "av2"
+#: The recording car, a Ford Fusion: length, width and height of its box in the sensor logs, metres.
+EGO_SIZE = (4.877, 2.0, 1.473)
+#: Its poses are those of the middle of the rear axle, one wheel radius above ground. On the real logs the axis that
+#: does not slip sideways in turns is within 0.3 m of the pose, and the map 0.33 m below it. The body's middle is half
+#: the wheelbase of 2.85 m ahead, less 0.09 m, because the rear overhang is longer than the front one.
+CENTRE_AHEAD_M = 1.34
+AXLE_HEIGHT_M = 0.33
+#: Limits of what can be in a log: city coordinates in metres, speeds in m/s, sizes in metres, tracks times steps.
+FARTHEST_M, FASTEST_MPS, LARGEST_M, MOST_STATES = 1e6, 200.0, 100.0, 2_000_000
+
 
 Array = np.ndarray[Any, Any]
 
@@ -61,17 +74,8 @@ def read_table(path: Path, columns: Mapping[str, Kind]) -> Table:
     Args:
         path: The file.
         columns: Name and kind of the columns: any number, whole numbers, or text. Other columns are not read.
-
-    Raises:
-        DataError: The file is missing or damaged, or lacks a column, a value, or a kind.
-        UsageError: pyarrow is not installed.
     """
-    try:
-        import pyarrow as pa
-    except ImportError as error:
-        raise UsageError(
-            "reading Argoverse 2 needs pyarrow", cure="pip install 'drivax[av2,maps]'"
-        ) from error
+    pa = import_extra("pyarrow")
     try:
         table = _load(path, list(columns))
         if table.num_rows == 0:
@@ -113,8 +117,8 @@ def _load(path: Path, columns: Sequence[str]) -> Any:
     return table
 
 
-def _check(names: Sequence[str], wanted: Sequence[str], rows: int) -> None:
-    for name in wanted:
+def _check(names: Sequence[str], columns: Sequence[str], rows: int) -> None:
+    for name in columns:
         if names.count(name) != 1:
             raise DataError(f"has no column {name}", cure="this is another kind of table, or a damaged one")
     if not 0 <= rows <= MOST_ROWS:

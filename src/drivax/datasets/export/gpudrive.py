@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets.export.restore import restore
+from drivax.datasets.export.recording import restore
 from drivax.scenario.recording import Light, MapFeature, Recording
 from drivax.scenario.schema import (
     EDGE_KINDS,

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from drivax.datasets.export.restore import restore
-from drivax.datasets.readings import MPS_PER_MPH
+from drivax.datasets.export.recording import restore
+from drivax.datasets.parsing import MPS_PER_MPH
 from drivax.geometry.polylines import project, resample
 from drivax.scenario.recording import MapFeature, Recording, Tracks
 from drivax.scenario.schema import (
@@ -34,7 +34,7 @@ _Array = np.ndarray[Any, Any]
 
 AGENTS, LIGHTS, POINTS = 128, 16, 30_000
 _SPANS = {"past": slice(0, 10), "current": slice(10, 11), "future": slice(11, STEPS)}
-#: At most so many tracks to predict come before all others.
+#: Tracks to predict that come before all others.
 _FIRST = 8
 #: Just under 1 m, so that rounding never makes a gap of more: readers cut polylines there.
 _SPACING_M = 0.998
@@ -53,7 +53,7 @@ _ON_ROUTE_M, _ON_ROUTE_SHARE = 1.5, 0.95
 
 @dataclass(frozen=True)
 class Paths:
-    """Form of ``path_samples``: so many paths of so many points, so far apart."""
+    """Number, points and spacing of ``path_samples``."""
 
     count: int
     points: int
@@ -117,8 +117,8 @@ def _order(tracks: Tracks, recording: Recording) -> Int[_Array, " track"]:
     others, those with most valid steps first. The ego stands in front of them all because V-Max takes row 0 for it.
     """
     now = tracks.valid[:, CURRENT_STEP]
-    wanted = [row for row in recording.to_predict if now[row] and row != recording.ego]
-    first = sorted(wanted, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
+    predicted = [row for row in recording.to_predict if now[row] and row != recording.ego]
+    first = sorted(predicted, key=lambda row: int(tracks.track_id[row]))[:_FIRST]
     at = tracks.xy[:, CURRENT_STEP]
     away = np.hypot(*(at - at[recording.ego]).T)
     rank = np.where(now, away, 1e9 - tracks.valid.sum(axis=1))

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.datasets.nuplan.geopackage import Database
-from drivax.datasets.readings import box_centre
+from drivax.datasets.nuplan.sqlite import Database
+from drivax.datasets.parsing import box_centre
 from drivax.errors import DataError
 from drivax.geometry.vectors import rotate, wrap
 from drivax.scenario.recording import Tracks
@@ -60,11 +60,7 @@ _KINDS = {
     "czone_sign": AgentKind.STATIC,
     "generic_object": AgentKind.STATIC,
 }
-_LIGHT_STATES = {
-    "green": LightState.GO,
-    "yellow": LightState.CAUTION,
-    "red": LightState.STOP,
-}
+_LIGHT_STATES = {"green": LightState.GO, "yellow": LightState.CAUTION, "red": LightState.STOP}
 
 
 @dataclass(frozen=True)
@@ -111,11 +107,7 @@ class Agents:
 
 
 def log_names(database: Database, path: Path) -> tuple[str, str]:
-    """Name of the log (of the file, where the table has none) and name of its map.
-
-    Raises:
-        DataError: The file is damaged, or names no map.
-    """
+    """Name of the log (of the file, where the table has none) and name of its map."""
     rows = database.rows("SELECT logfile, map_version FROM log")
     if not rows or not isinstance(rows[0][1], str) or not rows[0][1]:
         raise DataError("its table log names no map", file=path, cure="download the file again")
@@ -124,11 +116,7 @@ def log_names(database: Database, path: Path) -> tuple[str, str]:
 
 
 def time_line(database: Database) -> TimeLine:
-    """All lidar sweeps in order of time.
-
-    Raises:
-        DataError: The file is damaged or has no sweep.
-    """
+    """All lidar sweeps in order of time."""
     rows = database.rows("SELECT token, timestamp, scene_token FROM lidar_pc ORDER BY timestamp")
     if not rows:
         raise DataError("has no lidar sweep", file=database.path, cure="download the file again")
@@ -143,11 +131,8 @@ def pieces(line: TimeLine) -> list[Piece]:
 
     Of sweeps at 20 Hz every second is taken, counted from the last gap. What remains too short for a window after
     the last scene is left out: it is the future of the windows before.
-
-    Raises:
-        DataError: The sweeps come neither at 20 nor at 10 Hz.
     """
-    found: list[Piece] = []
+    recordings: list[Piece] = []
     counts: dict[Any, int] = {}
     step = _every(line.time_us)
     ends = np.flatnonzero(np.diff(line.time_us) > _GAP_US) + 1
@@ -161,8 +146,8 @@ def pieces(line: TimeLine) -> list[Piece]:
             number = counts[scene] = counts.get(scene, 0) + 1
             name = _hexadecimal(scene) + (f".{number}" if number > 1 else "")
             own = int(sweeps[begin]), int(sweeps[end - 1]) + step
-            found.append(Piece(name, scene, sweeps[part], own))
-    return found
+            recordings.append(Piece(name, scene, sweeps[part], own))
+    return recordings
 
 
 def _every(time_us: Int64[np.ndarray, " sweep"]) -> int:
@@ -181,11 +166,11 @@ def _scenes(line: TimeLine, sweeps: Int64[np.ndarray, " step"]) -> list[tuple[in
     """Steps of each scene, first and one past the last; long ones in parts."""
     scenes = [line.scenes[sweep] for sweep in sweeps]
     begins = [step for step in range(len(scenes)) if step == 0 or scenes[step] != scenes[step - 1]]
-    found = []
+    ranges = []
     for begin, end in zip(begins, (*begins[1:], len(scenes)), strict=True):
         starts = range(begin, end, _LONGEST_PIECE)
-        found += [(start, min(start + _LONGEST_PIECE, end)) for start in starts]
-    return found
+        ranges += [(start, min(start + _LONGEST_PIECE, end)) for start in starts]
+    return ranges
 
 
 def _hexadecimal(token: Any) -> str:
@@ -199,19 +184,15 @@ def timestamps(line: TimeLine, piece: Piece) -> Float64[np.ndarray, " step"]:
 
 def _rows(database: Database, query: str, tokens: Sequence[Any]) -> list[tuple[Any, ...]]:
     """Rows of a query that ends in ``IN``, for any number of tokens."""
-    found = []
+    result = []
     for start in range(0, len(tokens), _TOKENS_AT_ONCE):
         part = tokens[start : start + _TOKENS_AT_ONCE]
-        found += database.rows(f"{query} ({', '.join('?' * len(part))})", part)
-    return found
+        result += database.rows(f"{query} ({', '.join('?' * len(part))})", part)
+    return result
 
 
 def _numbers(rows: Sequence[Sequence[Any]], width: int, what: str) -> Float64[np.ndarray, "row column"]:
-    """Rows of numbers; NaN where a cell is NULL.
-
-    Raises:
-        DataError: A cell holds something else.
-    """
+    """Rows of numbers; NaN where a cell is NULL."""
     try:
         return np.array(rows, dtype=np.float64).reshape(len(rows), width)
     except (ValueError, TypeError, OverflowError) as error:
@@ -225,11 +206,7 @@ def _check(values: Float64[np.ndarray, "*shape"], most: float, what: str) -> Non
 
 
 def agents(database: Database) -> Agents:
-    """The tracks of a log: their kinds, and numbers counting from 1 in order of the table.
-
-    Raises:
-        DataError: The file is damaged.
-    """
+    """The tracks of a log: their kinds, and numbers counting from 1 in order of the table."""
     rows = database.rows(
         "SELECT t.token, c.name FROM track AS t LEFT JOIN category AS c ON c.token = t.category_token ORDER BY t.rowid"
     )
@@ -238,11 +215,7 @@ def agents(database: Database) -> Agents:
 
 
 def tracks(database: Database, line: TimeLine, piece: Piece, known: Agents) -> tuple[Tracks, dict[str, int]]:
-    """All tracks of a piece, the ego in row 0, and what was left out.
-
-    Raises:
-        DataError: An ego pose or a box is missing or damaged.
-    """
+    """All tracks of a piece, the ego in row 0, and what was left out."""
     steps = len(piece.sweeps)
     boxes, owners, left_out = _boxes(database, line, piece, known)
     tokens = sorted({owner for _, owner in owners}, key=lambda token: known.numbers[token])
@@ -255,7 +228,7 @@ def tracks(database: Database, line: TimeLine, piece: Piece, known: Agents) -> t
     if owners:
         at = np.array([(rows[owner], step) for step, owner in owners]).T
         table[at[0], at[1]], valid[at[0], at[1]] = boxes, True
-    found = Tracks(
+    states = Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
         heading=table[..., 3].copy(),
@@ -265,7 +238,7 @@ def tracks(database: Database, line: TimeLine, piece: Piece, known: Agents) -> t
         kind=np.array([AgentKind.VEHICLE, *(known.kinds[token] for token in tokens)], np.int8),
         track_id=np.array([EGO_TRACK_ID, *(known.numbers[token] for token in tokens)], np.int64),
     )
-    return found, left_out
+    return states, left_out
 
 
 def _ego(database: Database, line: TimeLine, piece: Piece) -> Float64[np.ndarray, "step 9"]:
@@ -298,11 +271,7 @@ def _ego(database: Database, line: TimeLine, piece: Piece) -> Float64[np.ndarray
 
 
 def yaw_of(quaternion: Float64[np.ndarray, "pose 4"]) -> Float64[np.ndarray, " pose"]:
-    """Heading of the x axis after the rotation by quaternions (w, x, y, z), radians.
-
-    Raises:
-        DataError: One is not of unit length.
-    """
+    """Heading of the x axis after the rotation by quaternions (w, x, y, z), radians."""
     w, x, y, z = quaternion.T
     if not (np.abs(np.linalg.norm(np.clip(quaternion, -2.0, 2.0), axis=1) - 1.0) < 0.01).all():
         raise DataError("an ego orientation is no unit quaternion", cure=_CURE)
@@ -317,8 +286,8 @@ def _observed(
     query = f"SELECT lidar_pc_token, {columns} FROM {table} WHERE lidar_pc_token IN"
     rows = _rows(database, query, list(steps))
     # A damaged index leads to rows of other sweeps.
-    found = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
-    return sorted(found, key=lambda row: row[0])
+    kept = [(steps[row[0]], *row[1:]) for row in rows if row[0] in steps]
+    return sorted(kept, key=lambda row: row[0])
 
 
 def _boxes(

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivax.datasets import readings
-from drivax.datasets.nuplan.geopackage import Database, Layer, open_database, read_layer
+from drivax.datasets import parsing
+from drivax.datasets.nuplan.sqlite import Database, Layer, open_database, read_layer
 from drivax.errors import DataError
 
 #: Layers that are read and their columns. The order gives the numbers of the layers in feature ids.
@@ -36,7 +36,7 @@ LAYERS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 _NEEDED = ("baseline_paths", "lanes_polygons", "lane_connectors")
 NUMBERS = {name: number for number, name in enumerate((*LAYERS, "road_edges"), start=1)}
-#: Folder in the archive of the maps, which users are told to rename to ``maps``.
+#: Folder in the archive of the maps, which the documentation renames to ``maps``.
 _UNPACKED, _LISTING = "nuplan-maps-v*", "nuplan-maps-*.json"
 _FASTEST_MPS = 60.0
 CURE = "download the nuPlan maps again"
@@ -50,14 +50,11 @@ def feature_id(layer: str, fid: int) -> int:
 def find_map(log: Path, name: str) -> Path:
     """The GeoPackage of a named map.
 
-    Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, beside the log or beside any folder
+    Looked for in ``maps``, or in ``nuplan-maps-v1.0`` as the archive unpacks it, next to the log or next to any folder
     above it, then where the environment variable ``NUPLAN_MAPS_ROOT`` of the nuPlan devkit points.
-
-    Raises:
-        DataError: There are no maps, or not this one.
     """
     listing = _listing(log)
-    known = readings.load_json(listing)
+    known = parsing.load_json(listing)
     entry = known.get(name) if isinstance(known, dict) else None
     version = entry.get("version") if isinstance(entry, dict) else None
     if (
@@ -79,12 +76,12 @@ def _listing(log: Path) -> Path:
         roots.append(Path(os.environ["NUPLAN_MAPS_ROOT"]))
     for root in roots:
         for pattern in (_LISTING, f"{_UNPACKED}/{_LISTING}"):
-            if found := sorted(root.glob(pattern)):
-                return found[-1]
+            if listings := sorted(root.glob(pattern)):
+                return listings[-1]
     raise DataError(
-        "no nuPlan maps beside it (maps/nuplan-maps-v1.0.json)",
+        "no nuPlan maps next to it (maps/nuplan-maps-v1.0.json)",
         file=log,
-        cure="put the folder maps beside or above it, or set NUPLAN_MAPS_ROOT",
+        cure="put the folder maps next to or above it, or set NUPLAN_MAPS_ROOT",
     )
 
 
@@ -124,11 +121,7 @@ class City:
 
 
 def city_map(path: Path) -> City:
-    """The index of a map, kept between calls as long as the file does not change.
-
-    Raises:
-        DataError: The file is damaged or no nuPlan map.
-    """
+    """The index of a map, kept between calls as long as the file does not change."""
     state = path.stat()
     return _city(path, state.st_mtime_ns, state.st_size)
 
@@ -227,8 +220,8 @@ def _plain_lanes(layer: Layer, baselines: Mapping[int, int]) -> dict[int, Lane]:
             places.setdefault((block, slot), number)
             slots[number] = block, slot
     for number, (block, slot) in slots.items():
-        beside = {"left": places.get((block, slot - 1)), "right": places.get((block, slot + 1))}
-        lanes[number] = replace(lanes[number], **beside)
+        neighbours = {"left": places.get((block, slot - 1)), "right": places.get((block, slot + 1))}
+        lanes[number] = replace(lanes[number], **neighbours)
     return lanes
 
 
@@ -267,10 +260,10 @@ def corridor(city: City, ids: Sequence[int]) -> tuple[tuple[int, ...], int]:
 
     Groups of lanes and of connectors share the list; an id that both have means the lanes, as in the devkit.
     """
-    found: dict[int, None] = {}
+    lane_ids: dict[int, None] = {}
     unknown = 0
     for number in ids:
         lanes = city.roadblocks.get(("lane", number)) or city.roadblocks.get(("connector", number))
         unknown += lanes is None
-        found.update(dict.fromkeys(lanes or ()))
-    return tuple(found), unknown
+        lane_ids.update(dict.fromkeys(lanes or ()))
+    return tuple(lane_ids), unknown

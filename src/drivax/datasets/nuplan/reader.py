@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivax.datasets import readings
-from drivax.datasets.ground import flatten
+from drivax.datasets import parsing
+from drivax.datasets.elevation import flatten
 from drivax.datasets.nuplan import log as nuplan_log
-from drivax.datasets.nuplan.features import features_around
-from drivax.datasets.nuplan.geopackage import SQLITE_MAGIC, Database, open_database
 from drivax.datasets.nuplan.log import Agents, Piece, TimeLine
 from drivax.datasets.nuplan.map import City, city_map, corridor, feature_id, find_map
-from drivax.datasets.places import place_tags
+from drivax.datasets.nuplan.map_features import features_around
+from drivax.datasets.nuplan.sqlite import SQLITE_MAGIC, Database, open_database
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.errors import DataError
 from drivax.scenario.recording import STRIDE, Light, MapFeature, Recording
@@ -45,16 +45,12 @@ class NuPlan:
             return False
 
     def describe(self, path: Path) -> Description:
-        """What the log holds, and whether its map is there.
-
-        Raises:
-            DataError: It is damaged.
-        """
+        """What the log holds, and whether its map is there."""
         with open_database(path) as database:
             log = _open_log(database, path)
-            found = nuplan_log.pieces(log.line)
+            pieces = nuplan_log.pieces(log.line)
         times = log.line.time_us
-        scenes = len({piece.scene for piece in found})
+        scenes = len({piece.scene for piece in pieces})
         notes = [
             f"map {log.map_name}",
             f"{(times[-1] - times[0]) * 1e-6:.0f} s of driving in {scenes} scenes",
@@ -65,16 +61,16 @@ class NuPlan:
         except DataError as error:
             missing = (f"maps/{log.map_name}/<version>/map.gpkg",)
             notes.append(str(error))
-        return Description("nuPlan", "SQLite log", None, len(found), tuple(notes), missing)
+        return Description("nuPlan", "SQLite log", None, len(pieces), tuple(notes), missing)
 
     def count(self, path: Path) -> int:
         """Number of windows of 91 steps at the usual stride; 0 where the log cannot be read."""
         try:
             with open_database(path) as database:
-                found = nuplan_log.pieces(nuplan_log.time_line(database))
+                pieces = nuplan_log.pieces(nuplan_log.time_line(database))
         except DataError:
             return 0
-        return sum(max(len(piece.sweeps) - STEPS, 0) // STRIDE + 1 for piece in found)
+        return sum(max(len(piece.sweeps) - STEPS, 0) // STRIDE + 1 for piece in pieces)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """One recording per scene in order of time, and in their place the scenes that cannot be read."""
@@ -110,11 +106,7 @@ def _open_log(database: Database, path: Path) -> _Log:
 
 
 def _recording(log: _Log, piece: Piece, agents: Agents, city: City) -> Recording:
-    """The recording of one piece.
-
-    Raises:
-        DataError: Its part of the log or of the map is damaged, or the two do not belong together.
-    """
+    """The recording of one piece."""
     if len(piece.sweeps) <= CURRENT_STEP:
         raise DataError(
             f"{len(piece.sweeps)} steps without a gap, fewer than {CURRENT_STEP + 1}", cure="skip this record"
@@ -153,7 +145,7 @@ def _lights(
         The lights, and how many connectors with a light the whole map does not have.
     """
     starts = {feature.feature_id: feature.points[0].tolist() for feature in features}
-    lights = readings.Lights(len(piece.sweeps))
+    lights = parsing.Lights(len(piece.sweeps))
     unknown = set()
     for step, connector, state in nuplan_log.light_states(log.database, log.line, piece):
         good = isinstance(connector, int) and 0 <= connector < 2**32

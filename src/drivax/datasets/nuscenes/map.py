@@ -10,15 +10,44 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from drivax.datasets.areas import Area, road_edges
-from drivax.datasets.nuscenes.cropping import Box
-from drivax.datasets.readings import load_json
+from drivax.datasets.parsing import load_json
+from drivax.datasets.road_edges import Area, road_edges
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LINE_KINDS, RoadKind
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in the plane, metres."""
+
+    low: Float[Array, "2"]
+    high: Float[Array, "2"]
+
+    @classmethod
+    def around(cls, xy: Float[Array, "point 2"], margin_m: float) -> Box:
+        """The box of some points, widened on all sides."""
+        return cls(xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m)
+
+    def touches(self, a: Float[Array, "segment 2"], b: Float[Array, "segment 2"]) -> Bool[Array, " segment"]:
+        """Whether the bounding boxes of segments reach into it."""
+        return np.all((np.maximum(a, b) >= self.low) & (np.minimum(a, b) <= self.high), axis=-1)
+
+    def pieces(self, points: Float[Array, "point dim"]) -> Iterator[Float[Array, "part dim"]]:
+        """The parts of a polyline that reach into the box: runs of whole segments, in order.
+
+        A polyline that lies inside as a whole comes out unchanged, so that rings stay closed.
+        """
+        if len(points) < 2:
+            return
+        near = self.touches(points[:-1, :2], points[1:, :2])
+        change = np.flatnonzero(np.diff(np.concatenate(([False], near, [False]))))
+        for start, end in zip(change[::2], change[1::2], strict=True):
+            yield points[start : end + 1]
+
 
 Array = np.ndarray[Any, Any]
 
@@ -28,8 +57,8 @@ SPACING_M = 0.5
 #: No lane is longer.
 _LONGEST_M = 5_000.0
 _TURNS = {"L": 1.0, "S": 0.0, "R": -1.0}
-#: Lanes beside each other: spacing of their centres, angle between them.
-_BESIDE_M, _PARALLEL_RAD = (2.2, 5.5), np.deg2rad(20.0)
+#: Adjacent lanes: spacing of their centres, angle between them.
+_NEIGHBOUR_M, _PARALLEL_RAD = (2.2, 5.5), np.deg2rad(20.0)
 _WIDTHS_M = (2.0, 6.0)
 
 
@@ -70,11 +99,7 @@ class City:
 
 @lru_cache(maxsize=4)
 def city(path: Path) -> City:
-    """The map in a file of the map expansion (v1.0 to v1.3).
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """The map in a file of the map expansion (v1.0 to v1.3)."""
     content = load_json(path)
     try:
         return _Layers(content).city()
@@ -110,9 +135,9 @@ class _Layers:
 
     def _points(self, tokens: Sequence[str]) -> Float[Array, "point 3"]:
         """Nodes by token; those that do not exist are left out and counted."""
-        found = [self._nodes[token] for token in tokens if token in self._nodes]
-        self._count("nodes", len(tokens) - len(found))
-        return np.column_stack((np.array(found, np.float64).reshape(-1, 2), np.zeros(len(found))))
+        nodes = [self._nodes[token] for token in tokens if token in self._nodes]
+        self._count("nodes", len(tokens) - len(nodes))
+        return np.column_stack((np.array(nodes, np.float64).reshape(-1, 2), np.zeros(len(nodes))))
 
     def _count(self, name: str, number: int) -> None:
         if number:
@@ -152,7 +177,7 @@ class _Layers:
                     interpolating=connects,
                 )
             )
-        return beside(lanes)
+        return with_neighbours(lanes)
 
     def _width(self, row: Mapping[str, Any], line: Float[Array, "point 2"]) -> float | None:
         """Area of the lane's polygon over the length of its centre line; None where that is no lane's width."""
@@ -260,8 +285,8 @@ def marking(name: str) -> RoadKind | None:
     return RoadKind.LINE_SOLID_DOUBLE_WHITE if double else RoadKind.LINE_SOLID_SINGLE_WHITE
 
 
-def beside(lanes: Sequence[MapFeature]) -> list[MapFeature]:
-    """Lanes with their neighbours, which the map does not name: lanes that run parallel 2.2 to 5.5 m beside.
+def with_neighbours(lanes: Sequence[MapFeature]) -> list[MapFeature]:
+    """Lanes with their neighbours, which the map does not name: lanes that run parallel at 2.2 to 5.5 m.
 
     Looked up at the middle of each lane; lane connectors have none.
     """
@@ -278,12 +303,12 @@ def beside(lanes: Sequence[MapFeature]) -> list[MapFeature]:
     for i in rows:
         middle = len(lanes[i].points) // 2
         at, course = lanes[i].points[middle, :2], _headings(lanes[i].points[:, :2])[middle]
-        near = np.array(tree.query_ball_point(at, _BESIDE_M[1] + 0.5), dtype=np.int64)
+        near = np.array(tree.query_ball_point(at, _NEIGHBOUR_M[1] + 0.5), dtype=np.int64)
         near = near[(owner[near] != i) & (np.abs(wrap(heading[near] - course)) < _PARALLEL_RAD)]
         offset = points[near] - at
         ahead = offset @ np.array([np.cos(course), np.sin(course)])
         left = offset @ np.array([-np.sin(course), np.cos(course)])
-        good = (np.abs(ahead) < 1.0) & (np.abs(left) >= _BESIDE_M[0]) & (np.abs(left) <= _BESIDE_M[1])
+        good = (np.abs(ahead) < 1.0) & (np.abs(left) >= _NEIGHBOUR_M[0]) & (np.abs(left) <= _NEIGHBOUR_M[1])
         sides = {
             side: tuple(int(lane) for lane in owner[near[good & (sign * left > 0)]][:1])
             for side, sign in (("left_neighbours", 1), ("right_neighbours", -1))

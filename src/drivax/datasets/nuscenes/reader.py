@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from drivax.datasets.ground import flatten
+from drivax.datasets.elevation import flatten
 from drivax.datasets.nuscenes.map import city
 from drivax.datasets.nuscenes.tables import Scene, Tables, has_annotations, scene_rows
-from drivax.datasets.places import place_tags
+from drivax.datasets.parsing import box_centre, check_finite, place_tags, windows_of
 from drivax.datasets.reader import BadRecord, Description
-from drivax.datasets.readings import box_centre, check_finite, windows_of
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.recording import Recording, Tracks
@@ -54,7 +53,7 @@ class NuScenes:
     )
 
     def recognise(self, path: Path) -> bool:
-        """Whether it is ``scene.json`` with the other tables beside it."""
+        """Whether it is ``scene.json`` with the other tables next to it."""
         return path.name == "scene.json" and (path.parent / "sample.json").is_file()
 
     def describe(self, path: Path) -> Description:
@@ -106,16 +105,14 @@ class NuScenes:
 def _maps(path: Path) -> Path:
     """The folder of city maps: where the devkit wants it, or where people unpack the pack, which brings a folder."""
     root = path.parent.parent
-    wanted = root / "maps" / "expansion"
-    return next((f for f in (wanted, root / "maps", root / "expansion") if any(f.glob("*.json"))), wanted)
+    expansion = root / "maps" / "expansion"
+    return next(
+        (f for f in (expansion, root / "maps", root / "expansion") if any(f.glob("*.json"))), expansion
+    )
 
 
 def recording(scene: Scene, map_file: Path, version: str) -> Recording:
-    """One scene at 10 Hz in the city's frame.
-
-    Raises:
-        DataError: The map is missing, or the scene's numbers make no sense.
-    """
+    """One scene at 10 Hz in the city's frame."""
     begin = scene.keyframes_s[0]
     duration = float(scene.keyframes_s[-1] - begin)
     if not duration <= _LONGEST_S:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,9 +14,53 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.datasets.nuscenes.json_rows import rows
 from drivax.errors import DataError
 from drivax.scenario.schema import AgentKind
+
+_CHUNK = 1 << 20
+#: No row of a table is longer; a longer one is damage.
+_LONGEST = 1 << 24
+_BETWEEN = re.compile(r"[ \t\r\n,]*")
+
+
+def rows(path: Path) -> Iterator[dict[str, Any]]:
+    """The objects of a file that holds one array of objects.
+
+    Args:
+        path: The file; it is never held in memory as a whole.
+    """
+    decoder = json.JSONDecoder()
+    number = 0
+    try:
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_CHUNK).lstrip()
+            if not text.startswith("["):
+                raise DataError("is not a table (an array of objects)", file=path, cure="download it again")
+            place = 1
+            while True:
+                # Only places move: cutting the text after every row would copy a chunk thousands of times.
+                between = _BETWEEN.match(text, place)
+                place = place if between is None else between.end()
+                if text.startswith("]", place):
+                    return
+                try:
+                    row, end = decoder.raw_decode(text, place)
+                except ValueError:
+                    more = file.read(_CHUNK)
+                    if not more or len(text) - place > _LONGEST:
+                        raise
+                    text, place = text[place:] + more, 0
+                    continue
+                if not isinstance(row, dict):
+                    raise DataError("is no object", file=path, record=number, cure="download it again")
+                yield row
+                place, number = end, number + 1
+    except FileNotFoundError as error:
+        raise DataError("is missing", file=path, cure="unpack the metadata archive again") from error
+    except (ValueError, RecursionError) as error:
+        problem = f"is damaged after {number} rows ({error})"
+        raise DataError(problem, file=path, cure="unpack the metadata archive again") from error
+
 
 _AGAIN = "unpack the metadata archive again"
 #: Categories by the beginning of their names; the first that fits counts.
@@ -98,14 +144,10 @@ class Tables:
 
     @classmethod
     def read(cls, folder: Path) -> Tables:
-        """Reads the tables of one version (``v1.0-mini``, ...), the large ones row by row.
-
-        Raises:
-            DataError: A table is missing or damaged, or there are no annotations, as in the test split.
-        """
+        """Reads the tables of one version (``v1.0-mini``, ...), the large ones row by row."""
         if not has_annotations(folder):
             raise DataError(
-                "holds no annotations, so nobody but the ego would be there",
+                "holds no annotations: the ego would be the only agent",
                 file=folder / "sample_annotation.json",
                 cure="convert v1.0-trainval or v1.0-mini; the test split has none",
             )
@@ -138,11 +180,7 @@ class Tables:
         )
 
     def scene(self, row: int) -> Scene:
-        """One scene.
-
-        Raises:
-            DataError: It has no keyframes or no poses, or its log is unknown.
-        """
+        """One scene."""
         about = self.scenes[row]
         location, logfile = self.logs.get(about["log_token"], ("", ""))
         samples = np.flatnonzero(self.sample_scene == row)

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
-from drivax.datasets.scenarionet.edges import drivable_on_left, outlines_on_left
+from drivax.datasets import parsing
 from drivax.datasets.scenarionet.values import (  # fmt: skip
     MOST_NUMBERS,
     SKIP,
@@ -22,17 +21,106 @@ from drivax.datasets.scenarionet.values import (  # fmt: skip
     text,
 )
 from drivax.errors import DataError
+from drivax.geometry.polylines import point_to_segment
 from drivax.geometry.vectors import wrap
 from drivax.scenario.build.lanes import WIDTHS_M
 from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import EDGE_KINDS, LANE_KINDS, POLYGON_KINDS, RoadKind
+
+#: Lane points within this distance say on which side of an edge one drives, metres.
+NEIGHBOUR_M = 8.0
+#: Places along a ring that are looked up in the other rings; rings may touch in some.
+_PROBES = 5
+_MOST_COMPARISONS = 100_000_000
+#: Comparisons of points and segments at once.
+_BLOCK = 500_000
+
+
+def outlines_on_left(lines: Sequence[Array]) -> list[Array]:
+    """Rings of the outline of drivable space, exteriors anticlockwise and holes clockwise.
+
+    Rings do not cross, so one inside an even number of others is an exterior, else a hole. A line that is no ring
+    (the outline was clipped) is turned round: GEOS, which makes these outlines, runs clockwise around areas.
+
+    Args:
+        lines: Points of the rings, metres; the first point is repeated at the end.
+    """
+    ring = [len(points) >= 4 and bool((points[0, :2] == points[-1, :2]).all()) for points in lines]
+    rings = [points[:, :2] for points, closed in zip(lines, ring, strict=True) if closed]
+    if _PROBES * len(rings) * sum(map(len, rings)) > _MOST_COMPARISONS:
+        raise DataError(f"an outline of {len(rings)} rings", cure=SKIP)
+    depth = iter([_depth(points, [other for other in rings if other is not points]) for points in rings])
+    turned = []
+    for points, closed in zip(lines, ring, strict=True):
+        anticlockwise = closed and _area(points) > 0
+        exterior = closed and next(depth) % 2 == 0
+        turned.append(points if closed and anticlockwise == exterior else points[::-1].copy())
+    return turned
+
+
+def _area(ring: Array) -> float:
+    """Twice the signed area, anticlockwise positive (shoelace formula around the first point)."""
+    x, y = (ring[:, :2] - ring[0, :2]).T
+    return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]))
+
+
+def _depth(ring: Array, others: Sequence[Array]) -> int:
+    """In how many other rings a ring lies, as most of a few places along it tell."""
+    at = np.linspace(0, len(ring) - 2, _PROBES).astype(np.int64)
+    place = (ring[at] + ring[at + 1]) / 2
+    return sum(int(2 * inside(place, other).sum() > _PROBES) for other in others)
+
+
+def inside(points: Array, ring: Array) -> Array:
+    """Which points lie inside a closed ring (even-odd rule)."""
+    a, b = ring[:-1], ring[1:]
+    above = points[:, None, 1] >= a[None, :, 1]
+    crosses = above != (points[:, None, 1] >= b[None, :, 1])
+    rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])
+    x = a[:, 0] + (points[:, None, 1] - a[:, 1]) / rise * (b - a)[:, 0]
+    return ((crosses & (x > points[:, None, 0])).sum(axis=1) % 2).astype(bool)
+
+
+def drivable_on_left(edges: Sequence[Array], lanes: Sequence[Array]) -> list[Array]:
+    """Edges with most of the lanes next to them on their left; unchanged where no lane is near.
+
+    Args:
+        edges: Points of road edges, metres.
+        lanes: Points of lane centres.
+    """
+    centres = np.concatenate([points[:, :2] for points in lanes]) if lanes else np.zeros((0, 2))
+    if sum(map(len, edges)) * len(centres) > _MOST_COMPARISONS:
+        raise DataError("road edges and lanes of too many points", cure=SKIP)
+    return [points[::-1].copy() if _votes_left(points[:, :2], centres) < 0 else points for points in edges]
+
+
+def _votes_left(edge: Array, centres: Array) -> int:
+    """Lane points next to an edge that are on its left, less those on its right."""
+    low, high = edge.min(axis=0) - NEIGHBOUR_M, edge.max(axis=0) + NEIGHBOUR_M
+    near = centres[np.all((centres >= low) & (centres <= high), axis=1)]
+    block = max(_BLOCK // len(edge), 1)
+    return sum(_votes(edge, near[first : first + block]) for first in range(0, len(near), block))
+
+
+def _votes(edge: Array, points: Array) -> int:
+    a, b = edge[:-1], edge[1:]
+    distance, along = point_to_segment(points[:, None], a[None], b[None])
+    rows = np.arange(len(points))
+    nearest = distance.argmin(axis=1)
+    place = nearest + along[rows, nearest]
+    # What is nearest to an end lies before or behind the edge, not next to it.
+    adjacent = (distance[rows, nearest] <= NEIGHBOUR_M) & (place > 0) & (place < len(a))
+    step, offset = (b - a)[nearest], points - a[nearest]
+    side = np.sign(step[:, 0] * offset[:, 1] - step[:, 1] * offset[:, 0])
+    return int(side[adjacent].sum())
+
 
 Array = np.ndarray[Any, Any]
 
 _MPS_PER_KMH = 1 / 3.6
 #: A limit above this is a placeholder (MetaDrive's is 1000 km/h).
 _FASTEST_MPS = 45.0
-#: Data sets whose converters write limits that nobody measured: 100 km/h on every connector, 85 mph everywhere.
+#: Data sets whose converters write invented limits: 100 km/h on every connector, 85 mph everywhere.
 _MADE_UP_LIMITS = ("nuscenes", "lyft", "nuplan", "av2")
 #: Data sets whose files have road edges with the drivable side on the left.
 _ORIENTED = ("womd",)
@@ -98,9 +186,6 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
         table: Features by name.
         dataset: Where the data come from; decides which limits and which sides of edges can be believed.
         around: A place (x, y) where the ego has been, metres.
-
-    Raises:
-        DataError: A feature holds no numbers, or all of them together are too large.
     """
     named = {name: body for key, body in table.items() if (name := text(key)) and isinstance(body, dict)}
     numbers = sum(extent(value) for body in named.values() for value in body.values())
@@ -120,7 +205,7 @@ def road_map(table: Mapping[Any, Any], dataset: str, around: Array) -> RoadMap:
         features=tuple(_with_edges(features, outline, dataset)),
         names=reading.names,
         flat=flat,
-        lost=readings.counted(**reading.lost),
+        lost=parsing.nonzero(**reading.lost),
     )
 
 
@@ -182,7 +267,7 @@ def _lane(lane: MapFeature, body: Mapping[Any, Any], reading: _Reading) -> MapFe
 
 def _limit(body: Mapping[Any, Any], reading: _Reading) -> float | None:
     """The speed limit in m/s; 0 in the file means unknown."""
-    given = ((body.get("speed_limit_mph"), readings.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
+    given = ((body.get("speed_limit_mph"), parsing.MPS_PER_MPH), (body.get("speed_limit_kmh"), _MPS_PER_KMH))
     for value, unit in given:
         limit = number(value)
         if limit is not None and limit > 0:
@@ -211,14 +296,14 @@ def _width(body: Mapping[Any, Any]) -> float | None:
 
 def _links(value: Any, reading: _Reading) -> tuple[int, ...]:
     """Numbers of linked features. Links come as numbers, texts, or neighbours with a ``feature_id``."""
-    found = []
+    links = []
     for item in items(value):
         link = reading.names.get(item.get("feature_id") if isinstance(item, dict) else item)
         if link is None:
             reading.lost["dangling_links"] += 1
         else:
-            found.append(link)
-    return tuple(found)
+            links.append(link)
+    return tuple(links)
 
 
 def _check_length(features: Sequence[MapFeature]) -> None:
@@ -239,8 +324,8 @@ def third_column_is_heading(lanes: Sequence[Array]) -> bool:
         moved = step.any(axis=1)
         direction = np.arctan2(step[moved, 1], step[moved, 0])
         differences.append(np.abs(wrap(points[:-1, 2][moved] - direction)))
-    found = np.concatenate(differences) if differences else np.zeros(0)
-    return len(found) > 0 and float(np.median(found)) < _YAW_RAD
+    difference = np.concatenate(differences) if differences else np.zeros(0)
+    return len(difference) > 0 and float(np.median(difference)) < _YAW_RAD
 
 
 def _is_outline(name: str, feature: MapFeature) -> bool:

@@ -35,9 +35,6 @@ def load(data: bytes) -> Any:
 
     Arrays are views of the file's bytes (those of booleans as uint8), arrays of objects with one axis become lists,
     NumPy scalars Python numbers, and ordered or default dictionaries plain ones.
-
-    Raises:
-        DataError: It is damaged, too large, or names anything but the few things that data needs.
     """
     if len(data) > MOST_BYTES:
         raise DataError(f"a pickle of {len(data) >> 20} MB", cure=f"drivax reads up to {MOST_BYTES >> 20} MB")
@@ -365,7 +362,7 @@ _CALLED: dict[str, Callable[..., Any]] = {
 
 
 def _content(content: Any) -> bytes:
-    """The bytes of a bytes-like value, never so many new ones."""
+    """The bytes of a bytes-like value; an integer, which would allocate that many, is refused."""
     if isinstance(content, str):
         return _encoded(content)
     if not isinstance(content, bytes | bytearray):

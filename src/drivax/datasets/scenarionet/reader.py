@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
-from drivax.datasets.ground import flatten, lift
+from drivax.datasets import parsing
+from drivax.datasets.elevation import flatten, lift
 from drivax.datasets.nuscenes.reader import CENTRE_AHEAD_M
-from drivax.datasets.places import place_tags
+from drivax.datasets.parsing import place_tags
 from drivax.datasets.reader import BadRecord, Description
 from drivax.datasets.scenarionet import pickles
 from drivax.datasets.scenarionet.map import RoadMap, road_map
@@ -78,11 +78,7 @@ class ScenarioNet:
         )
 
     def describe(self, path: Path) -> Description:
-        """Data set, version and length of the scenario, and what its map lacks.
-
-        Raises:
-            DataError: The file is damaged, or no scenario.
-        """
+        """Data set, version and length of the scenario, and what its map lacks."""
         tree = _load(path)
         recording = decode(tree)
         lanes = [f for f in recording.features if f.kind in LANE_KINDS]
@@ -107,7 +103,7 @@ class ScenarioNet:
         except OSError:
             return 0
         steps = _named_length(head)
-        return 0 if steps is None else readings.windows_of(steps)
+        return 0 if steps is None else parsing.windows_of(steps)
 
     def read(self, path: Path) -> Iterator[Recording | BadRecord]:
         """The recording of one file, or why it cannot be read."""
@@ -142,11 +138,7 @@ def _named_length(head: bytes) -> int | None:
 
 
 def decode(tree: Any) -> Recording:
-    """The recording in a ScenarioNet dictionary, in the file's map frame, metres, float64.
-
-    Raises:
-        DataError: It is none, or contradicts itself.
-    """
+    """The recording in a ScenarioNet dictionary, in the file's map frame, metres, float64."""
     metadata = mapping(tree, "metadata")
     table = {name: body for key, body in mapping(tree, "tracks").items() if (name := text(key)) is not None}
     rows = {name: row for row, name in enumerate(table)}
@@ -155,7 +147,7 @@ def decode(tree: Any) -> Recording:
     around = tracks.xy[ego, int(np.argmax(tracks.valid[ego]))]
     roads = road_map(mapping(tree, "map_features"), dataset, around)
     steps = tracks.valid.shape[1]
-    lost = Counter({**roads.lost, "one_point_features": readings.one_point_features(roads.features)})
+    lost = Counter({**roads.lost, "one_point_features": parsing.one_point_features(roads.features)})
     lights = _lights(mapping(tree, "dynamic_map_states"), steps, dataset, roads, lost)
     tracks, features = _with_heights(tracks, roads)
     return Recording(
@@ -171,7 +163,7 @@ def decode(tree: Any) -> Recording:
         to_predict=_named_rows(metadata.get("tracks_to_predict"), rows),
         of_interest=_named_rows(metadata.get("objects_of_interest"), rows),
         tags=_tags(metadata),
-        lost=readings.counted(**lost),
+        lost=parsing.nonzero(**lost),
         flags=flags,
         split_gap_m=_WOMD_GAP_M if dataset == "womd" else None,
     )
@@ -179,8 +171,8 @@ def decode(tree: Any) -> Recording:
 
 def _identity(tree: Any, metadata: Mapping[Any, Any]) -> str:
     for value in (tree.get("id"), metadata.get("scenario_id"), metadata.get("id")):
-        if found := text(value):
-            return found
+        if identity := text(value):
+            return identity
     raise DataError("the scenario has no id", cure=SKIP)
 
 
@@ -199,7 +191,7 @@ def _ego(metadata: Mapping[Any, Any], rows: Mapping[str, int]) -> int:
     row = rows.get("ego" if named is None else named)
     if row is not None:
         return row
-    raise DataError(f"the ego {(named or 'is not named')[:40]!r} is none of {len(rows)} tracks", cure=SKIP)
+    raise DataError(f"the ego {(named or 'is not named')[:40]!r} is not one of {len(rows)} tracks", cure=SKIP)
 
 
 def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int) -> tuple[Tracks, Flag]:
@@ -209,7 +201,7 @@ def _motion(tracks: Tracks, metadata: Mapping[Any, Any], dataset: str, ego: int)
         tracks = _centred(tracks, ego)
     if velocity_is_missing(tracks):
         times = _timestamps(metadata, tracks.valid.shape[1])
-        tracks = replace(tracks, velocity=readings.differentiate(tracks.xy, tracks.valid, times))
+        tracks = replace(tracks, velocity=parsing.differentiate(tracks.xy, tracks.valid, times))
         flags |= Flag.DIFFERENTIATED_VELOCITY
     return tracks, flags
 
@@ -218,7 +210,7 @@ def _centred(tracks: Tracks, ego: int) -> Tracks:
     """The ego at its box centre: nuScenes' poses are of the rear axle."""
     heading, valid = tracks.heading[ego], tracks.valid[ego]
     xy = tracks.xy.copy()
-    xy[ego] = np.where(valid[:, None], readings.box_centre(xy[ego], heading, CENTRE_AHEAD_M), 0.0)
+    xy[ego] = np.where(valid[:, None], parsing.box_centre(xy[ego], heading, CENTRE_AHEAD_M), 0.0)
     return replace(tracks, xy=xy)
 
 
@@ -257,8 +249,8 @@ def _current_step(metadata: Mapping[Any, Any], steps: int) -> int:
 def _named_rows(value: Any, rows: Mapping[str, int]) -> tuple[int, ...]:
     """Rows of the tracks that a list of names, or a dictionary by name, is about; unknown names are left out."""
     names = list(value) if isinstance(value, dict) else items(value)
-    found = (rows.get(name) for item in names if (name := text(item)) is not None)
-    return tuple(row for row in found if row is not None)
+    numbers = (rows.get(name) for item in names if (name := text(item)) is not None)
+    return tuple(row for row in numbers if row is not None)
 
 
 def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
@@ -271,11 +263,11 @@ def _tags(metadata: Mapping[Any, Any]) -> dict[str, str]:
 def _lights(
     table: Mapping[Any, Any], steps: int, dataset: str, roads: RoadMap, lost: Counter[str]
 ) -> tuple[Light, ...]:
-    """Lights by lane. None in the file is a step at which nobody saw the light."""
+    """Lights by lane. None in the file is a step without an observation."""
     if len(table) * steps > _MOST_STATES:
         raise DataError(f"{len(table)} lights of {steps} steps", cure=SKIP)
     starts = {f.feature_id: f.points[0] for f in roads.features if f.kind in LANE_KINDS}
-    lights = readings.Lights(steps)
+    lights = parsing.Lights(steps)
     for key, body in table.items():
         what = f"light {(text(key) or '')[:40]!r}"
         light = mapping({"": body}, "", what)

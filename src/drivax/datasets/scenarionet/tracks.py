@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing
 from drivax.datasets.scenarionet.values import SKIP, Names, count_rows, floats, mapping
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
@@ -48,9 +48,6 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
         table: Tracks by name, in order.
         names: Their numbers.
         ego: Row of the ego.
-
-    Raises:
-        DataError: States are missing, of different lengths, too many, or no numbers.
     """
     bodies = [
         (f"track {name[:40]!r}", mapping({"": body}, "", f"tracks[{name[:40]!r}]"))
@@ -73,7 +70,7 @@ def read_tracks(table: Mapping[str, Any], names: Names, ego: int) -> Tracks:
     valid = stacked["valid"][..., 0] > 0.5
     for name, limit in _LIMITS.items():
         stacked[name][~valid] = 0.0
-        readings.check_within(limit, stacked[name])
+        parsing.check_within(limit, stacked[name])
     size = np.concatenate([stacked[name] for name in ("length", "width", "height")], axis=-1)
     return Tracks(
         xy=stacked["position"][..., :2].copy(),

@@ -18,11 +18,7 @@ _NUMBER = (int, float)
 
 
 def mapping(parent: Any, name: str, what: str = "the file") -> Mapping[Any, Any]:
-    """The dictionary under a name.
-
-    Raises:
-        DataError: There is none.
-    """
+    """The dictionary under a name."""
     value = parent.get(name) if isinstance(parent, dict) else None
     if not isinstance(value, dict):
         raise DataError(f"{what} has no dictionary {name!r}", cure=SKIP)
@@ -34,11 +30,11 @@ def text(value: Any) -> str | None:
     if isinstance(value, bool) or not isinstance(value, str | int):
         return None
     try:
-        found = str(value)
-        found.encode()
+        written = str(value)
+        written.encode()
     except ValueError:  # a lone surrogate, or an integer of thousands of digits
         return None
-    return found
+    return written
 
 
 def whole(value: Any) -> int | None:
@@ -74,11 +70,7 @@ def extent(value: Any) -> int:
 
 
 def floats(value: Any, what: str) -> Array:
-    """Numbers or rows of up to three numbers as float64; the file may hold arrays, lists or tuples.
-
-    Raises:
-        DataError: It holds anything else.
-    """
+    """Numbers or rows of up to three numbers as float64; the file may hold arrays, lists or tuples."""
     if isinstance(value, np.ndarray):
         narrow = value.ndim == 1 or (value.ndim == 2 and value.shape[1] <= 3)
         if value.dtype.kind in "biuf" and narrow and len(value) <= MOST_NUMBERS:

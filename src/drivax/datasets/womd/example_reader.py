@@ -6,13 +6,12 @@ as one list of points that the writer cut off at 20,000 or 30,000, and at most 1
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
 from drivax.datasets.womd import tf_example
 from drivax.datasets.womd.tfrecord import count_records
@@ -21,24 +20,19 @@ from drivax.scenario.schema import Flag
 
 
 @dataclass(frozen=True)
-class WomdExample:
+class WomdExample(womd.TfRecordReader):
     """Reads tf.Examples: tracks, map points grouped into features, lights re-keyed by lane."""
 
     name: str = womd.EXAMPLE_FORMAT
-    patterns: tuple[str, ...] = womd.PATTERNS
     companions: tuple[str, ...] = ("export.json",)
 
-    def recognise(self, path: Path) -> bool:
-        """Whether the first readable record is a tf.Example of the motion dataset."""
-        return womd.recognise(path, self.name)
+    def decode(self, payload: bytes) -> Recording:
+        """Return the recording in a payload."""
+        return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by sampling and features, truncated map, paths.
-
-        Raises:
-            DataError: It is damaged or of another form.
-        """
-        recording = womd.first_recording(path, self.name, decode)
+        """What the first record shows: version by sampling and features, truncated map, paths."""
+        recording = self.first(path)
         notes = [
             *womd.notes_of(recording),
             "no lane graph and no speed limits: lanes are chained by geometry",
@@ -48,7 +42,7 @@ class WomdExample:
                 "the list of map points is full, the map is cut off; the Scenario protos hold all of it"
             )
         if "paths" in recording.lost:
-            notes.append("path_samples are not used: routes are made anew")
+            notes.append("path_samples are not used: routes are computed again")
         newer = bool(recording.features) and tf_example.is_coarse(recording.features)
         return Description(
             dataset=womd.FULL_NAME,
@@ -58,46 +52,9 @@ class WomdExample:
             notes=tuple(notes),
         )
 
-    def count(self, path: Path) -> int:
-        """Records times windows of the first; 0 where it cannot be read."""
-        return womd.count(path, decode)
-
-    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recordings of one file, and in their place the records that cannot be read."""
-        return womd.read(path, self.name, decode)
-
 
 def decode(payload: bytes) -> Recording:
-    """The recording in a serialised tf.Example.
-
-    Padding rows are dropped; the ego row, rows to predict and of interest are numbered among the rest. Invalid
-    entries (-1 in the file) are zeros, headings are wrapped. Lights are keyed by lane id because the 16 slots are
-    used by different lanes over time. ``path_samples`` are counted as lost: which of them is the route was marked
-    with the log's future.
-
-    Raises:
-        DataError: The payload is no such tf.Example, or a feature is missing or has the wrong length.
-    """
+    """Return the recording in a serialised tf.Example; rows without an id are padding."""
     table = tf_example.features_of(payload)
     used = np.flatnonzero(table.numbers("state/id") != -1)
-    track_id = tf_example.track_ids(table, used)
-    tracks = tf_example.tracks(table, used, track_id)
-    features, truncated = tf_example.map_features(table)
-    scenario_id = table.scenario_id(payload)
-    return Recording(
-        scenario_id=scenario_id,
-        dataset=womd.DATASET,
-        segment=scenario_id,
-        timestamps_s=tf_example.timestamps(table, used, tracks.valid),
-        current_step=table.spans["past"],
-        ego=tf_example.ego_row(table, used),
-        tracks=tracks,
-        features=features,
-        lights=tf_example.lights(table),
-        to_predict=table.marked("state/tracks_to_predict", used),
-        of_interest=table.marked("state/objects_of_interest", used),
-        tags={"source_format": womd.EXAMPLE_FORMAT},
-        lost=tf_example.lost(table, features),
-        flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
-        split_gap_m=tf_example.split_gap_m(features),
-    )
+    return tf_example.recording(table, payload, used, womd.DATASET, womd.EXAMPLE_FORMAT)

@@ -8,15 +8,21 @@ in a descriptor pool of their own and so never clash with an installed ``waymo-o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from drivax.errors import UsageError
+import numpy as np
+from jaxtyping import Float64
+
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
 
 #: (name, number, type): ``*`` marks a repeated field, ``?`` a member of the message's one-of ``kind``.
 _Field = tuple[str, int, str]
 
-#: Messages of the Scenario proto. States and points of polylines are kept as bytes (``womd_tables`` reads them).
+#: Messages of the Scenario proto. States and points of polylines are kept as bytes (:func:`read_table` reads them).
 MESSAGES: dict[str, tuple[_Field, ...]] = {
     "Scenario": (
         ("timestamps_seconds", 1, "double*"),
@@ -91,20 +97,12 @@ _PACKAGES = {"drivax.womd": MESSAGES, "drivax.example": _EXAMPLE}
 
 
 def scenario_class(name: str = "Scenario") -> Any:
-    """The message class of a WOMD ``Scenario``, or of one of its parts.
-
-    Raises:
-        UsageError: protobuf is not installed.
-    """
+    """The message class of a WOMD ``Scenario``, or of one of its parts."""
     return _class("drivax.womd", name)
 
 
 def example_class() -> Any:
-    """The message class of a ``tf.Example``, its map of features declared as repeated entries.
-
-    Raises:
-        UsageError: protobuf is not installed.
-    """
+    """The message class of a ``tf.Example``, its map of features declared as repeated entries."""
     return _class("drivax.example", "Example")
 
 
@@ -120,18 +118,16 @@ def parse(message_class: Any, payload: bytes) -> Any | None:
 
 @cache
 def _class(package: str, name: str) -> Any:
-    found = _pool(package).FindMessageTypeByName(f"{package}.{name}")
+    descriptor = _pool(package).FindMessageTypeByName(f"{package}.{name}")
     from google.protobuf import message_factory
 
-    return message_factory.GetMessageClass(found)
+    return message_factory.GetMessageClass(descriptor)
 
 
 @cache
 def _pool(package: str) -> Any:
-    try:
-        from google.protobuf import descriptor_pb2, descriptor_pool
-    except ImportError as error:
-        raise UsageError("reading WOMD needs protobuf", cure="pip install 'drivax[womd]'") from error
+    descriptor_pb2 = import_extra("google.protobuf.descriptor_pb2")
+    descriptor_pool = import_extra("google.protobuf.descriptor_pool")
     file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto2")
     for message_name, fields in _PACKAGES[package].items():
         _declare(file.message_type.add(name=message_name), fields, package)
@@ -153,3 +149,85 @@ def _declare(message: Any, fields: tuple[_Field, ...], package: str) -> None:
             field.type, field.type_name = field.TYPE_MESSAGE, f".{package}.{plain}"
         else:
             field.type = getattr(field, f"TYPE_{plain.upper()}")
+
+
+_Array = np.ndarray[Any, Any]
+#: Wire types of protocol buffers and what numpy reads there; a bool is a varint of one byte.
+_WIRE = {"double": (1, "<f8"), "float": (5, "<f4"), "bool": (0, "u1")}
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """A message of numbers.
+
+    Attributes:
+        name: Its name.
+        fields: Name, number and type (``double``, ``float``, ``bool``) of every field, in the order of columns.
+        forms: Which fields (by column) may be there together and are read fast, in order of their numbers.
+    """
+
+    name: str
+    fields: tuple[tuple[str, int, str], ...]
+    forms: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, name: str, forms: Sequence[Sequence[str]]) -> Numbers:
+        """The message of this name, with forms by the names of their fields."""
+        fields = MESSAGES[name]
+        columns = {field: column for column, (field, _, _) in enumerate(fields)}
+        return cls(name, fields, tuple(tuple(columns[field] for field in form) for form in forms))
+
+
+@cache
+def _layouts(numbers: Numbers) -> tuple[tuple[np.dtype[Any], tuple[int, ...]], ...]:
+    """Packed record types of every form in both orders, with its columns."""
+    layouts = []
+    for form in numbers.forms:
+        for order in (form, form[::-1]):
+            parts = []
+            for column in order:
+                _, number, kind = numbers.fields[column]
+                parts += [(f"tag{column}", "u1"), (str(column), _WIRE[kind][1])]
+                assert number << 3 | _WIRE[kind][0] < 128, "a tag of one byte"
+            layouts.append((np.dtype(parts), order))
+    return tuple(layouts)
+
+
+def read_table(blobs: Sequence[bytes], numbers: Numbers) -> Float64[np.ndarray, "message field"]:
+    """One row per message, one column per field, 0 where a field is not there."""
+    out = np.zeros((len(blobs), len(numbers.fields)))
+    todo = np.ones(len(blobs), dtype=bool)
+    sizes = np.fromiter(map(len, blobs), np.int64, len(blobs))
+    for layout, columns in _layouts(numbers):
+        rows = np.flatnonzero(todo & (sizes == layout.itemsize))
+        if not rows.size:
+            continue
+        whole = rows.size == len(blobs)
+        records = np.frombuffer(b"".join(blobs if whole else [blobs[row] for row in rows.tolist()]), layout)
+        same = np.ones(len(rows), dtype=bool)
+        for column in columns:
+            _, number, kind = numbers.fields[column]
+            same &= records[f"tag{column}"] == number << 3 | _WIRE[kind][0]
+            if kind == "bool":
+                same &= records[str(column)] < 2
+        with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
+            for column in columns:
+                out[rows[same], column] = records[str(column)][same]
+        todo[rows[same]] = False
+    for row in np.flatnonzero(todo).tolist():
+        out[row] = read_one(blobs[row], numbers)
+    return out
+
+
+def read_one(blob: bytes, numbers: Numbers) -> list[float]:
+    """One row as protobuf reads it."""
+    message = parse(scenario_class(numbers.name), blob)
+    if message is None:
+        raise DataError(
+            f"a message {numbers.name} is damaged", cure="skip this record, or download the file again"
+        )
+    return [float(getattr(message, name)) for name, _, _ in numbers.fields]
+
+
+STATES = Numbers.of("ObjectState", [[name for name, _, _ in MESSAGES["ObjectState"]], ["center_z", "valid"]])
+POINTS = Numbers.of("MapPoint", ["xyz"])

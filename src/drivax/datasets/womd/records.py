@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing
 from drivax.datasets.reader import BadRecord
 from drivax.datasets.womd.messages import example_class, parse, scenario_class
 from drivax.datasets.womd.tf_example import Features, is_motion
@@ -27,8 +28,6 @@ _CONTENTS = {
 }
 #: Signs of ScenarioMax's writer that an example must show at least; one alone may be damage or another exporter.
 _SIGNS = 2
-
-Decode = Callable[[bytes], Recording]
 
 
 def flavour(payload: bytes) -> str | None:
@@ -61,28 +60,8 @@ def scenariomax_signs(features: Features) -> int:
     return int(not features.has("state/difficulty_level")) + int(renumbered) + int(untimed)
 
 
-def recognise(path: Path, name: str) -> bool:
-    """Whether the first readable record of a TFRecord file is of the format ``name``; never raises.
-
-    Where the packages that could look into it are not installed, a TFRecord counts as Scenario protos, so that
-    reading it names what to install.
-    """
-    if not looks_framed(path):
-        return False
-    try:
-        return flavour(_first(path)) == name
-    except UsageError:
-        return name == SCENARIO_FORMAT
-    except DataError:
-        return False
-
-
 def _first(path: Path) -> bytes:
-    """Payload of the first readable record.
-
-    Raises:
-        DataError: There is none; the first damage.
-    """
+    """Payload of the first readable record."""
     damage = DataError("the file is empty", file=path, cure="download it again")
     for number, record in read_records(path):
         if isinstance(record, bytes):
@@ -91,54 +70,76 @@ def _first(path: Path) -> bytes:
     raise damage
 
 
-def first_recording(path: Path, name: str, decode: Decode) -> Recording:
-    """The first readable record of a file, decoded: what ``describe`` looks at.
+@dataclass(frozen=True)
+class TfRecordReader:
+    """Base of the readers of TFRecord files that hold one recording per record."""
 
-    Raises:
-        DataError: It is damaged, or of another form.
-    """
-    payload = _first(path)
-    try:
-        return decode(payload)
-    except DataError as error:
-        better = explain(error, payload, name)
-        raise DataError(better.problem, file=path, cure=better.cure) from error
+    name: str
+    patterns: tuple[str, ...] = PATTERNS
+    companions: tuple[str, ...] = ()
 
+    def decode(self, payload: bytes) -> Recording:
+        """Return the recording in a payload."""
+        raise NotImplementedError
 
-def count(path: Path, decode: Decode) -> int:
-    """Records of a file times windows of the first one; 0 where it cannot be read."""
-    try:
-        return count_records(path) * readings.windows_of(len(decode(_first(path)).timestamps_s))
-    except DrivaxError:
-        return 0
+    def recognise(self, path: Path) -> bool:
+        """Whether the first readable record is of this format; never raises.
 
-
-def read(path: Path, name: str, decode: Decode) -> Iterator[Recording | BadRecord]:
-    """The recordings of a TFRecord file whose payloads ``decode`` reads, and bad records in their places."""
-    for number, record in read_records(path):
-        if isinstance(record, DataError):
-            yield BadRecord.of(record, path, number)
-            continue
+        Where the packages that decode it are not installed, a TFRecord counts as Scenario protos: reading it then
+        names the package to install.
+        """
+        if not looks_framed(path):
+            return False
         try:
-            yield decode(record)
+            return flavour(_first(path)) == self.name
+        except UsageError:
+            return self.name == SCENARIO_FORMAT
+        except DataError:
+            return False
+
+    def first(self, path: Path) -> Recording:
+        """Return the recording of the first readable record."""
+        payload = _first(path)
+        try:
+            return self.decode(payload)
         except DataError as error:
-            yield BadRecord.of(explain(error, record, name), path, number)
+            better = self._explain(error, payload)
+            raise DataError(better.problem, file=path, cure=better.cure) from error
 
+    def count(self, path: Path) -> int:
+        """Return the number of records times the windows of the first; 0 where it cannot be read."""
+        try:
+            return count_records(path) * parsing.windows_of(len(self.decode(_first(path)).timestamps_s))
+        except DrivaxError:
+            return 0
 
-def explain(error: DataError, payload: bytes, name: str) -> DrivaxError:
-    """The error, or a better one where the payload is of another form."""
-    other = flavour(payload)
-    if other is None or other == name:
-        return error
-    return DataError(f"holds {_CONTENTS[other]}, not {_CONTENTS[name]}", cure=f"use --format {other}")
+    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
+        """Yield the recordings of a file, with a bad record in place of each that cannot be decoded."""
+        for number, record in read_records(path):
+            if isinstance(record, DataError):
+                yield BadRecord.of(record, path, number)
+                continue
+            try:
+                yield self.decode(record)
+            except DataError as error:
+                yield BadRecord.of(self._explain(error, record), path, number)
+
+    def _explain(self, error: DataError, payload: bytes) -> DrivaxError:
+        """Return the error, or a better one where the payload is of another format."""
+        other = flavour(payload)
+        if other is None or other == self.name:
+            return error
+        return DataError(
+            f"holds {_CONTENTS[other]}, not {_CONTENTS[self.name]}", cure=f"use --format {other}"
+        )
 
 
 def notes_of(recording: Recording) -> tuple[str, ...]:
     """What a user should know about recordings like this one: length, future, lights."""
     steps, now = len(recording.timestamps_s), recording.current_step
     notes = [f"{steps} steps, current step {now}"]
-    if readings.windows_of(steps) > 1:
-        notes.append(f"each recording becomes {readings.windows_of(steps)} windows of 91 steps")
+    if parsing.windows_of(steps) > 1:
+        notes.append(f"each recording becomes {parsing.windows_of(steps)} windows of 91 steps")
     elif now == steps - 1:
         notes.append("no future (test split): stored, but refused for training and evaluation")
     if not recording.lights:

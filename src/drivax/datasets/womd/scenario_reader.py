@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from drivax.datasets import readings
-from drivax.datasets.reader import BadRecord, Description
+from drivax.datasets import parsing
+from drivax.datasets.reader import Description
 from drivax.datasets.womd import records as womd
-from drivax.datasets.womd.message_tables import POINTS, STATES, read_table
-from drivax.datasets.womd.messages import parse, scenario_class
+from drivax.datasets.womd.messages import POINTS, STATES, parse, read_table, scenario_class
 from drivax.datasets.womd.tf_example import agent_kind
 from drivax.datasets.womd.tfrecord import count_records
 from drivax.errors import DataError
@@ -34,24 +33,18 @@ _Points = Float64[np.ndarray, "point 3"]
 
 
 @dataclass(frozen=True)
-class WomdScenario:
+class WomdScenario(womd.TfRecordReader):
     """Reads Scenario protos: dense tracks, map with lane graph and speed limits, lights by lane."""
 
     name: str = womd.SCENARIO_FORMAT
-    patterns: tuple[str, ...] = womd.PATTERNS
-    companions: tuple[str, ...] = ()
 
-    def recognise(self, path: Path) -> bool:
-        """Whether the first readable record is a Scenario proto."""
-        return womd.recognise(path, self.name)
+    def decode(self, payload: bytes) -> Recording:
+        """Return the recording in a payload."""
+        return decode(payload)
 
     def describe(self, path: Path) -> Description:
-        """What the first record shows: version by kinds of features, length, lane graph, lights.
-
-        Raises:
-            DataError: It is damaged or of another form.
-        """
-        recording = womd.first_recording(path, self.name, decode)
+        """What the first record shows: version by kinds of features, length, lane graph, lights."""
+        recording = self.first(path)
         lanes = [feature for feature in recording.features if feature.kind in LANE_KINDS]
         linked = any(lane.successors or lane.predecessors for lane in lanes)
         notes = list(womd.notes_of(recording))
@@ -66,14 +59,6 @@ class WomdScenario:
             notes=tuple(notes),
         )
 
-    def count(self, path: Path) -> int:
-        """Records times windows of the first; 0 where it cannot be read."""
-        return womd.count(path, decode)
-
-    def read(self, path: Path) -> Iterator[Recording | BadRecord]:
-        """The recordings of one file, and in their place the records that cannot be read."""
-        return womd.read(path, self.name, decode)
-
 
 def decode(payload: bytes) -> Recording:
     """The recording in a serialised ``Scenario``.
@@ -81,9 +66,6 @@ def decode(payload: bytes) -> Recording:
     Positions stay in the proto's map frame, metres, float64. Headings are wrapped (the files hold up to 10 rad),
     invalid states are zeros (the files keep a z there), speed limits are m/s and None where the file says 0.
     Links to lanes that the file does not hold are kept.
-
-    Raises:
-        DataError: The payload is no Scenario, or contradicts itself.
     """
     message = parse(scenario_class(), payload)
     if message is None or not message.scenario_id:
@@ -102,8 +84,8 @@ def decode(payload: bytes) -> Recording:
         tracks=_tracks(message.tracks, steps),
         features=features,
         lights=_lights(message.dynamic_map_states, steps),
-        to_predict=readings.rows_within(
-            [wanted.track_index for wanted in message.tracks_to_predict],
+        to_predict=parsing.rows_within(
+            [prediction.track_index for prediction in message.tracks_to_predict],
             len(message.tracks),
             "tracks_to_predict",
         ),
@@ -122,7 +104,7 @@ def _check(message: Any, steps: int) -> None:
         raise DataError("the scenario has no steps or no tracks", cure=_SKIP)
     if not 0 <= message.current_time_index < steps:
         raise DataError(f"current_time_index is {message.current_time_index} of {steps} steps", cure=_SKIP)
-    readings.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
+    parsing.rows_within([message.sdc_track_index], len(message.tracks), "sdc_track_index")
     if len(message.dynamic_map_states) > steps:
         raise DataError(f"{len(message.dynamic_map_states)} light steps, {steps} steps", cure=_SKIP)
     seen = set()
@@ -139,7 +121,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
     table = read_table(blobs, STATES).reshape(len(tracks), steps, -1)
     valid = table[..., 9] > 0.5
     table[~valid] = 0.0
-    readings.check_finite(table)
+    parsing.check_finite(table)
     return Tracks(
         xy=table[..., 0:2].copy(),
         z=table[..., 2].copy(),
@@ -153,7 +135,7 @@ def _tracks(tracks: Any, steps: int) -> Tracks:
 
 
 def _lights(states: Any, steps: int) -> tuple[Light, ...]:
-    lights = readings.Lights(steps)
+    lights = parsing.Lights(steps)
     for step, state in enumerate(states):
         for lane in state.lane_states:
             point = lane.stop_point
@@ -186,11 +168,11 @@ def _features(messages: Any) -> tuple[tuple[MapFeature, ...], dict[str, int]]:
         _feature(feature_id, kind, body, line.copy())
         for (feature_id, kind, body, _), line in zip(parts, np.split(points, ends), strict=False)
     )
-    lost = readings.counted(
+    lost = parsing.nonzero(
         unknown_features=unknown,
         empty_features=empty,
         duplicate_features=twice,
-        one_point_features=readings.one_point_features(features),
+        one_point_features=parsing.one_point_features(features),
     )
     return features, lost
 
@@ -219,7 +201,7 @@ def _lane(feature_id: int, lane: Any, points: _Points) -> MapFeature:
         feature_id=feature_id,
         kind=RoadKind(lane.type) if 0 <= lane.type <= 3 else RoadKind.LANE_UNDEFINED,
         points=points,
-        limit_mps=lane.speed_limit_mph * readings.MPS_PER_MPH if lane.speed_limit_mph > 0 else None,
+        limit_mps=lane.speed_limit_mph * parsing.MPS_PER_MPH if lane.speed_limit_mph > 0 else None,
         successors=tuple(lane.exit_lanes),
         predecessors=tuple(lane.entry_lanes),
         left_neighbours=tuple(neighbour.feature_id for neighbour in lane.left_neighbors),

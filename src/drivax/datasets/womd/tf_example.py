@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from drivax.datasets import readings
+from drivax.datasets import parsing
 from drivax.datasets.womd.messages import example_class, parse
 from drivax.errors import DataError
 from drivax.geometry.vectors import wrap
-from drivax.scenario.recording import Light, MapFeature, Tracks
-from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, AgentKind, RoadKind
+from drivax.scenario.recording import Light, MapFeature, Recording, Tracks
+from drivax.scenario.schema import LANE_KINDS, POLYGON_KINDS, AgentKind, Flag, RoadKind
 
 SKIP = "skip this record, or download the file again"
 _SPANS = ("past", "current", "future")
@@ -38,11 +38,7 @@ def agent_kind(code: int) -> AgentKind:
 
 
 def features_of(payload: bytes) -> Features:
-    """The features in a serialised tf.Example.
-
-    Raises:
-        DataError: The payload is none.
-    """
+    """The features in a serialised tf.Example."""
     message = parse(example_class(), payload)
     if message is None or not message.features.feature:
         raise DataError("the payload is not a tf.Example", cure=SKIP)
@@ -62,11 +58,7 @@ class Features:
         return kind is not None and len(getattr(value, kind).value) > 0
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
-        """A numeric feature, checked against and brought into a shape.
-
-        Raises:
-            DataError: It is missing, no numbers, or has the wrong length.
-        """
+        """A numeric feature, checked against and brought into a shape."""
         value = self._values.get(name)
         kind = value.WhichOneof("kind") if value is not None else None
         if kind not in ("float_list", "int64_list"):
@@ -76,17 +68,13 @@ class Features:
             values = np.array(getattr(value, kind).value, dtype)
         if shape is None:
             return values
-        wanted = int(np.prod(shape))
-        if values.size != wanted:
-            raise DataError(f"feature {name} has {values.size} values, not {wanted}", cure=SKIP)
+        count = int(np.prod(shape))
+        if values.size != count:
+            raise DataError(f"feature {name} has {values.size} values, not {count}", cure=SKIP)
         return values.reshape(shape)
 
     def integers(self, name: str, shape: tuple[int, ...] | None = None) -> Array:
-        """A feature that must be stored as whole numbers: ids of lanes would be rounded by floats.
-
-        Raises:
-            DataError: As ``numbers``, or it is stored as floats.
-        """
+        """A feature that must be stored as whole numbers: ids of lanes would be rounded by floats."""
         values = self.numbers(name, shape)
         if values.dtype != np.int64:
             raise DataError(f"feature {name} holds floats, not integers", cure=SKIP)
@@ -132,13 +120,40 @@ class Features:
         return np.concatenate(parts, axis=1)
 
 
+def recording(table: Features, payload: bytes, used: Array, dataset: str, source_format: str) -> Recording:
+    """Return the recording in the rows used.
+
+    Invalid entries (-1 in the file) are zeros, headings are wrapped. Lights are keyed by lane because the 16 slots
+    hold different lanes over time. ``path_samples`` count as lost: the route among them was marked with the log's
+    future.
+    """
+    track_id = track_ids(table, used)
+    made = tracks(table, used, track_id)
+    mapped, truncated = map_features(table)
+    scenario_id = table.scenario_id(payload)
+    return Recording(
+        scenario_id=scenario_id,
+        dataset=dataset,
+        segment=scenario_id,
+        timestamps_s=timestamps(table, used, made.valid),
+        current_step=table.spans["past"],
+        ego=ego_row(table, used),
+        tracks=made,
+        features=mapped,
+        lights=lights(table),
+        to_predict=table.marked("state/tracks_to_predict", used),
+        of_interest=table.marked("state/objects_of_interest", used),
+        tags={"source_format": source_format},
+        lost=lost(table, mapped),
+        flags=Flag.TRUNCATED_MAP if truncated else Flag.NONE,
+        split_gap_m=split_gap_m(mapped),
+    )
+
+
 def track_ids(features: Features, used: Array) -> Array:
     """Ids of the rows used, as int64.
 
     The file stores them as floats. WOMD's are far below 2**24, up to where that is exact.
-
-    Raises:
-        DataError: One is not a whole number, too large to be exact, negative, or given twice.
     """
     ids = features.numbers("state/id")[used]
     if not np.isfinite(ids).all() or (ids != np.round(ids)).any() or (np.abs(ids) > _EXACT).any():
@@ -149,16 +164,12 @@ def track_ids(features: Features, used: Array) -> Array:
 
 
 def tracks(features: Features, used: Array, track_id: Array) -> Tracks:
-    """The tracks in the rows used; what is not valid (-1 in the file) is zero, headings are wrapped.
-
-    Raises:
-        DataError: A feature is missing, has the wrong length, or valid states are not finite.
-    """
+    """The tracks in the rows used; what is not valid (-1 in the file) is zero, headings are wrapped."""
     valid = features.over_time("valid", used) == 1
 
     def measured(*names: str) -> Array:
         values = [np.where(valid, features.over_time(name, used).astype(np.float64), 0.0) for name in names]
-        readings.check_finite(*values)
+        parsing.check_finite(*values)
         return values[0] if len(values) == 1 else np.stack(values, axis=-1)
 
     kinds = np.nan_to_num(features.numbers("state/type", (features.numbers("state/id").size,))[used])
@@ -177,15 +188,11 @@ def tracks(features: Features, used: Array, track_id: Array) -> Tracks:
 def timestamps(features: Features, used: Array, valid: Array) -> Array:
     """Seconds of every step; where no valid state has a time, 10 Hz from the nearest that has."""
     micros = np.where(valid, features.over_time("timestamp_micros", used), -1).max(axis=0, initial=-1)
-    return readings.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
+    return parsing.seconds(np.where(micros >= 0, micros * 1e-6, np.nan))
 
 
 def ego_row(features: Features, used: Array) -> int:
-    """The ego's row among the rows used.
-
-    Raises:
-        DataError: None or several are marked.
-    """
+    """The ego's row among the rows used."""
     ego = features.marked("state/is_sdc", used)
     if len(ego) != 1:
         raise DataError(f"state/is_sdc marks {len(ego)} rows, not 1", cure=SKIP)
@@ -193,12 +200,8 @@ def ego_row(features: Features, used: Array) -> int:
 
 
 def lights(features: Features) -> tuple[Light, ...]:
-    """Lights by lane: the slots are used by different lanes over time.
-
-    Raises:
-        DataError: A feature is missing, has the wrong length, or lane ids are stored as floats.
-    """
-    found = readings.Lights(sum(features.spans.values()))
+    """Lights by lane: the slots are used by different lanes over time."""
+    collector = parsing.Lights(sum(features.spans.values()))
     start = 0
     for span, steps in features.spans.items():
         base = f"traffic_light_state/{span}/"
@@ -209,19 +212,15 @@ def lights(features: Features) -> tuple[Light, ...]:
             points = np.stack([features.numbers(base + axis, (steps, slots)) for axis in "xyz"], axis=-1)
             seen = (valid == 1) & (lanes >= 0) & np.isfinite(states) & np.isfinite(points).all(axis=-1)
             for step, slot in np.argwhere(seen).tolist():
-                found.observe(
+                collector.observe(
                     start + step, int(lanes[step, slot]), int(states[step, slot]), points[step, slot].tolist()
                 )
         start += steps
-    return found.collected()
+    return collector.collected()
 
 
 def map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
-    """Map features in order of first appearance, and whether the list of points is full, so probably cut off.
-
-    Raises:
-        DataError: A feature is missing, has the wrong length, or ids are stored as floats.
-    """
+    """Map features in order of first appearance, and whether the list of points is full, so probably cut off."""
     base = "roadgraph_samples/"
     if not features.has(base + "id"):
         return (), False
@@ -230,12 +229,12 @@ def map_features(features: Features) -> tuple[tuple[MapFeature, ...], bool]:
     points = features.numbers(base + "xyz", (ids.size, 3)).astype(np.float64)
     valid = features.numbers(base + "valid", ids.shape) == 1
     keep = np.flatnonzero(valid & np.isin(kinds, [int(kind) for kind in RoadKind]))
-    readings.check_finite(points[keep])
+    parsing.check_finite(points[keep])
     limits = _limits(features, ids.size)
     made = []
     for group in _groups(ids, keep):
         kind = RoadKind(int(kinds[group[0]]))
-        limit = float(limits[group].max()) * readings.MPS_PER_MPH if kind in LANE_KINDS else 0.0
+        limit = float(limits[group].max()) * parsing.MPS_PER_MPH if kind in LANE_KINDS else 0.0
         ring = _unclosed(points[group]) if kind in POLYGON_KINDS else points[group]
         made.append(MapFeature(int(ids[group[0]]), kind, ring, limit_mps=limit if limit > 0 else None))
     return tuple(made), bool(valid.all())
@@ -265,19 +264,19 @@ def _unclosed(points: Array) -> Array:
     return points[:-1] if closed else points
 
 
-def is_coarse(found: Sequence[MapFeature]) -> bool:
+def is_coarse(mapped: Sequence[MapFeature]) -> bool:
     """Whether the map is sampled at 1 m (from v1.2 on) rather than at 0.5 m."""
-    return (readings.spacing_m(found) or 0.5) > 0.75
+    return (parsing.spacing_m(mapped) or 0.5) > 0.75
 
 
-def split_gap_m(found: Sequence[MapFeature]) -> float:
+def split_gap_m(mapped: Sequence[MapFeature]) -> float:
     """Where polylines are cut: at twice the nominal spacing of their points."""
-    return 2.0 if is_coarse(found) else 1.0
+    return 2.0 if is_coarse(mapped) else 1.0
 
 
-def lost(features: Features, found: Sequence[MapFeature]) -> dict[str, int]:
+def lost(features: Features, mapped: Sequence[MapFeature]) -> dict[str, int]:
     """What is left out: the ego's published paths, and features of one point."""
-    return readings.counted(paths=_paths(features), one_point_features=readings.one_point_features(found))
+    return parsing.nonzero(paths=_paths(features), one_point_features=parsing.one_point_features(mapped))
 
 
 def _paths(features: Features) -> int:

@@ -9,11 +9,74 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from drivax.errors import DataError, UsageError
+import numpy as np
+
+from drivax.datasets.parsing import import_extra
+from drivax.errors import DataError
+
+_Array = np.ndarray[Any, Any]
+
+#: Wire type of everything that has a length, and the fields of ``Feature`` by kind of list.
+_LENGTH, _BYTES, _FLOATS, _INTEGERS = 2, 1, 2, 3
+#: Values that encode in seven bits a byte: at most ten bytes for 64 bits.
+_GROUPS = np.arange(10, dtype=np.uint64)
+
+
+def example(features: Mapping[str, bytes | _Array]) -> bytes:
+    """A serialised tf.Example, its features in order of their names.
+
+    Args:
+        features: By name: bytes (a list of one), an integer array (int64 list) or a floating-point array (float32
+            list); arrays are flattened row by row.
+    """
+    entries = b"".join(
+        _field(1, _field(1, name.encode()) + _field(2, _feature(features[name]))) for name in sorted(features)
+    )
+    return _field(1, entries)
+
+
+def _feature(value: bytes | _Array) -> bytes:
+    if isinstance(value, bytes):
+        return _field(_BYTES, _field(1, value))
+    if np.issubdtype(value.dtype, np.floating):
+        return _field(_FLOATS, _field(1, value.astype("<f4").tobytes()))
+    return _field(_INTEGERS, _field(1, varints(value)))
+
+
+def _field(number: int, content: bytes) -> bytes:
+    return bytes((number << 3 | _LENGTH,)) + varints(np.array([len(content)])) + content
+
+
+def varints(values: _Array) -> bytes:
+    """Integers as variable-length ones: seven bits a byte, the least first; negative ones take ten bytes."""
+    bits = values.reshape(-1, 1).astype(np.int64).view(np.uint64)
+    groups = bits >> (np.uint64(7) * _GROUPS)
+    more = groups >= 128
+    used = np.concatenate((np.ones_like(more[:, :1]), more[:, :-1]), axis=1)
+    return (
+        ((groups & np.uint64(127)) | (more.astype(np.uint64) << np.uint64(7)))
+        .astype(np.uint8)[used]
+        .tobytes()
+    )
+
+
+def shard_name(name: str, number: int, shards: int) -> str:
+    """The usual file name of a shard."""
+    return f"{name}.tfrecord-{number:05d}-of-{shards:05d}"
+
+
+def write_record(file: BinaryIO, payload: bytes) -> None:
+    """Append one record."""
+    crc32c = import_extra("google_crc32c").value
+    length = struct.pack("<Q", len(payload))
+    for part in (length, payload):
+        file.write(part)
+        file.write(struct.pack("<I", masked(crc32c(part))))
+
 
 _HEADER_BYTES, _FOOTER_BYTES = 12, 4
 _MASK = 0xA282EAD8
@@ -38,10 +101,6 @@ def read_records(path: str | Path) -> Iterator[tuple[int, bytes | DataError]]:
 
     Yields:
         (record number, payload or error). An empty file yields one error.
-
-    Raises:
-        DataError: The file cannot be opened.
-        UsageError: google-crc32c is not installed.
     """
     crc32c = _crc32c()
     path = Path(path)
@@ -156,10 +215,4 @@ def _bad_length(header: bytes, start: int) -> DataError:
 
 
 def _crc32c() -> Callable[[bytes], int]:
-    try:
-        import google_crc32c
-    except ImportError as error:
-        raise UsageError(
-            "reading TFRecord files needs google-crc32c", cure="pip install 'drivax[womd]'"
-        ) from error
-    return google_crc32c.value
+    return import_extra("google_crc32c").value

@@ -117,7 +117,7 @@ def along_curve(
 
 
 def slowed(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
-    """A vehicle of the cast that brakes from a step on until it stands: it stays on the way it took."""
+    """A vehicle of the roles that brakes from a step on until it stands: it stays on the way it took."""
     xy, heading = motion.xy[row], np.unwrap(motion.heading[row])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     times = DT_S * (np.arange(len(xy)) - step)

@@ -41,7 +41,7 @@ class _Way:
     @classmethod
     def through(cls, scene: Scene, way: int, rng: np.random.Generator) -> _Way:
         """The way through a connector, from far before it."""
-        lanes = scene.cast.network.lanes
+        lanes = scene.roles.network.lanes
         before, after = _chain(lanes, way, -1, _FROM_M, rng), _chain(lanes, way, 1, _BEYOND_M, rng)
         ahead = [lanes[i].curve for i in reversed(before)]
         line = sum(float(curve.arc_m[-1]) for curve in ahead)
@@ -158,7 +158,7 @@ class CrossTraffic:
 
     def _ways(self, scene: Scene) -> list[int]:
         """Connectors of actors that cross one that ego will drive through during the recording."""
-        network = scene.cast.network
+        network = scene.roles.network
         return sorted({other for mine in scene.connectors for other in self._crossing(network, mine)})
 
     def _crossing(self, network: RoadNetwork, mine: int) -> list[int]:
@@ -216,7 +216,7 @@ class CrossTraffic:
 
     def _fits_lights(self, scene: Scene, lane: int, entry: int) -> bool:
         """A runner enters at red (not just now), a turner without a red light."""
-        network = scene.cast.network
+        network = scene.roles.network
         if network.signals is None:
             return self.turning
         colour, _ = network.signals.colours(scene.times_s, len(network.lanes))

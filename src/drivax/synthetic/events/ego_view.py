@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS
 from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.curves import STEP_M
-from drivax.synthetic.traffic.roles import Cast, Motion
+from drivax.synthetic.traffic.roles import Motion, Roles
 
 #: Events begin in this range of steps of the recording, and are over or in full swing at the last one.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
@@ -100,12 +100,12 @@ class Scene:
     """The scenario without the event.
 
     Attributes:
-        cast: Who is in it.
+        roles: Who is in it.
         motion: How they go; row 0 is ego.
         first_step: Step of ``motion`` at which the recording begins.
     """
 
-    cast: Cast
+    roles: Roles
     motion: Motion
     first_step: int
 
@@ -143,7 +143,7 @@ class Scene:
     @cached_property
     def _lane_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Every second sample of all lanes: position, heading, lane."""
-        lanes = self.cast.network.lanes
+        lanes = self.roles.network.lanes
         return (
             np.concatenate([lane.curve.xy[::2] for lane in lanes]),
             np.concatenate([lane.curve.heading[::2] for lane in lanes]),
@@ -158,7 +158,7 @@ class Scene:
         near = (gap < 2.0) & (np.cos(turned - heading) > 0.8)
         if not near.any():
             return -1
-        on_route = near & np.isin(lane, self.cast.route)
+        on_route = near & np.isin(lane, self.roles.route)
         chosen = on_route if on_route.any() else near
         return int(lane[chosen][np.argmin(gap[chosen])])
 
@@ -167,14 +167,14 @@ class Scene:
         lane = self.lane_at(station)
         if lane < 0:
             return -1
-        here = self.cast.network.lanes[lane]
+        here = self.roles.network.lanes[lane]
         return here.left if side > 0 else here.right
 
     @cached_property
     def lane_ends(self) -> list[tuple[float, int]]:
         """Where lanes beside ego's way end or lead off the road: stations, and on which side they are."""
         result = []
-        for lane in self.cast.network.lanes:
+        for lane in self.roles.network.lanes:
             if lane.ends or lane.exit_only:
                 (station,), (aside,) = self.track.projected(lane.curve.xy[-1:])
                 if 2.0 < abs(aside) < 5.5 and station > 0:
@@ -186,7 +186,7 @@ class Scene:
         origin, heading = self.track.place(station)
         out = side * np.array([-np.sin(heading), np.cos(heading)])
         best = math.inf
-        for edge in self.cast.network.edges:
+        for edge in self.roles.network.edges:
             a = edge.xy - origin
             b = np.roll(a, -1, axis=0)
             # In the frame (out, along): where the side crosses the ray.
@@ -201,7 +201,7 @@ class Scene:
     def plain_road(self, station: float) -> bool:
         """Whether there is an ordinary lane, no junction, under ego at a station, and no crosswalk near."""
         lane = self.lane_at(station)
-        network = self.cast.network
+        network = self.roles.network
         if lane < 0 or network.lanes[lane].connector:
             return False
         xy, _ = self.track.place(station)
@@ -212,11 +212,11 @@ class Scene:
         """The ways across junctions that ego takes during the recording, or would take right after it."""
         begin, end = self.track.at[self.first_step + EARLIEST], self.track.at[self.last_step] + 30.0
         found = {self.lane_at(station) for station in np.arange(begin, end, 3.0).tolist()}
-        return sorted(i for i in found if i >= 0 and self.cast.network.lanes[i].connector)
+        return sorted(i for i in found if i >= 0 and self.roles.network.lanes[i].connector)
 
     def meets_junction(self, low_m: float, high_m: float) -> bool:
         """Whether ego's way has a light, a sign or a crossing way between two stations, where actors are deaf."""
-        lanes = self.cast.network.lanes
+        lanes = self.roles.network.lanes
         found = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
         return any(lanes[lane].connector for lane in found if lane >= 0)
 
@@ -235,7 +235,7 @@ class Scene:
 
         Ego drives as it would without, or slower by the common law of following.
         """
-        drivers, at, speed = self.cast.drivers.idm, self.track.at, self.motion.speed[0]
+        drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
         law = replace(
             drivers,
             headway_s=drivers.headway_s[:1],

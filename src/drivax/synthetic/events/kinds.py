@@ -63,7 +63,7 @@ class Proposal:
     Attributes:
         severity_mps2: What it is meant to require of ego.
         threat: How the actor will go if nobody disturbs it, at all steps.
-        vehicle: Its row if it is a vehicle of the cast; else it is the first of the extras.
+        vehicle: Its row if it is a vehicle of the roles; else it is the first of the extras.
         others: Rows of further actors.
         scene: The scene with the actor in it, where ego drives otherwise because of it long before the event.
     """

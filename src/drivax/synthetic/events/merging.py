@@ -139,7 +139,7 @@ class CutIn:
         places = np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0)
         lane = -1
         reach = finish
-        lanes = scene.cast.network.lanes
+        lanes = scene.roles.network.lanes
         for place in places.tolist():
             found = scene.neighbour(place, side)
             if found < 0:

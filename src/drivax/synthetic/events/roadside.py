@@ -32,7 +32,7 @@ def _has_streets(network: RoadNetwork) -> bool:
 def _place(scene: Scene, station: float) -> bool:
     """Whether something may come from the side here: an ordinary street away from junctions and crosswalks."""
     lane = scene.lane_at(station)
-    return scene.plain_road(station) and scene.cast.network.lanes[lane].limit_mps <= _STREET_MPS
+    return scene.plain_road(station) and scene.roles.network.lanes[lane].limit_mps <= _STREET_MPS
 
 
 def _across(
@@ -126,16 +126,16 @@ class Jaywalker:
     def _behind_parked(
         self, scene: Scene, wanted: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
-        if not scene.cast.parked:
+        if not scene.roles.parked:
             return None
-        centres = np.array([car.xy[0] for car in scene.cast.parked])
+        centres = np.array([car.xy[0] for car in scene.roles.parked])
         station, left = scene.track.projected(centres)
         steps = np.arange(scene.first_step + EARLIEST, scene.first_step + LATEST)
         speed = scene.motion.speed[0, steps]
         beside = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > scene.track.at[steps[0]] + 6.0)
         order = rng.permutation(np.flatnonzero(beside & (station < scene.track.at[steps[-1]] + 40.0)))
         for car in order[:6].tolist():
-            line = float(station[car]) + scene.cast.parked[car].size_m[0] / 2 + 0.55
+            line = float(station[car]) + scene.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
             front = scene.track.at[steps] + (scene.ego_size_m[0] + _PERSON_M[1]) / 2
             needs = [self._needs(scene, offset, float(v), pace, wanted) if v > 4.0 else None for v in speed]

@@ -1,4 +1,4 @@
-"""The expert who drives ego: the same stack as everyone, driven smoothly, and judged before it is accepted."""
+"""The expert that drives ego: the traffic model with a smooth driver, replanned where its motion is rejected."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from jaxtyping import Float64
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.comfort import discomfort
 from drivax.synthetic.expert.plan import plan_ego
-from drivax.synthetic.expert.violations import Fault, eventful, fault, last_stop
+from drivax.synthetic.expert.violations import Violation, find_violation, is_staged, last_stop
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import LaneChange, Path, Sway, lane_path, random_lanes
-from drivax.synthetic.traffic.roles import Cast, EgoPlan, Motion, Staging
+from drivax.synthetic.traffic.roles import EgoPlan, Motion, Roles, Staging
 
-#: Experts that brake harder than this are not shown, m/s2: comfort (-4.05) in common driving, the end of the
+#: Experts that brake harder than this are rejected, m/s2: comfort (-4.05) in common driving, the end of the
 #: common law's range where an event leaves no choice.
 HARDEST_MPS2, HARDEST_IN_EVENT_MPS2 = 4.0, 6.0
-#: What no plan for ego can mend, and what a plan hardly ever mends unless something is staged.
+#: Causes that no ego plan can fix, and a cause that a plan rarely fixes unless an event is staged.
 _HOPELESS, _STUCK = ("ego_leaves_map", "other_runs_red", "others_collide"), "ego_hardly_moves"
 
-#: Moves everyone: what is staged, and ego's plan.
+#: Runs traffic with a staging and ego's plan.
 TrafficRun = Callable[[Staging, EgoPlan | None], Motion]
 
 
-def drawn_expert(rng: np.random.Generator) -> Drivers:
-    """Draws ego's car and its driver: never above the limit, and well inside the limits of comfort."""
+def draw_expert(rng: np.random.Generator) -> Drivers:
+    """Draw ego's car and driver: below the speed limit and well within comfort limits."""
 
-    def one(low: float, high: float) -> Float64[np.ndarray, " 1"]:
+    def uniform(low: float, high: float) -> Float64[np.ndarray, " 1"]:
         return rng.uniform(low, high, size=1)
 
     size = np.array([[rng.uniform(4.5, 5.0), rng.uniform(1.85, 2.05), rng.uniform(1.5, 1.8)]])
@@ -37,26 +37,26 @@ def drawn_expert(rng: np.random.Generator) -> Drivers:
         kind=np.full(1, AgentKind.VEHICLE, np.int8),
         size_m=size,
         top_speed_mps=np.full(1, np.inf),
-        speed_factor=one(0.85, 0.98),
-        lateral_mps2=one(1.8, 2.4),
-        slowing_mps2=one(1.1, 1.5),
-        yellow_mps2=one(2.2, 2.6),
-        jerk_mps3=one(2.0, 2.6),
-        headway_s=one(1.3, 1.8),
-        acceleration_mps2=one(1.3, 1.8),
-        braking_mps2=one(1.8, 2.2),
-        politeness=one(0.3, 0.5),
+        speed_factor=uniform(0.85, 0.98),
+        lateral_mps2=uniform(1.8, 2.4),
+        slowing_mps2=uniform(1.1, 1.5),
+        yellow_mps2=uniform(2.2, 2.6),
+        jerk_mps3=uniform(2.0, 2.6),
+        headway_s=uniform(1.3, 1.8),
+        acceleration_mps2=uniform(1.3, 1.8),
+        braking_mps2=uniform(1.8, 2.2),
+        politeness=uniform(0.3, 0.5),
         reaction_s=np.zeros(1),
-        critical_gap_s=one(4.5, 5.5),
+        critical_gap_s=uniform(4.5, 5.5),
     )
 
 
 def expert_lanes(
     network: RoadNetwork, lane: int, change_share: float, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], LaneChange | None]:
-    """Draws ego's lanes from the lane on which it begins, and sometimes a lane change on the third or fourth lane.
+    """Draw ego's lanes from its first lane on, and sometimes a lane change on the third or fourth lane.
 
-    The lane before the first one is part of the way, so that a route has room behind ego.
+    A predecessor of the first lane is included: a route needs room behind ego.
     """
     lanes = random_lanes(network, lane, rng)
     before = network.lanes[lane].predecessors
@@ -66,89 +66,89 @@ def expert_lanes(
     if not sections or rng.random() >= change_share:
         return lanes, None
     section = int(rng.choice(sections))
-    beside = int(rng.choice(_neighbours(network, lanes[section])))
+    neighbour = int(rng.choice(_neighbours(network, lanes[section])))
     change = LaneChange(section, float(rng.uniform(1.0, 12.0)), float(rng.uniform(52.0, 64.0)))
-    return (*lanes[: section + 1], *random_lanes(network, beside, rng)), change
+    return (*lanes[: section + 1], *random_lanes(network, neighbour, rng)), change
 
 
 def _neighbours(network: RoadNetwork, lane: int) -> list[int]:
-    """Lanes beside this one that are about as long and long enough to change to."""
+    """Adjacent lanes that are long enough to change to."""
     this = network.lanes[lane]
-    beside = [other for other in (this.left, this.right) if other >= 0]
-    return [] if this.connector or not 70.0 < this.length_m < 100.0 else beside
+    neighbour = [other for other in (this.left, this.right) if other >= 0]
+    return [] if this.connector or not 70.0 < this.length_m < 100.0 else neighbour
 
 
 def expert_path(
     network: RoadNetwork, lanes: tuple[int, ...], change: LaneChange | None, rng: np.random.Generator
 ) -> Path:
-    """Ego's path: close to the centre of its lanes."""
+    """Return ego's path, close to the centres of its lanes."""
     return lane_path(network, lanes, Sway.drawn(rng, 0.12), change)
 
 
-def drive(
-    cast: Cast,
+def drive_ego(
+    roles: Roles,
     times_s: Float64[np.ndarray, " time"],
     staging: Staging,
     first_step: int,
     traffic_run: TrafficRun,
     aware_step: int = 0,
-    begun: Motion | None = None,
+    unplanned: Motion | None = None,
 ) -> tuple[Motion, str]:
-    """Lets ego drive well: as the common driver if that is good enough, else as planned with knowledge of the others.
+    """Drive ego like other traffic if that is acceptable, else along a plan that knows the others' motion.
 
-    Everybody reacts to a plan, so it is run, judged and made again where that spoils it.
+    Other agents react to a plan, so each plan is simulated and checked, and replaced where it fails.
 
     Args:
-        cast: Everybody.
+        roles: All users.
         times_s: Times of all steps, on the clock of the lights.
         staging: What is staged.
         first_step: Where the recording begins; from here on ego may be planned.
-        traffic_run: Moves everyone: :meth:`drivax.synthetic.traffic.simulation.Traffic.run`.
-        aware_step: Ego does not act on what is staged before this step, if it can be mastered from then on.
-        begun: What ``traffic_run`` gives without a plan, where that is known.
+        traffic_run: Runs the traffic: :meth:`drivax.synthetic.traffic.simulation.Traffic.run`.
+        aware_step: Ego reacts to the event from this step on, if that is early enough.
+        unplanned: What ``traffic_run`` gives without a plan, where that is known.
 
     Returns:
-        What everybody did, and why it must not be shown (empty: it is good).
+        The motion, and the cause of its rejection (empty: accepted).
     """
     hardest, hopeless = HARDEST_MPS2, (*_HOPELESS, _STUCK)
-    if eventful(staging):
+    if is_staged(staging):
         hardest, hopeless = HARDEST_IN_EVENT_MPS2, _HOPELESS
 
-    def judged(motion: Motion) -> Fault:
-        return fault(cast, motion, times_s, first_step, staging, hardest)
+    def find(motion: Motion) -> Violation:
+        return find_violation(roles, motion, times_s, first_step, staging, hardest)
 
     def pleasant(motion: Motion) -> bool:
         return not discomfort(motion.heading[0, first_step:], motion.speed[0, first_step:])
 
-    motion = begun or traffic_run(staging, None)
-    found = judged(motion)
-    if (not found.cause and pleasant(motion)) or found.cause in hopeless:
-        return motion, found.cause
-    # What is safe but rough is kept, unless a plan does better.
-    rough = None if found.cause else motion
-    minded: frozenset[int] = frozenset()
-    for begin in _beginnings(cast, motion, found, first_step, aware_step):
-        plan = plan_ego(cast, motion, times_s, begin, minded)
+    motion = unplanned or traffic_run(staging, None)
+    violation = find(motion)
+    if (not violation.cause and pleasant(motion)) or violation.cause in hopeless:
+        return motion, violation.cause
+    # A safe but uncomfortable motion is the fallback.
+    rough = None if violation.cause else motion
+    unreactive: frozenset[int] = frozenset()
+    for begin in _beginnings(roles, motion, violation, first_step, aware_step):
+        plan = plan_ego(roles, motion, times_s, begin, unreactive)
         motion = traffic_run(staging, plan)
-        found = judged(motion)
-        minded |= set(found.users)
-        if not found.cause and (rough is None or pleasant(motion)):
+        violation = find(motion)
+        unreactive |= set(violation.users)
+        if not violation.cause and (rough is None or pleasant(motion)):
             return motion, ""
-        if found.cause in ("", *hopeless):
+        if violation.cause in ("", *hopeless):
             break
-    return (motion, found.cause) if rough is None else (rough, "")
+    return (motion, violation.cause) if rough is None else (rough, "")
 
 
 def _beginnings(
-    cast: Cast, motion: Motion, found: Fault, first_step: int, aware_step: int
+    roles: Roles, motion: Motion, violation: Violation, first_step: int, aware_step: int
 ) -> tuple[int, int, int]:
-    """Where the first, second and last plan begin: each earlier than the one before.
+    """Return the first steps of three plans, each earlier than the previous.
 
-    Who stood at a stop sign before things go wrong has stood: only the last plan begins before that.
+    Only the last plan may begin before ego's last stop at a stop sign.
     """
     late = max(first_step, aware_step)
-    stood = last_stop(cast, motion, first_step)
-    if found.cause == "ego_collides":
-        late = late if late < found.step else first_step
-        stood = stood if stood < found.step else first_step
+    stood = last_stop(roles, motion, first_step)
+    if violation.cause == "ego_collides":
+        late = late if late < violation.step else first_step
+        stood = stood if stood < violation.step else first_step
     return max(late, stood), max((first_step + late) // 2, stood), first_step

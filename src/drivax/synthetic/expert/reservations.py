@@ -1,4 +1,4 @@
-"""Which places of ego's way are taken at which time: by other road users, and by lights and rules at stop lines."""
+"""When ego's path is occupied by other users, and when lights and rules close its stop lines."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from drivax.geometry.boxes import overlap
-from drivax.synthetic.expert.trajectories import SPACING_M, Way, way_boxes
+from drivax.synthetic.expert.trajectories import SPACING_M, CandidatePath, candidate_boxes
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import LaneSpan, Path
 
-#: Kept free around ego: at its bumpers and at its sides, m; what is checked in the end is 0.1 m.
+#: Hard margin at ego's bumpers and sides, m; the final check uses 0.1 m.
 HARD_M = (0.35, 0.2)
-#: Liked free around ego, m; and where somebody is on foot or on a bicycle.
+#: Preferred margin, m, for vehicles and for pedestrians and cyclists.
 NEAR_M, NEAR_PEOPLE_M = (1.2, 0.5), (2.0, 1.2)
-#: Every so many samples of the way are looked at first.
+#: Stride of the coarse pass over path samples.
 _STRIDE = 4
-#: Nobody likes to pass a light that turns red sooner than this, s.
+#: Ego avoids passing a light that turns red sooner than this, s.
 _LATE_YELLOW_S = 1.0
-#: Where ego has to give way, nobody who goes first may be nearer than this, s.
+#: Smallest time gap to users with priority where ego gives way, s.
 _YIELD_S = 2.0
 #: Where ego rests before a line, m from it.
 _SHORT_M = 0.5
 
 
 @dataclass(frozen=True)
-class Meetings:
-    """Where ego's box on its way would meet other users: one entry for each (user, step, sample of the way).
+class Conflicts:
+    """Overlaps of ego's box along its path with other users, one entry per (user, step, path sample).
 
     Attributes:
         hard: True where they would touch, else they would only be close.
@@ -40,14 +40,14 @@ class Meetings:
     point: Int64[np.ndarray, " meeting"]
     hard: Bool[np.ndarray, " meeting"]
 
-    def only(self, keep: Bool[np.ndarray, " meeting"]) -> Meetings:
-        """Some of the meetings."""
-        return Meetings(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
+    def only(self, keep: Bool[np.ndarray, " meeting"]) -> Conflicts:
+        """Return a subset."""
+        return Conflicts(self.user[keep], self.step[keep], self.point[keep], self.hard[keep])
 
 
 @dataclass(frozen=True)
-class Wall:
-    """A line that ego's centre may not pass for a while.
+class StopLine:
+    """A line that ego's centre must not pass at some steps.
 
     Attributes:
         base_m: Where it is, m ahead of ego along the path.
@@ -60,17 +60,17 @@ class Wall:
     late: Bool[np.ndarray, " time"]
 
 
-def meetings(
-    way: Way,
+def find_conflicts(
+    candidate: CandidatePath,
     size_m: Float64[np.ndarray, " 3"],
     others: Float64[np.ndarray, "user time 6"],
     valid: Bool[np.ndarray, "user time"],
     people: Bool[np.ndarray, " user"],
-) -> Meetings:
-    """All meetings of ego's box along a way with the boxes of others.
+) -> Conflicts:
+    """Find conflicts of ego's box along a path with other boxes.
 
     Args:
-        way: Ego's way.
+        candidate: Ego's path.
         size_m: Ego's length, width, height.
         others: Boxes of the others.
         valid: When they exist.
@@ -78,12 +78,12 @@ def meetings(
     """
     liked = np.where(people[:, None], NEAR_PEOPLE_M, NEAR_M)
     still = valid.all(axis=1) & (others == others[:, :1]).all(axis=(1, 2))
-    ego = way_boxes(way, size_m)
-    moving = _met(ego, others, valid & ~still[:, None], liked)
-    # Who never moves is looked at once.
-    once = _met(ego, others[:, :1], still[:, None], liked)
+    ego = candidate_boxes(candidate, size_m)
+    moving = _box_conflicts(ego, others, valid & ~still[:, None], liked)
+    # Static users are tested at one step only.
+    once = _box_conflicts(ego, others[:, :1], still[:, None], liked)
     steps = others.shape[1]
-    return Meetings(
+    return Conflicts(
         user=np.concatenate([moving.user, np.repeat(once.user, steps)]),
         step=np.concatenate([moving.step, np.tile(np.arange(steps), len(once.step))]),
         point=np.concatenate([moving.point, np.repeat(once.point, steps)]),
@@ -91,14 +91,14 @@ def meetings(
     )
 
 
-def _met(
+def _box_conflicts(
     ego: Float64[np.ndarray, "point 6"],
     others: Float64[np.ndarray, "user time 6"],
     valid: Bool[np.ndarray, "user time"],
-    liked_m: Float64[np.ndarray, "user 2"],
-) -> Meetings:
-    """Meetings of boxes: first of circles around them at every fourth sample, then exactly."""
-    reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + liked_m).T)
+    margin_m: Float64[np.ndarray, "user 2"],
+) -> Conflicts:
+    """Find conflicts of boxes: circles at every fourth sample first, then exact overlap."""
+    reach = np.hypot(*(others[:, 0, 4:].T / 2)) + np.hypot(*(ego[0, 4:] / 2 + margin_m).T)
     reach += _STRIDE * SPACING_M / 2
     user, step = np.nonzero(valid & _around(others, ego, reach))
     coarse = ego[::_STRIDE, :2]
@@ -110,14 +110,14 @@ def _met(
     inside = (point >= 0) & (point < len(ego))
     row, point = row[inside], point[inside]
     other, mine = others[user[row], step[row]], ego[point]
-    close = overlap(_wider(mine, liked_m[user[row]]), other)
+    close = overlap(_wider(mine, margin_m[user[row]]), other)
     row, point, other, mine = row[close], point[close], other[close], mine[close]
     hard = overlap(_wider(mine, np.array(HARD_M)), other)
-    return Meetings(user[row], step[row], point, hard)
+    return Conflicts(user[row], step[row], point, hard)
 
 
 def _wider(box: Float64[np.ndarray, "n 6"], by_m: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "n 6"]:
-    """Boxes with this much more at each end and at each side."""
+    """Grow boxes at each end and each side."""
     size = box[:, 4:] + 2 * by_m
     return np.concatenate([box[:, :4], size], axis=1)
 
@@ -127,21 +127,21 @@ def _around(
     ego: Float64[np.ndarray, "point 6"],
     reach: Float64[np.ndarray, " user"],
 ) -> Bool[np.ndarray, "user time"]:
-    """Who is near the rectangle around the way at all."""
+    """Mask of users near the bounding rectangle of the path."""
     low, high = ego[:, :2].min(axis=0), ego[:, :2].max(axis=0)
     outside = np.maximum(low - others[..., :2], others[..., :2] - high).max(axis=-1)
     return outside < reach[:, None]
 
 
-def walls(
+def stop_lines(
     network: RoadNetwork,
     path: Path,
     ego_m: tuple[float, float],
     times_s: Float64[np.ndarray, " time"],
     passed: Float64[np.ndarray, " time"],
     arrivals: dict[int, Bool[np.ndarray, " time"]],
-) -> list[Wall]:
-    """The stop lines ahead.
+) -> list[StopLine]:
+    """Return the stop lines ahead.
 
     Args:
         network: The roads.
@@ -149,7 +149,7 @@ def walls(
         ego_m: Where on it ego's centre is now, and half of ego's length.
         times_s: Times, on the clock of the lights.
         passed: Where on the path ego's centre was at these times in the last run: it tells when its turn came.
-        arrivals: For connectors, when somebody who goes first is on them or about to be.
+        arrivals: Per connector, when a user with priority is on it or about to be.
     """
     from_m, half_m = ego_m
     result = []
@@ -171,7 +171,7 @@ def walls(
         for first in lane.yields_to:
             late |= arrivals.get(first, np.zeros(len(times_s), bool))
         if closed.any() or late.any():
-            result.append(Wall(line - _SHORT_M - from_m, closed, late))
+            result.append(StopLine(line - _SHORT_M - from_m, closed, late))
     return result
 
 

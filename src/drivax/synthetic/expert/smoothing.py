@@ -42,7 +42,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Drive:
+class SpeedProfile:
     """A drive from the present step on: distance and speed, and by how much it exceeds its bounds (in their units)."""
 
     at_m: Float64[np.ndarray, " time"]
@@ -86,7 +86,7 @@ def smoothed(
     speed: Float64[np.ndarray, " time"],
     acceleration_mps2: float,
     bounds: Bounds,
-) -> Drive:
+) -> SpeedProfile:
     """The smoothest drive near a coarse one.
 
     Args:
@@ -100,10 +100,10 @@ def smoothed(
     free = speed[0] * DT_S * np.arange(1, steps + 1)
     before = np.zeros(steps)
     before[0] = acceleration_mps2 / DT_S
-    wanted = np.concatenate(
+    linear_terms = np.concatenate(
         [_PLACE * (at_m[1:] - free), _SPEED * (speed[1:] - speed[0]), np.zeros(steps), _JERK * before]
     )
-    target = _times(rows.T, wanted)
+    target = _times(rows.T, linear_terms)
     low_a, high_a = (np.full(steps, a) for a in bounds.acceleration_mps2)
     # Jerk counts a tenth, so that a bound is exceeded by about as much as one of the others.
     scale = np.repeat([1.0, 0.1], [3 * steps, steps])
@@ -114,7 +114,7 @@ def smoothed(
     knots = _least(base, target, bounded, low * scale, high * scale)
     value = _times(bounded, knots)
     excess = float(np.maximum(np.maximum(value - high * scale, low * scale - value), 0.0).max())
-    return _driven(float(speed[0]), _times(rows[2 * steps : 3 * steps], knots), excess)
+    return _profile(float(speed[0]), _times(rows[2 * steps : 3 * steps], knots), excess)
 
 
 def _least(
@@ -124,7 +124,7 @@ def _least(
     low: Float64[np.ndarray, " m"],
     high: Float64[np.ndarray, " m"],
 ) -> Float64[np.ndarray, " n"]:
-    """Minimises ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
+    """Minimise ``a B a / 2 - t a`` and the penalties of ``low <= R a <= high`` by Newton steps with a line search."""
     a = np.linalg.solve(base, target)
     value = _times(rows, a)
     for _ in range(_NEWTON_STEPS):
@@ -175,10 +175,10 @@ def _share(
     return (below + above) / 2
 
 
-def _driven(speed: float, a: Float64[np.ndarray, " step"], excess: float) -> Drive:
+def _profile(speed: float, a: Float64[np.ndarray, " step"], excess: float) -> SpeedProfile:
     """Speeds below zero, and creeping where the car has as good as stopped, become standing."""
     after = speed + np.cumsum(a) * DT_S
     after = np.where(after < 0.03, 0.0, after)
     whole = np.concatenate([[speed], after])
     travelled = np.concatenate([[0.0], np.cumsum((whole[1:] + whole[:-1]) * DT_S / 2)])
-    return Drive(travelled, whole, excess)
+    return SpeedProfile(travelled, whole, excess)

@@ -1,4 +1,4 @@
-"""The best speeds along a way by dynamic programming over place, speed and time.
+"""Speed search along a path by dynamic programming over position, speed and time.
 
 Steps of 0.5 s, speeds on a grid that holds the present speed, and a grid of places on which every step ends exactly:
 with speeds ``i dv`` a step covers ``(i + j) dv dt / 2``. One step is one gather over (acceleration, speed, place).
@@ -31,8 +31,8 @@ TOUCH = 1e5
 
 
 @dataclass(frozen=True)
-class Claims:
-    """What is taken on a way: at a step (axis 0) and at a distance from ego (axis 1, even spacing).
+class Occupancy:
+    """Occupancy of a path by step (axis 0) and distance from ego (axis 1, even spacing).
 
     Attributes:
         spacing_m: Distance between places.
@@ -96,32 +96,32 @@ def _grid(speed_mps: float, top_mps: float, reach_m: float) -> tuple[_Grid, int]
 
 
 def search(
-    claims: Claims,
-    fastest_mps: Float64[np.ndarray, " place"],
-    bound_mps: Float64[np.ndarray, " place"],
+    occupancy: Occupancy,
+    preferred_mps: Float64[np.ndarray, " place"],
+    limit_mps: Float64[np.ndarray, " place"],
     speed_mps: float,
 ) -> SpeedPlan:
-    """The cheapest speeds.
+    """Return the cheapest speeds.
 
     Args:
-        claims: What is taken, from the present step on.
-        fastest_mps: Liked speed at the places of ``claims``.
-        bound_mps: Speed that bends allow there.
+        occupancy: What is taken, from the present step on.
+        preferred_mps: Liked speed at the places of ``occupancy``.
+        limit_mps: Speed that bends allow there.
         speed_mps: Speed now.
     """
-    steps = -(-(len(claims.hard) - 1) // COARSE)
-    reach = claims.spacing_m * (claims.hard.shape[1] - 1)
-    top = max(float(fastest_mps.max()), speed_mps)
+    steps = -(-(len(occupancy.hard) - 1) // COARSE)
+    reach = occupancy.spacing_m * (occupancy.hard.shape[1] - 1)
+    top = max(float(preferred_mps.max()), speed_mps)
     reach = min(reach, (top + 1.0) * (steps + 1) * _STEP_S)
     grid, start = _grid(speed_mps, top, reach)
     speeds, places = len(grid.speed), len(grid.place)
-    liked = np.interp(grid.place, claims.spacing_m * np.arange(len(fastest_mps)), fastest_mps)
-    bound = np.interp(grid.place, claims.spacing_m * np.arange(len(bound_mps)), bound_mps)
+    liked = np.interp(grid.place, occupancy.spacing_m * np.arange(len(preferred_mps)), preferred_mps)
+    bound = np.interp(grid.place, occupancy.spacing_m * np.arange(len(limit_mps)), limit_mps)
     difference = grid.speed[:, None] - liked
     over = np.maximum(grid.speed[:, None] - bound, 0.0)
     always = np.where(difference > 0, _FAST, _SLOW) * difference**2 + _BEND * over**2
     always = (always * _STEP_S).astype(np.float32)
-    taken = _Taken(claims, grid)
+    taken = _Taken(occupancy, grid)
     layers = np.full((steps + 1, speeds * places + 1), np.inf, np.float32)
     layers[0, start * places] = 0.0
     for k in range(1, steps + 1):
@@ -132,7 +132,7 @@ def search(
 
 
 def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Taken) -> SpeedPlan:
-    """Goes back from the cheapest end."""
+    """Trace back from the cheapest final state."""
     places = len(grid.place)
     state = int(np.argmin(layers[-1]))
     cost = float(layers[-1, state])
@@ -150,42 +150,42 @@ def _traced(grid: _Grid, layers: Float32[np.ndarray, "coarse state"], taken: _Ta
 class _Taken:
     """Costs of claims at (speed, place); within half a coarse step a state is taken to keep its speed."""
 
-    def __init__(self, claims: Claims, grid: _Grid) -> None:
-        self._claims, self._grid = claims, grid
+    def __init__(self, occupancy: Occupancy, grid: _Grid) -> None:
+        self._occupancy, self._grid = occupancy, grid
         half = COARSE // 2
-        places = claims.hard.shape[1]
+        places = occupancy.hard.shape[1]
         moved = grid.place + (DT_S * np.arange(-half, half + 1))[:, None, None] * grid.speed[:, None]
-        self._index = np.clip(np.rint(moved / claims.spacing_m).astype(int), 0, places - 1)
+        self._index = np.clip(np.rint(moved / occupancy.spacing_m).astype(int), 0, places - 1)
         # The steps around one, as one row: what happens at the last step goes on.
-        price = TOUCH * claims.hard + (_CLOSE * DT_S) * claims.near
+        price = TOUCH * occupancy.hard + (_CLOSE * DT_S) * occupancy.near
         price = np.concatenate([price, np.repeat(price[-1:], COARSE + half, axis=0)]).astype(np.float32)
         self._price, self._places = price.ravel(), places
         self._flat = self._index + (places * np.arange(COARSE))[:, None, None]
-        self._ahead = _free_ahead(claims)
-        self._column = np.clip(np.rint(grid.place / claims.spacing_m).astype(int), 0, places - 1)
+        self._ahead = _free_ahead(occupancy)
+        self._column = np.clip(np.rint(grid.place / occupancy.spacing_m).astype(int), 0, places - 1)
         pace = np.minimum(grid.speed[:, None] / 5.0, 2.0)
-        # Even who stands must not be touched.
+        # Contact costs at standstill, too.
         self._pace, self._following = pace + 0.02, (_CLOSE_BEHIND * _STEP_S) * np.minimum(pace, 1.0)
-        self._wanted = _HEADWAY_S * grid.speed[:, None] + 0.5
+        self._preferred_gap = _HEADWAY_S * grid.speed[:, None] + 0.5
 
     def cost(self, step: int) -> Float32[np.ndarray, "speed place"]:
         """Cost of all states around a step."""
         first = (step - COARSE // 2) * self._places
         around = self._price[first : first + COARSE * self._places].take(self._flat).sum(axis=0)
         free = self._ahead[min(step, len(self._ahead) - 1)][self._column]
-        close = np.maximum(1.0 - (free - 1.0) / self._wanted, 0.0) ** 2
+        close = np.maximum(1.0 - (free - 1.0) / self._preferred_gap, 0.0) ** 2
         return around * self._pace + close * self._following
 
     def touched(self, step: int, v: int, s: int) -> bool:
         """Whether something is touched around a step."""
         half = COARSE // 2
-        rows = np.minimum(step + np.arange(-half, half + 1), len(self._claims.hard) - 1)
-        return bool(self._claims.hard[rows, self._index[:, v, s]].any())
+        rows = np.minimum(step + np.arange(-half, half + 1), len(self._occupancy.hard) - 1)
+        return bool(self._occupancy.hard[rows, self._index[:, v, s]].any())
 
 
-def _free_ahead(claims: Claims) -> Float32[np.ndarray, "time place"]:
+def _free_ahead(occupancy: Occupancy) -> Float32[np.ndarray, "time place"]:
     """Distance from each place to the next one ahead that is taken, m; 1 km where none is."""
-    places = claims.hard.shape[1]
-    index = np.where(claims.hard, np.arange(places), places + round(1000.0 / claims.spacing_m))
+    places = occupancy.hard.shape[1]
+    index = np.where(occupancy.hard, np.arange(places), places + round(1000.0 / occupancy.spacing_m))
     nearest = np.minimum.accumulate(index[:, ::-1], axis=1)[:, ::-1]
-    return ((nearest - np.arange(places)) * claims.spacing_m).astype(np.float32)
+    return ((nearest - np.arange(places)) * occupancy.spacing_m).astype(np.float32)

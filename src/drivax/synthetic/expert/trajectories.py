@@ -1,4 +1,4 @@
-"""Where ego may drive from now on: along its path, or shifted aside for a while to pass something in the way."""
+"""Candidate paths for ego: its own path, or a shifted one that passes an obstacle."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivax.synthetic.traffic.lateral import located, quintic_step
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path, smoothed_curvature
 
-#: Distance between the samples of a way, m.
+#: Distance between the samples of a path, m.
 SPACING_M = 0.5
 #: Lateral acceleration and yaw rate beyond which no plan goes: nuPlan's limits of comfort with a reserve.
 _LATERAL_MPS2, _YAW_RATE_RPS = 4.2, 0.8
@@ -26,7 +26,7 @@ _RETURN_M = 30.0
 
 @dataclass(frozen=True)
 class Shift:
-    """Aside and back by quintic steps.
+    """Lateral offset with quintic transitions.
 
     Attributes:
         aside_m: How far to the left (right where negative).
@@ -42,21 +42,21 @@ class Shift:
 
 
 @dataclass(frozen=True)
-class Way:
+class CandidatePath:
     """A curve that begins at ego's centre.
 
     Attributes:
         xy, heading: Samples every ``SPACING_M``.
-        base_m: Where each sample is beside the path, m ahead of ego along the path.
-        fastest_mps: The speed that the driver likes.
-        bound_mps: The speed that bends allow at most.
+        base_m: Position of each sample along the original path, m ahead of ego.
+        preferred_mps: The speed that the driver likes.
+        limit_mps: The speed that bends allow at most.
     """
 
     xy: Float64[np.ndarray, "point 2"]
     heading: Float64[np.ndarray, " point"]
     base_m: Float64[np.ndarray, " point"]
-    fastest_mps: Float64[np.ndarray, " point"]
-    bound_mps: Float64[np.ndarray, " point"]
+    preferred_mps: Float64[np.ndarray, " point"]
+    limit_mps: Float64[np.ndarray, " point"]
     shift: Shift = Shift()
 
     @property
@@ -78,14 +78,16 @@ class Way:
         return xy, np.interp(at_m, arc, self.heading)
 
 
-def shifted_way(path: Path, drivers: Drivers, pose: Pose, span_m: tuple[float, float], shift: Shift) -> Way:
-    """A way that leaves the path and comes back.
+def shifted_path(
+    path: Path, drivers: Drivers, pose: Pose, span_m: tuple[float, float], shift: Shift
+) -> CandidatePath:
+    """Return a path that leaves the original one and returns to it.
 
     Args:
         path: Ego's path.
         drivers: Row 0 is ego's driver.
         pose: Where ego is now.
-        span_m: About where on the path ego is, and how far the way reaches, m; it ends where the path does.
+        span_m: About where on the path ego is, and how far the path reaches, m; it ends where the path does.
         shift: How it leaves the path.
     """
     begin, left, direction = located(path, np.array([pose.x, pose.y]), span_m[0])
@@ -116,8 +118,8 @@ def _with_speeds(
     curve: Curve,
     base_m: tuple[float, Float64[np.ndarray, " point"]],
     shift: Shift,
-) -> Way:
-    """Adds the speeds that limits and bends allow."""
+) -> CandidatePath:
+    """Add the speeds that limits and bends allow."""
     curvature = smoothed_curvature(curve, SPACING_M)
     grid = path.step_m * np.arange(len(path.curve.xy))
     limit = np.interp(base_m[0] + base_m[1], grid, path.limit_mps)
@@ -127,19 +129,25 @@ def _with_speeds(
     fastest = speed_profile(driven, *map(float, driver))
     bend = np.maximum(np.abs(curvature), 1e-6)
     bound = np.minimum(np.sqrt(_LATERAL_MPS2 / bend), _YAW_RATE_RPS / bend)
-    return Way(curve.xy, curve.heading, base_m[1], fastest, bound, shift)
+    return CandidatePath(curve.xy, curve.heading, base_m[1], fastest, bound, shift)
 
 
-def way_boxes(way: Way, size_m: Float64[np.ndarray, " 3"], every: int = 1) -> Float64[np.ndarray, "point 6"]:
-    """Ego's box at the samples of a way."""
-    heading = way.heading[::every]
+def candidate_boxes(
+    candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"], every: int = 1
+) -> Float64[np.ndarray, "point 6"]:
+    """Return ego's box at the samples of a path."""
+    heading = candidate.heading[::every]
     size = np.broadcast_to(size_m[:2], (len(heading), 2))
     return np.concatenate(
-        [way.xy[::every], np.cos(heading)[:, None], np.sin(heading)[:, None], size], axis=-1
+        [candidate.xy[::every], np.cos(heading)[:, None], np.sin(heading)[:, None], size], axis=-1
     )
 
 
-def way_corners(way: Way, size_m: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "corner 2"]:
-    """Corners of ego's box every metre of the part of a way that is not on the path."""
-    away = (way.base_m >= way.shift.begin_m - 2.0) & (way.base_m <= way.shift.end_m + 2.0)
-    return corners(way_boxes(way, size_m)[away][::2]).reshape(-1, 2)
+def candidate_corners(
+    candidate: CandidatePath, size_m: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, "corner 2"]:
+    """Return corners of ego's box every metre where a candidate leaves the original path."""
+    away = (candidate.base_m >= candidate.shift.begin_m - 2.0) & (
+        candidate.base_m <= candidate.shift.end_m + 2.0
+    )
+    return corners(candidate_boxes(candidate, size_m)[away][::2]).reshape(-1, 2)

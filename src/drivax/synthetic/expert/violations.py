@@ -1,4 +1,4 @@
-"""Why a scenario must not be shown: ego is no expert in it, or somebody does what nobody does."""
+"""Violations that reject a generated scenario: collisions, broken rules, harsh braking, leaving the road."""
 
 from __future__ import annotations
 
@@ -13,26 +13,25 @@ from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.paths import Path
-from drivax.synthetic.traffic.roles import Cast, Motion, Staging
+from drivax.synthetic.traffic.roles import Motion, Roles, Staging
 
-#: Ego is tested for overlap with so much around it, m: its replay in float32, beside others who are recorded with
-#: noise, must not touch either.
+#: Margin around ego in overlap tests, m: covers replay in float32 and the noise of recorded tracks.
 EGO_SKIN_M = 0.1
 #: An ego that moves less than this shows nothing, m.
 _LEAST_M = 10.0
-#: A car stands below this, within so many metres before a stop line, in the last seconds before it passes.
+#: A stop at a line: below this speed, within this distance, this long before passing.
 _STANDING_MPS, _BEFORE_LINE_M, _STOOD_S = 0.5, 3.0, 3.0
 #: Travelling against traffic for longer than this within 1 s is what the metric ``wrong_way`` counts, m.
 _WRONG_WAY_M = 2.0
-#: Further than this from the lanes of its way ego is beside it, m; the metric says 2.
-_BESIDE_M = 1.9
+#: Ego is off its route beyond this distance from the route's lanes, m; the metric uses 2.
+_OFF_ROUTE_M = 1.9
 #: Lanes of both directions that are as near as this, to each other, tell nothing, m.
 _DOUBT_M = 0.5
 
 
 @dataclass(frozen=True)
-class Fault:
-    """Why a scenario must not be shown.
+class Violation:
+    """Why a scenario is rejected.
 
     Attributes:
         cause: A word for it, or empty.
@@ -46,61 +45,61 @@ class Fault:
 
 
 def user_boxes(motion: Motion) -> Float64[np.ndarray, "user time 6"]:
-    """Everybody's boxes in the order of :mod:`drivax.geometry.boxes`."""
+    """Return all users' boxes in the layout of :mod:`drivax.geometry.boxes`."""
     size = np.broadcast_to(motion.size_m[:, None, :2], (*motion.heading.shape, 2))
     heading = motion.heading[..., None]
     return np.concatenate([motion.xy, np.cos(heading), np.sin(heading), size], axis=-1)
 
 
-def fault(
-    cast: Cast,
+def find_violation(
+    roles: Roles,
     motion: Motion,
     times_s: Float64[np.ndarray, " time"],
     first_step: int,
     staging: Staging,
     hardest_mps2: float,
-) -> Fault:
-    """Judges a motion from a step on.
+) -> Violation:
+    """Find the first violation of a motion from a step on.
 
     Args:
-        cast: Everybody.
-        motion: What they did.
+        roles: All users.
+        motion: Their motion.
         times_s: Times of its steps, on the clock of the lights.
         first_step: Where the recording begins.
-        staging: What is staged: it excuses who acts in it.
+        staging: The staged event, which excuses driving against traffic.
         hardest_mps2: Ego must not brake harder than this.
     """
     now = slice(first_step, None)
     speed = motion.speed[0, now]
     if np.sum(np.abs(speed)) * DT_S < _LEAST_M:
-        return Fault("ego_hardly_moves")
+        return Violation("ego_hardly_moves")
     if not motion.valid[0, now].all():
-        return Fault("ego_leaves_map")
+        return Violation("ego_leaves_map")
     box = user_boxes(motion)[:, now]
     pairs = touching(box, motion.valid[:, now], _tested(motion))
     if (pairs[0] < box.shape[1]).any():
         users = np.flatnonzero(pairs[0] < box.shape[1])
-        return Fault("ego_collides", tuple(users.tolist()), first_step + int(pairs[0].min()))
+        return Violation("ego_collides", tuple(users.tolist()), first_step + int(pairs[0].min()))
     if np.diff(speed).min() < -(hardest_mps2 + 0.02) * DT_S:
-        return Fault("ego_brakes_hard")
-    if leaves_road(cast.network, box[0]):
-        return Fault("ego_leaves_road")
-    cause = _rules_broken(cast, motion, times_s, first_step)
+        return Violation("ego_brakes_hard")
+    if leaves_road(roles.network, box[0]):
+        return Violation("ego_leaves_road")
+    cause = _rules_broken(roles, motion, times_s, first_step)
     if cause:
-        return Fault(cause)
-    excused = bool(cast.parked) or eventful(staging)
-    if not excused and goes_against_traffic(cast.network, box[0, :, :2], motion.heading[0, now]):
-        return Fault("ego_wrong_way")
-    return Fault("others_collide" if (pairs < box.shape[1]).any() else "")
+        return Violation(cause)
+    excused = bool(roles.parked) or is_staged(staging)
+    if not excused and goes_against_traffic(roles.network, box[0, :, :2], motion.heading[0, now]):
+        return Violation("ego_wrong_way")
+    return Violation("others_collide" if (pairs < box.shape[1]).any() else "")
 
 
-def eventful(staging: Staging) -> bool:
+def is_staged(staging: Staging) -> bool:
     """Whether anything is staged."""
     return any(vars(staging).values())
 
 
 def _tested(motion: Motion) -> Bool[np.ndarray, "user user"]:
-    """Which pairs must not touch: people pass each other as they like, and who never moves was put there."""
+    """Mask of pairs that must not overlap: not two pedestrians, not two static users."""
     person = motion.kind == AgentKind.PEDESTRIAN
     moves = np.abs(np.where(motion.valid, motion.speed, 0.0)).max(axis=1) > 0.0
     return (moves[:, None] | moves) & ~(person[:, None] & person)
@@ -111,7 +110,7 @@ def touching(
     valid: Bool[np.ndarray, "user time"],
     tested: Bool[np.ndarray, "user user"],
 ) -> Int64[np.ndarray, "user user"]:
-    """When pairs of users first overlap; row 0 (ego) is tested with a skin of 10 cm around it.
+    """Return when pairs of users first overlap; row 0 (ego) has a margin of 10 cm.
 
     Args:
         box: Boxes.
@@ -130,13 +129,13 @@ def touching(
         low = np.where(valid[..., None], at, np.inf).min(axis=1) - reach[:, None]
         high = np.where(valid[..., None], at, -np.inf).max(axis=1) + reach[:, None]
     meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(axis=-1)
-    one, other = np.nonzero(np.triu(tested & meet, 1))
-    gap = np.sum((box[one, :, :2] - box[other, :, :2]) ** 2, axis=-1)
-    near = (gap < ((reach[one] + reach[other]) ** 2)[:, None]) & valid[one] & valid[other]
+    first, second = np.nonzero(np.triu(tested & meet, 1))
+    gap = np.sum((box[first, :, :2] - box[second, :, :2]) ** 2, axis=-1)
+    near = (gap < ((reach[first] + reach[second]) ** 2)[:, None]) & valid[first] & valid[second]
     pair, time = np.nonzero(near)
-    hit = overlap(box[one[pair], time], box[other[pair], time])
+    hit = overlap(box[first[pair], time], box[second[pair], time])
     result = np.full((len(box), len(box)), box.shape[1])
-    np.minimum.at(result, (one[pair[hit]], other[pair[hit]]), time[hit])
+    np.minimum.at(result, (first[pair[hit]], second[pair[hit]]), time[hit])
     return np.minimum(result, result.T)
 
 
@@ -184,65 +183,62 @@ def passes(
 
 
 def _rules_broken(
-    cast: Cast,
+    roles: Roles,
     motion: Motion,
     times_s: Float64[np.ndarray, " time"],
     first_step: int,
 ) -> str:
-    """Whether somebody runs a red light, or ego passes a stop sign without standing."""
-    network, now = cast.network, slice(first_step, None)
+    """Return whether a vehicle runs a red light or ego a stop sign."""
+    network, now = roles.network, slice(first_step, None)
     red = np.zeros((len(times_s) - first_step, len(network.lanes)), bool)
     if network.signals is not None:
         red = network.signals.colours(times_s[now], len(network.lanes))[0] == Colour.RED
-    dark = red[:-1] & red[1:]
-    for i, path in enumerate(motion.paths or cast.paths):
+    red_steps = red[:-1] & red[1:]
+    for i, path in enumerate(motion.paths or roles.paths):
         heading, valid = motion.heading[i, now], motion.valid[i, now]
         ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[i, 0] / 2
         front = motion.xy[i, now] + ahead
         for span in path.spans:
             lane = network.lanes[span.lane]
             stop = i == 0 and lane.control in (Control.STOP, Control.ALL_WAY_STOP)
-            if not lane.connector or not (stop or dark[:, span.lane].any()):
+            if not lane.connector or not (stop or red_steps[:, span.lane].any()):
                 continue
             passed = passes(lane, front, heading) & valid[:-1] & valid[1:]
-            if np.any(passed & dark[:, span.lane]):
+            if np.any(passed & red_steps[:, span.lane]):
                 return "ego_runs_red" if i == 0 else "other_runs_red"
             if stop and not _stood(lane, motion, first_step, front, passed):
                 return "ego_runs_stop_sign"
-        if i == 0 and _passes_beside(network, path, motion.xy[0, now], front, heading, dark):
+        if i == 0 and _passes_red_off_route(network, path, motion.xy[0, now], front, heading, red_steps):
             return "ego_runs_red"
     return ""
 
 
-def _passes_beside(
+def _passes_red_off_route(
     network: RoadNetwork,
     path: Path,
     xy: Float64[np.ndarray, "time 2"],
     front: Float64[np.ndarray, "time 2"],
     heading: Float64[np.ndarray, " time"],
-    dark: Bool[np.ndarray, "step lane"],
+    red_steps: Bool[np.ndarray, "step lane"],
 ) -> bool:
-    """Whether ego goes around something over the line of a lane that is not its own and has red.
-
-    As the metric has it: beside the way the lights of other lanes count, too.
-    """
+    """Whether ego, off its route, passes the line of another lane at red, as the metric counts it."""
     own = {span.lane for span in path.spans}
-    others = [k for k in np.flatnonzero(dark.any(axis=0)) if network.lanes[k].connector and k not in own]
-    passed = [passes(network.lanes[k], front, heading) & dark[:, k] for k in others]
+    others = [k for k in np.flatnonzero(red_steps.any(axis=0)) if network.lanes[k].connector and k not in own]
+    passed = [passes(network.lanes[k], front, heading) & red_steps[:, k] for k in others]
     if not np.any(passed):
         return False
-    way = np.concatenate([network.lanes[k].curve.xy for k in own])
-    off = np.hypot(*(xy[:, None] - way).transpose(2, 0, 1)).min(axis=1) > _BESIDE_M
+    route_xy = np.concatenate([network.lanes[k].curve.xy for k in own])
+    off = np.hypot(*(xy[:, None] - route_xy).transpose(2, 0, 1)).min(axis=1) > _OFF_ROUTE_M
     return bool((np.any(passed, axis=0) & off[1:]).any())
 
 
-def last_stop(cast: Cast, motion: Motion, first_step: int) -> int:
-    """When ego last stands before a stop sign that it then passes; the first step where it never does so."""
+def last_stop(roles: Roles, motion: Motion, first_step: int) -> int:
+    """Return the step of ego's last stop at a stop sign that it then passes, else the first step."""
     heading = motion.heading[0]
     front = motion.xy[0] + np.stack([np.cos(heading), np.sin(heading)], axis=-1) * motion.size_m[0, 0] / 2
     result = first_step
-    for span in (motion.paths or cast.paths)[0].spans:
-        lane = cast.network.lanes[span.lane]
+    for span in (motion.paths or roles.paths)[0].spans:
+        lane = roles.network.lanes[span.lane]
         if lane.connector and lane.control in (Control.STOP, Control.ALL_WAY_STOP):
             for step in np.flatnonzero(passes(lane, front, heading)):
                 standing = np.flatnonzero(motion.speed[0, first_step : step + 1] < _STANDING_MPS)

@@ -1,4 +1,4 @@
-"""Vehicles and who drives them."""
+"""Vehicles and their drivers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Drivers:
     Attributes:
         kind: ``AgentKind``: VEHICLE or CYCLIST.
         size_m: Length, width and height.
-        speed_factor: Wanted speed as a multiple of the limit.
+        speed_factor: Preferred speed as a multiple of the limit.
         top_speed_mps: Speed that is not exceeded whatever the limit.
         lateral_mps2: Lateral acceleration accepted in bends.
         slowing_mps2: Deceleration with which slower stretches are approached.
@@ -26,7 +26,7 @@ class Drivers:
         jerk_mps3: Rate at which acceleration is changed in ordinary driving.
         headway_s, acceleration_mps2, braking_mps2: The driver's IDM.
         politeness: Weight of others' accelerations when a lane change is weighed (MOBIL).
-        reaction_s: A driver acts on what it wanted this long ago.
+        reaction_s: Delay between a decision and its execution.
         critical_gap_s: Shortest time to the arrival of others at which a driver who must give way goes.
     """
 
@@ -56,7 +56,7 @@ class Drivers:
 
     @property
     def cyclist(self) -> Bool[np.ndarray, " vehicle"]:
-        """Who rides a bicycle."""
+        """Mask of cyclists."""
         return self.kind == AgentKind.CYCLIST
 
     def chosen(self, rows: np.ndarray) -> Drivers:
@@ -64,7 +64,7 @@ class Drivers:
         return Drivers(**{name: value[rows] for name, value in vars(self).items()})
 
     def with_headway(self, row: int, headway_s: float) -> Drivers:
-        """The same drivers, one of whom keeps another time gap."""
+        """Return the drivers with one time gap changed."""
         changed = self.headway_s.copy()
         changed[row] = headway_s
         return replace(self, headway_s=changed)

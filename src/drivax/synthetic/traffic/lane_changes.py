@@ -30,9 +30,9 @@ _LEAVE_M, _LEAVE_S = 120.0, 9.0
 _DURATION_S, _SHORTEST_M, _LEAST_MPS = 4.2, 14.0, 3.0
 #: Bumper-to-bumper room that must be left ahead and behind, m and s.
 _ROOM_M, _ROOM_S = 2.0, 0.25
-#: After a change a driver stays for this long, s; nobody changes right behind a junction or right before one, m.
+#: After a change a driver stays for this long, s; no changes this close behind or before a junction, m.
 _REST_S, _AFTER_M, _BEFORE_M = 4.0, 12.0, 25.0
-#: Those who make room brake at most like this, m/s2.
+#: Largest braking to make room for others, m/s2.
 HELP_MPS2 = 1.8
 
 
@@ -111,12 +111,12 @@ class Helped:
 
 @dataclass(frozen=True)
 class Situation:
-    """Where everyone is when lane changes are considered.
+    """State of all vehicles when lane changes are decided.
 
     Attributes:
-        free: Who may change for pleasure or need (not ego, nobody who is changing, no bicycle).
+        free: Mask of vehicles that may change (not ego, cyclists, or vehicles that are changing).
         fastest: Fastest speed on the own path here.
-        acceleration: Wanted acceleration on the own path, everything considered.
+        acceleration: Preferred acceleration on the own path.
     """
 
     at_m: Float64[np.ndarray, " v"]
@@ -142,7 +142,7 @@ def _rows(parameters: IdmParameters, rows: Int64[np.ndarray, " k"]) -> IdmParame
 
 
 class LaneChanges:
-    """Decides about lane changes of all vehicles at once.
+    """Lane-change decisions of all vehicles.
 
     Args:
         network: The roads.
@@ -157,33 +157,33 @@ class LaneChanges:
         self._thing_half = np.full(len(self._thing_chain), 2.4)
 
     def decide(self, now: Situation, tables: PathTables) -> tuple[list[Change], Helped]:
-        """The changes that begin now, and who helps whom that has to change."""
-        everyone = np.arange(len(now.at_m))
-        lane, along = tables.on(now.at_m, everyone)
+        """Return lane changes that begin now, and pairs that open gaps for mandatory ones."""
+        rows = np.arange(len(now.at_m))
+        lane, along = tables.on(now.at_m, rows)
         own = lane[:, 0]
         chains = self.chains
         candidates = now.free & now.active & (own >= 0) & ~self._drivers.cyclist
         candidates &= (chains.left[own] >= 0) | (chains.right[own] >= 0)
-        who = np.flatnonzero(candidates)
-        nobody = np.zeros(0, int)
-        if not len(who):
-            return [], Helped(nobody, nobody, np.zeros(0))
+        vehicles = np.flatnonzero(candidates)
+        none = np.zeros(0, int)
+        if not len(vehicles):
+            return [], Helped(none, none, np.zeros(0))
         line = np.where(lane >= 0, chains.chain[lane], -1)
         line[~now.active] = -1
         place = chains.offset_m[lane] + along
         # To the left first, then to the right: who has a lane there, and may or must go over to it.
-        target = np.concatenate([chains.left[own[who]], chains.right[own[who]]])
+        target = np.concatenate([chains.left[own[vehicles]], chains.right[own[vehicles]]])
         sides = np.flatnonzero(target >= 0)
-        who, target = who[sides % len(who)], target[sides]
-        options = self._possible(now, who, target, (own[who], along[who, 0]))
-        if not len(options.who):
-            return [], Helped(nobody, nobody, np.zeros(0))
+        vehicles, target = vehicles[sides % len(vehicles)], target[sides]
+        options = self._possible(now, vehicles, target, (own[vehicles], along[vehicles, 0]))
+        if not len(options.vehicles):
+            return [], Helped(none, none, np.zeros(0))
         return self._chosen(now, self._weighed(now, options, (line, place)))
 
     def _possible(
         self,
         now: Situation,
-        who: Int64[np.ndarray, " k"],
+        vehicles: Int64[np.ndarray, " k"],
         target: Int64[np.ndarray, " k"],
         here: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]],
     ) -> _Options:
@@ -195,18 +195,18 @@ class LaneChanges:
         here_chain = chains.chain[own]
         here_at = chains.offset_m[own] + along
         left = chains.length_m[here_chain] - here_at
-        speed = now.speed[who]
-        must = chains.ends[here_chain] & (left < np.maximum(_LEAVE_M, _LEAVE_S * speed))
+        speed = now.speed[vehicles]
+        mandatory = chains.ends[here_chain] & (left < np.maximum(_LEAVE_M, _LEAVE_S * speed))
         length = np.maximum(_DURATION_S * speed, _SHORTEST_M)
-        length = np.where(must, np.minimum(length, np.maximum(left - 2.0, 8.0)), length)
+        length = np.where(mandatory, np.minimum(length, np.maximum(left - 2.0, 8.0)), length)
         rest = chains.length_m[chain] - at
         possible = (rest > length + 3.0) & (~chains.ends[here_chain] | (left > length))
         wish = possible & (speed > _LEAST_MPS) & (at > _AFTER_M) & (rest > length + _BEFORE_M)
         wish &= ~chains.exit[target] & ~chains.ends[chain]
-        possible = np.where(must, possible & ~chains.ends[chain], wish)
-        limit = now.fastest[who] * chains.limit[target] / chains.limit[own]
-        k = np.flatnonzero(possible | must)
-        return _Options(who[k], target[k], length[k], possible[k], must[k], limit[k], left[k],
+        possible = np.where(mandatory, possible & ~chains.ends[chain], wish)
+        limit = now.fastest[vehicles] * chains.limit[target] / chains.limit[own]
+        k = np.flatnonzero(possible | mandatory)
+        return _Options(vehicles[k], target[k], length[k], possible[k], mandatory[k], limit[k], left[k],
                         (chain[k], at[k]), (here_chain[k], here_at[k]))  # fmt: skip
 
     def _weighed(
@@ -215,34 +215,38 @@ class LaneChanges:
         options: _Options,
         lines: tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]],
     ) -> _Weighed:
-        """What changing would bring."""
-        o, who, must = options, options.who, options.must
-        speed = now.speed[who]
-        new_lead, new = self._next(now, who, o.there, lines)
+        """Evaluate the incentive and safety of each option."""
+        o, vehicles, mandatory = options, options.vehicles, options.mandatory
+        speed = now.speed[vehicles]
+        new_lead, new = self._next(now, vehicles, o.there, lines)
         ahead, ahead_gap, ahead_speed = new_lead
         behind, behind_gap, _ = new
-        mine = self._follow(who, speed, o.limit_mps, ahead_gap, ahead_speed)
+        mine = self._follow(vehicles, speed, o.limit_mps, ahead_gap, ahead_speed)
         # The new follower follows the vehicle ahead today and this one then; with the old one it is the other way.
-        new_then, new_today = self._followed(now, who, new, new_lead)
-        old_lead, old = self._next(now, who, o.here, lines)
-        old_today, old_then = self._followed(now, who, old, old_lead)
+        new_then, new_today = self._followed(now, vehicles, new, new_lead)
+        old_lead, old = self._next(now, vehicles, o.here, lines)
+        old_today, old_then = self._followed(now, vehicles, old, old_lead)
         others = new_then - new_today + old_then - old_today
-        gain = mine - now.acceleration[who] + self._drivers.politeness[who] * others
-        urgency = np.where(must, 1.0 - np.clip(o.left_m / _LEAVE_M, 0.0, 1.0), 0.0)
+        gain = mine - now.acceleration[vehicles] + self._drivers.politeness[vehicles] * others
+        urgency = np.where(mandatory, 1.0 - np.clip(o.left_m / _LEAVE_M, 0.0, 1.0), 0.0)
         safe = _SAFE_MPS2 + urgency * (_URGENT_MPS2 - _SAFE_MPS2)
         follower_speed = np.where(behind >= 0, now.speed[np.maximum(behind, 0)], 0.0)
         ok = o.possible & (new_then > -safe) & (mine > -safe)
         ok &= ahead_gap > _ROOM_M + _ROOM_S * np.maximum(speed - ahead_speed, 0.0) * 4
         ok &= behind_gap > _ROOM_M + _ROOM_S * follower_speed * (1 - 0.6 * urgency)
-        return _Weighed(o, ok & (must | (gain > _THRESHOLD_MPS2)), gain,
+        return _Weighed(o, ok & (mandatory | (gain > _THRESHOLD_MPS2)), gain,
                         ahead, ahead_gap, behind, behind_gap)  # fmt: skip
 
-    def _followed(self, now: Situation, who: Int64[np.ndarray, " k"], behind: _Next, ahead: _Next) -> _Pair:
-        """Accelerations of followers who have a vehicle ahead of them, and the one ahead of that; 0 without any."""
+    def _followed(
+        self, now: Situation, vehicles: Int64[np.ndarray, " k"], behind: _Next, ahead: _Next
+    ) -> _Pair:
+        """Return followers' accelerations behind the vehicle and behind its leader; 0 without a follower."""
         row, gap, _ = behind
         there, row = row >= 0, np.maximum(row, 0)
-        gaps = np.stack([gap, gap + 2 * self._half[who] + ahead[1]])
-        then = self._follow(row, now.speed[row], now.fastest[row], gaps, np.stack([now.speed[who], ahead[2]]))
+        gaps = np.stack([gap, gap + 2 * self._half[vehicles] + ahead[1]])
+        then = self._follow(
+            row, now.speed[row], now.fastest[row], gaps, np.stack([now.speed[vehicles], ahead[2]])
+        )
         near, far = np.where(there, then, 0.0)
         return near, far
 
@@ -250,35 +254,35 @@ class LaneChanges:
         self,
         rows: Int64[np.ndarray, " k"],
         speed: Float64[np.ndarray, " k"],
-        wanted: Float64[np.ndarray, " k"],
+        preferred: Float64[np.ndarray, " k"],
         gap: Float64[np.ndarray, "*k"],
         leader_speed: Float64[np.ndarray, "*k"],
     ) -> Float64[np.ndarray, "*k"]:
-        return idm_acceleration(speed, wanted, gap, leader_speed, _rows(self._idm, rows))
+        return idm_acceleration(speed, preferred, gap, leader_speed, _rows(self._idm, rows))
 
     def _next(
         self,
         now: Situation,
-        who: Int64[np.ndarray, " k"],
+        vehicles: Int64[np.ndarray, " k"],
         where: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]],
         lines: tuple[Int64[np.ndarray, "v slot"], Float64[np.ndarray, "v slot"]],
     ) -> tuple[_Next, _Next]:
         """The nearest on a chain ahead of a place, and the nearest behind it."""
         line, place = lines
         chain, at = where
-        pair = np.arange(len(who))
+        pair = np.arange(len(vehicles))
         apart = place - at[:, None, None]
         seen = line == chain[:, None, None]
-        seen[pair, who] = False
-        found = []
+        seen[pair, vehicles] = False
+        neighbours = []
         for distance in (apart, -apart):
             slots = np.where(seen & (distance >= 0), distance, np.inf)
             # NumPy reduces a last axis this short several times more slowly.
             gap = reduce(np.minimum, np.moveaxis(slots, -1, 0)) - self._half
             row = gap.argmin(axis=1)
             nearest = gap[pair, row]
-            found.append((np.where(np.isfinite(nearest), row, -1), nearest, now.speed[row]))
-        (row, nearest, speed), (back, behind, slower) = found
+            neighbours.append((np.where(np.isfinite(nearest), row, -1), nearest, now.speed[row]))
+        (row, nearest, speed), (back, behind, slower) = neighbours
         if len(self._thing_m):
             ahead = self._thing_m - at[:, None]
             there = (self._thing_chain == chain[:, None]) & (ahead > -3.0)
@@ -286,14 +290,14 @@ class LaneChanges:
             stands = thing < nearest
             row, speed = np.where(stands, -1, row), np.where(stands, 0.0, speed)
             nearest = np.minimum(nearest, thing)
-        return (row, nearest - self._half[who], speed), (back, behind - self._half[who], slower)
+        return (row, nearest - self._half[vehicles], speed), (back, behind - self._half[vehicles], slower)
 
     def _chosen(self, now: Situation, weighed: _Weighed) -> tuple[list[Change], Helped]:
         changes: list[Change] = []
         taken: list[tuple[int, float]] = []
         o = weighed.options
         order = sorted(
-            (-float(weighed.gain[k]) - 100.0 * bool(o.must[k]), int(o.who[k]), k)
+            (-float(weighed.gain[k]) - 100.0 * bool(o.mandatory[k]), int(o.vehicles[k]), k)
             for k in np.flatnonzero(weighed.ok)
         )
         moved: set[int] = set()
@@ -313,19 +317,19 @@ class _Options:
     """Changes that may or must be made, one entry per change: to the left first, each side in order of vehicles.
 
     Attributes:
-        who, target: The vehicle and its new lane.
+        vehicles, target: The vehicle and its new lane.
         length_m: How long the change takes.
-        possible, must: Whether it may be made as far as the lanes go, and whether it has to.
+        possible, mandatory: Whether it may be made as far as the lanes go, and whether it has to.
         limit_mps: The speed that the driver likes on the new lane.
         left_m: What is left of the own chain of lanes.
         there, here: Chain and place on the new and the own lane.
     """
 
-    who: Int64[np.ndarray, " k"]
+    vehicles: Int64[np.ndarray, " k"]
     target: Int64[np.ndarray, " k"]
     length_m: Float64[np.ndarray, " k"]
     possible: Bool[np.ndarray, " k"]
-    must: Bool[np.ndarray, " k"]
+    mandatory: Bool[np.ndarray, " k"]
     limit_mps: Float64[np.ndarray, " k"]
     left_m: Float64[np.ndarray, " k"]
     there: tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]
@@ -348,8 +352,10 @@ class _Weighed:
 def _helped(now: Situation, weighed: _Weighed, moved: set[int]) -> Helped:
     """Pairs that adjust to each other because one of them must change and has not found room yet."""
     pairs: list[tuple[int, int, float]] = []
-    for k in np.flatnonzero(weighed.options.must):
-        row, ahead, behind = (int(who[k]) for who in (weighed.options.who, weighed.ahead, weighed.behind))
+    for k in np.flatnonzero(weighed.options.mandatory):
+        row, ahead, behind = (
+            int(vehicles[k]) for vehicles in (weighed.options.vehicles, weighed.ahead, weighed.behind)
+        )
         if row in moved:
             continue
         if ahead >= 0 and ahead not in moved:
@@ -366,12 +372,12 @@ def _on_chains(
     network: RoadNetwork, chains: LaneChains, boxes: Boxes
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """Where standing things block lanes: chain and position of each."""
-    found_chain, found_at = [], []
+    thing_chain, thing_m = [], []
     for index, lane in enumerate(network.lanes):
         if chains.chain[index] < 0 or not len(boxes):
             continue
         gap = np.sum((boxes.xy[:, None] - lane.curve.xy[::2]) ** 2, axis=-1)
         for thing in np.flatnonzero(gap.min(axis=1) < (0.95 + boxes.size_m[:, 1] / 2) ** 2):
-            found_chain.append(chains.chain[index])
-            found_at.append(chains.offset_m[index] + float(lane.curve.arc_m[::2][np.argmin(gap[thing])]))
-    return np.array(found_chain, int), np.array(found_at)
+            thing_chain.append(chains.chain[index])
+            thing_m.append(chains.offset_m[index] + float(lane.curve.arc_m[::2][np.argmin(gap[thing])]))
+    return np.array(thing_chain, int), np.array(thing_m)

@@ -1,4 +1,4 @@
-"""Paths that leave their lanes' centres: changes to another way from wherever a vehicle is, and ways around things."""
+"""Paths that leave lane centres: lane changes, and detours around obstacles."""
 
 from __future__ import annotations
 
@@ -10,11 +10,165 @@ from jaxtyping import Float64
 
 from drivax.geometry.vectors import wrap
 from drivax.synthetic.roads.curves import STEP_M, Curve
+from drivax.synthetic.roads.network import RoadNetwork
+from drivax.synthetic.traffic.obstacles import Boxes, Extents, extents
+from drivax.synthetic.traffic.path_arrays import PathTables
 from drivax.synthetic.traffic.paths import SLOTS, LaneSpan, Path, smoothed_curvature
+
+#: Drivers begin to look for a way around this far before a thing, m; they pass it with this room, m.
+LOOK_M, _ROOM_M = 45.0, 0.55
+#: What comes so near to the side of a vehicle on its path is in its way, m.
+DETOUR_MARGIN_M = 0.3
+#: Largest offset of a detour, m, and its steepest slope, m forward per m aside.
+_FURTHEST_M, _STEEPEST = 4.3, 2.2
+#: Distance ahead over which a detour occupies adjacent lanes, m.
+_ADJACENT_M = 60.0
+#: Room kept to the road's edge, m, and speed at which things are passed, m/s.
+_EDGE_M, _PASS_MPS = 0.2, 6.0
+
+
+@dataclass(frozen=True)
+class DetourRequest:
+    """A vehicle that looks for a detour: path position, speed, size, and adjacent lanes of its direction."""
+
+    path: Path
+    at_m: float
+    speed: float
+    size_m: tuple[float, float]
+    adjacent: tuple[Occupied, ...] = ()
+
+
+def detour_request(
+    network: RoadNetwork, tables: PathTables, row: int, now: tuple[float, float], size_m: tuple[float, float]
+) -> DetourRequest:
+    """Build the request of a vehicle at a path position and speed."""
+    at = float(now[0])
+    lane, along = tables.on(np.array([at]), np.array([row]))
+    adjacent = []
+    if lane[0, 0] >= 0:
+        here = network.lanes[lane[0, 0]]
+        for other in (here.left, here.right):
+            if other >= 0:
+                scale = here.length_m / network.lanes[other].length_m
+                adjacent.append(Occupied(other, at - float(along[0, 0]), scale, at, at + _ADJACENT_M))
+    return DetourRequest(tables.paths[row], at, float(now[1]), size_m, tuple(adjacent))
+
+
+class Detours:
+    """Finds detours around standing obstacles.
+
+    Args:
+        network: The roads.
+    """
+
+    def __init__(self, network: RoadNetwork) -> None:
+        points = [_dense(edge.xy) for edge in network.edges]
+        xy = np.concatenate(points) if points else np.zeros((0, 2))
+        self._edge = Boxes(xy, np.zeros(len(xy)), np.zeros(len(xy)), np.zeros((len(xy), 2)))
+
+    def find(self, request: DetourRequest, standing: Boxes, moving: Boxes) -> tuple[Path, float] | None:
+        """A path around what stands ahead, and where it is back on the old one (m); None where there is none."""
+        path, half_width, half_length = request.path, request.size_m[1] / 2, request.size_m[0] / 2
+        near = standing.chosen(_close(standing, path, request.at_m, LOOK_M + 40.0))
+        seen, _ = extents(path, near)
+        front = request.at_m + half_length
+        blocks = (
+            (seen.right_m < half_width + DETOUR_MARGIN_M)
+            & (seen.left_m > -half_width - DETOUR_MARGIN_M)
+            & (seen.near_m > front - 0.5)
+        )
+        if not blocks.any():
+            return None
+        first = float(seen.near_m[blocks].min())
+        if not 2.0 < first - front < LOOK_M:
+            return None
+        last = first
+        for k in np.argsort(seen.near_m, kind="stable"):
+            if blocks[k] and seen.near_m[k] < last + 2 * half_length + 14.0:
+                last = max(last, float(seen.far_m[k]))
+        group = blocks & (seen.near_m <= last)
+        sides = [
+            float(seen.left_m[group].max()) + half_width + _ROOM_M,
+            float(seen.right_m[group].min()) - half_width - _ROOM_M,
+        ]
+        for aside in sorted(sides, key=abs):
+            plan = self._plan(request, first, last, aside)
+            if plan is not None and self._is_free(request, plan, aside, seen, moving):
+                return around(path, plan, aside, request.adjacent), plan[3]
+        return None
+
+    @staticmethod
+    def _plan(
+        request: DetourRequest, first: float, last: float, aside: float
+    ) -> tuple[float, float, float, float] | None:
+        half = request.size_m[0] / 2
+        out = first - half - 0.3
+        begin = max(request.at_m, out - max(_STEEPEST * 2 * abs(aside), 2.4 * request.speed))
+        back = last + half + 0.5
+        end = back + max(_STEEPEST * 1.6 * abs(aside), 2.0 * min(request.speed, _PASS_MPS))
+        if (
+            abs(aside) > _FURTHEST_M
+            or out - begin < _STEEPEST * abs(aside)
+            or end > request.path.length_m - 5.0
+        ):
+            return None
+        return begin, out, back, end
+
+    def _is_free(
+        self,
+        request: DetourRequest,
+        plan: tuple[float, float, float, float],
+        aside: float,
+        seen: Extents,
+        moving: Boxes,
+    ) -> bool:
+        """Whether the detour is free of road edges, standing obstacles and oncoming or overtaking users."""
+        begin, out, back, end = plan
+        half = request.size_m[1] / 2
+        low, high = aside - half - _EDGE_M, aside + half + _EDGE_M
+        adjacent = (seen.near_m < back) & (seen.far_m > out) & (seen.right_m < high) & (seen.left_m > low)
+        if adjacent.any():
+            return False
+        edge = self._edge.chosen(_close(self._edge, request.path, (out + back) / 2, (end - begin) / 2 + 15.0))
+        edges, _ = extents(request.path, edge)
+        sweep = (edges.near_m > out) & (edges.near_m < back)
+        sweep &= (edges.left_m > min(low, -half)) & (edges.right_m < max(high, half))
+        if sweep.any():
+            return False
+        lasts = (end - request.at_m) / max(request.speed, _PASS_MPS) + 1.0
+        near = moving.chosen(
+            _close(moving, request.path, (request.at_m + end) / 2, end - request.at_m + 90.0)
+        )
+        others, which = extents(request.path, near, within_m=6.0)
+        place = np.rint(
+            np.clip((others.near_m + others.far_m) / 2, 0, request.path.length_m) / request.path.step_m
+        )
+        turned = wrap(near.heading[which] - request.path.curve.heading[place.astype(int)])
+        speed = near.speed[which] * np.cos(turned)
+        meets = (others.right_m < high + 0.3) & (others.left_m > low - 0.3)
+        ahead = (others.far_m > request.at_m) & (others.near_m + np.minimum(speed, 0.0) * lasts < end + 5.0)
+        behind = (others.far_m <= request.at_m) & (others.far_m + speed * 3.0 > request.at_m - 6.0)
+        # A moving vehicle beyond the detour in the own lane is a leader, no conflict.
+        ahead &= ~((speed > 1.0) & (others.near_m > back))
+        return not bool(np.any(meets & (ahead | behind)))
+
+
+def _dense(ring: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "dense 2"]:
+    """A closed ring with points at most a metre apart."""
+    closed = np.concatenate([ring, ring[:1]])
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
+    at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+    return np.stack([np.interp(at, arc, closed[:, k]) for k in (0, 1)], axis=-1)
+
+
+def _close(boxes: Boxes, path: Path, at_m: float, within_m: float) -> np.ndarray:
+    centre = path.curve.xy[min(int(max(at_m, 0.0) / path.step_m), len(path.curve.xy) - 1)]
+    return np.sum((boxes.xy - centre) ** 2, axis=1) < within_m**2
+
 
 #: Share of a lane change after which a vehicle has left the old lane.
 _LEFT_SHARE = 0.75
-#: From this lateral offset on a vehicle takes up room in the lane beside, m.
+#: From this lateral offset on a vehicle occupies the adjacent lane, m.
 _INTRUDES_M = 0.7
 
 
@@ -114,7 +268,7 @@ def _take_up(
     lane: np.ndarray,
     lane_m: Float64[np.ndarray, "point slot"],
 ) -> None:
-    """Enters a lane into the first free slot of the samples on which it is taken up."""
+    """Enter a lane into the first free slot of the samples on which it is taken up."""
     here = (at >= other.from_m) & (at <= other.until_m) & ~(lane == other.lane).any(axis=1)
     for slot in range(SLOTS):
         free = here & (lane[:, slot] < 0)
@@ -146,7 +300,7 @@ def quintic_step(
 def located(
     path: Path, xy: Float64[np.ndarray, " 2"], near_m: float | None = None
 ) -> tuple[float, float, float]:
-    """Where a point is beside a path: position along it, offset to the left (m), and the path's heading there.
+    """Locate a point relative to a path: position along it, offset to the left (m), and the path's heading there.
 
     Args:
         path: The path.
@@ -183,7 +337,7 @@ def change_onto(
     """A path that leaves another where a vehicle is and swings onto a third, as a lane change does.
 
     Args:
-        target: The path to get onto; it runs beside the present one here.
+        target: The path to get onto; it runs parallel to the present one here.
         present: The path that the vehicle is on.
         at_m: Where on it, m.
         length_m: Distance along the target over which to change, m.
@@ -213,7 +367,7 @@ def change_onto(
 
 
 def around(
-    path: Path, at_m: tuple[float, float, float, float], aside_m: float, beside: tuple[Occupied, ...] = ()
+    path: Path, at_m: tuple[float, float, float, float], aside_m: float, adjacent: tuple[Occupied, ...] = ()
 ) -> Path:
     """A path with a bulge to one side: out from the first to the second position, back from the third to the last.
 
@@ -221,9 +375,9 @@ def around(
         path: The path.
         at_m: The four positions, rising.
         aside_m: Offset in between, positive to the left.
-        beside: Lanes into which the bulge reaches.
+        adjacent: Lanes into which the bulge reaches.
     """
     old = path.step_m * np.arange(len(path.curve.xy))
     out = 1.0 - quintic_step(old, (at_m[0], 1.0, 0.0), at_m[1] - at_m[0])
     back = quintic_step(old, (at_m[2], 1.0, 0.0), at_m[3] - at_m[2])
-    return displaced(path, aside_m * out * back, beside if abs(aside_m) > _INTRUDES_M else ())[0]
+    return displaced(path, aside_m * out * back, adjacent if abs(aside_m) > _INTRUDES_M else ())[0]

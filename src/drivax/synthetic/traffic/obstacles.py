@@ -1,4 +1,4 @@
-"""What stands or moves in the way of a vehicle without being on a lane: parked cars, people, whoever swerves."""
+"""Obstacles in a vehicle's corridor that are on no lane: parked cars, pedestrians, swerving vehicles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MIDDLE_M = 1.3
 _AHEAD_M, _EVERY_M, _ASIDE_M = 50.0, 2.0, 16.0
 #: How far ahead other vehicles are looked at, m.
 _NEAR_M = 25.0
-#: Who crosses ahead is not braked for when it will have left so long before, s.
+#: Crossing users are ignored when they leave the corridor this long before arrival, s.
 _WELL_S = 0.8
 #: Sideways motion is foreseen for this long, s.
 _FORESEEN_S = 0.7
@@ -131,7 +131,7 @@ class Standing:
 
     Args:
         boxes: The things.
-        tables: Everyone's paths.
+        tables: All paths.
         width_m: Widths of the vehicles.
     """
 
@@ -177,7 +177,7 @@ class Standing:
         return np.where(gap > -1.0, gap, np.inf).min(axis=1)
 
 
-def in_the_way(
+def nearest_obstacles(
     tables: PathTables,
     vehicles: Boxes,
     at_m: Float64[np.ndarray, " v"],
@@ -187,42 +187,42 @@ def in_the_way(
     """Gap from each front bumper to the nearest thing in the corridor of the own path, and its speed along it.
 
     Args:
-        tables: Everyone's paths.
+        tables: All paths.
         vehicles: The vehicles.
         at_m: Where they are on their paths.
         active: Which of them are there.
-        others: What may be in the way beside vehicles: things in motion, those that stand for once too.
+        others: Other possible obstacles: moving users, including those that stand for now.
     """
     count, things = len(vehicles), vehicles.joined(others)
     gap, speed = np.full(count, np.inf), np.zeros(count)
-    who, what = _close(vehicles, things, active)
-    if not len(who):
+    viewer, thing = _close(vehicles, things, active)
+    if not len(viewer):
         return gap, speed
-    pose, place_m, apart2 = _nearest(tables, at_m, who, things.xy[what])
-    at, left, turned = _relative(things, what, pose[:, :2], pose[:, 2])
+    pose, place_m, apart2 = _nearest(tables, at_m, viewer, things.xy[thing])
+    at, left, turned = _relative(things, thing, pose[:, :2], pose[:, 2])
     at = at + place_m
-    length, width = _reach(things.size_m[what], turned)
+    length, width = _reach(things.size_m[thing], turned)
     # Vehicles keep out of each other's way by the rules: of one that turns, only the middle part counts.
-    vehicle = what < count
+    vehicle = thing < count
     width = np.where(vehicle, np.minimum(width, _MIDDLE_M), width)
-    drift = things.speed[what] * np.sin(turned)
+    drift = things.speed[thing] * np.sin(turned)
     soon = left + drift * _FORESEEN_S
-    size = vehicles.size_m[who]
+    size = vehicles.size_m[viewer]
     half = size[:, 1] / 2 + np.where(vehicle, _VEHICLES_M, _MARGIN_M)
     inside = (np.minimum(left, soon) - width < half) & (np.maximum(left, soon) + width > -half)
-    # Beyond the last sample of the path, or beside the vehicle rather than ahead of it: not in the way.
-    inside &= (at > at_m[who] + 0.3 * size[:, 0]) & (apart2 < 64.0)
+    # Beyond the last sample of the path, or next to the vehicle: no obstacle.
+    inside &= (at > at_m[viewer] + 0.3 * size[:, 0]) & (apart2 < 64.0)
     k = inside.nonzero()[0]
     if not len(k):
         return gap, speed
-    who, what, left, drift = who[k], what[k], left[k], drift[k]
-    room = at[k] - length[k] - at_m[who] - size[k, 0] / 2
-    stays = ~_gone(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[who], 1.0))
+    viewer, thing, left, drift = viewer[k], thing[k], left[k], drift[k]
+    room = at[k] - length[k] - at_m[viewer] - size[k, 0] / 2
+    stays = ~_gone(left, drift, half[k] + width[k], room / np.maximum(vehicles.speed[viewer], 1.0))
     # The nearest is entered last.
     order = np.argsort(-room, kind="stable")
     order = order[stays[order]]
-    gap[who[order]] = room[order]
-    speed[who[order]] = np.maximum(things.speed[what] * np.cos(turned[k]), 0.0)[order]
+    gap[viewer[order]] = room[order]
+    speed[viewer[order]] = np.maximum(things.speed[thing] * np.cos(turned[k]), 0.0)[order]
     return gap, speed
 
 
@@ -258,18 +258,18 @@ _LOOKS_M = np.arange(0.0, _AHEAD_M + 6.0, _EVERY_M)
 def _nearest(
     tables: PathTables,
     at_m: Float64[np.ndarray, " v"],
-    who: Int64[np.ndarray, " k"],
+    viewer: Int64[np.ndarray, " k"],
     xy: Float64[np.ndarray, "k 2"],
 ) -> tuple[Float64[np.ndarray, "k 4"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """The sample ahead on the path of a vehicle that is nearest to a point, where it is, and the squared distance."""
-    step = tables.step_m[who]
-    place = np.rint((at_m[who, None] + _LOOKS_M) / step[:, None]).astype(int)
-    place = np.minimum(place, tables.last[who, None])
+    step = tables.step_m[viewer]
+    place = np.rint((at_m[viewer, None] + _LOOKS_M) / step[:, None]).astype(int)
+    place = np.minimum(place, tables.last[viewer, None])
     flat = tables.table.reshape(-1, 4)
-    points = flat.take(place + (who * tables.table.shape[1])[:, None], axis=0)
+    points = flat.take(place + (viewer * tables.table.shape[1])[:, None], axis=0)
     dx, dy = points[..., 0] - xy[:, 0, None], points[..., 1] - xy[:, 1, None]
     apart = dx * dx + dy * dy
-    pair = np.arange(len(who)), apart.argmin(axis=1)
+    pair = np.arange(len(viewer)), apart.argmin(axis=1)
     return points[pair], place[pair] * step, apart[pair]
 
 
@@ -279,6 +279,6 @@ def _gone(
     reach: Float64[np.ndarray, " k"],
     seconds: Float64[np.ndarray, " k"],
 ) -> Bool[np.ndarray, " k"]:
-    """Who crosses the corridor will have left it well before the vehicle comes."""
+    """Mask of crossing users that leave the corridor well before the vehicle arrives."""
     then = left + drift * np.maximum(seconds - _WELL_S, 0.0)
     return (seconds > 2 * _WELL_S) & (np.abs(then) > reach) & (then * drift > 0)

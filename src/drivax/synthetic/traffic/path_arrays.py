@@ -1,4 +1,4 @@
-"""Everyone's paths as arrays of one shape, so that one step of traffic is a few operations over all vehicles."""
+"""All paths as arrays of one shape: a traffic step is a few operations over all vehicles."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class PathTables:
         lane, lane_m: Lanes taken up at each sample, and where on them.
         begin, scale, since, until: Per lane of the network: where it begins on the path (nan: it does not), and the
             range of own positions in which others on it matter.
-        way, way_begin, way_end: Connectors on the path in order (-1: none), and where they begin and end.
+        connector, connector_begin, connector_end: Connectors on the path in order (-1: none), and where they begin and
+            end.
         crossing, crossing_m: Crossings on the path in order of travel (-1: none), and where their near side is.
         stop_m: Where the last lane ends although the road goes on, m (infinite: it does not).
     """
@@ -47,15 +48,18 @@ class PathTables:
                 self._crossings.setdefault(lane, []).append((number, along - crossing.width_m / 2))
         # Later paths may be longer: half as much room again costs nothing.
         points = int(1.5 * max(len(path.curve.xy) for path in paths))
-        ways = 4 + max(sum(network.lanes[s.lane].connector for s in path.spans) for path in paths)
+        connectors = 4 + max(sum(network.lanes[s.lane].connector for s in path.spans) for path in paths)
         self.table = np.zeros((count, points, 4))
         self.lane = np.full((count, points, SLOTS), -1)
         self.lane_m = np.zeros((count, points, SLOTS))
         self.step_m, self.last = np.ones(count), np.ones(count, int)
         self.begin, self.scale = np.full((count, lanes), np.nan), np.ones((count, lanes))
         self.since, self.until = np.full((count, lanes), -np.inf), np.full((count, lanes), np.inf)
-        self.way = np.full((count, ways), -1)
-        self.way_begin, self.way_end = np.full((count, ways), np.inf), np.full((count, ways), np.inf)
+        self.connector = np.full((count, connectors), -1)
+        self.connector_begin, self.connector_end = (
+            np.full((count, connectors), np.inf),
+            np.full((count, connectors), np.inf),
+        )
         self.crossing = np.full((count, 4), -1)
         self.crossing_m = np.full((count, 4), np.inf)
         self.stop_m = np.full(count, np.inf)
@@ -63,10 +67,10 @@ class PathTables:
             self.replace(row, path)
 
     def replace(self, row: int, path: Path) -> None:
-        """Enters the path of one vehicle."""
+        """Enter the path of one vehicle."""
         self.paths[row] = path
         d, n = self._drivers, len(path.curve.xy)
-        self._make_room(n)
+        self._grow(n)
         fastest = speed_profile(
             path, d.speed_factor[row], d.lateral_mps2[row], d.slowing_mps2[row], d.top_speed_mps[row]
         )
@@ -78,24 +82,28 @@ class PathTables:
         self.step_m[row], self.last[row] = path.step_m, n - 1
         self.begin[row], self.scale[row] = np.nan, 1.0
         self.since[row], self.until[row] = -np.inf, np.inf
-        self.way[row], self.way_begin[row], self.way_end[row] = -1, np.inf, np.inf
+        self.connector[row], self.connector_begin[row], self.connector_end[row] = -1, np.inf, np.inf
         self._enter_lanes(row, path)
         final = max(path.spans, key=lambda span: span.end_m if span.until_m == np.inf else -1.0)
         lane = self._network.lanes[final.lane]
         self.stop_m[row] = path.length_m if lane.ends and not lane.successors else np.inf
 
     def _enter_lanes(self, row: int, path: Path) -> None:
-        ways, crossings = [], []
+        connectors, crossings = [], []
         for span in path.spans:
             lane = span.lane
             self.begin[row, lane], self.scale[row, lane] = span.begin_m, span.scale
             self.since[row, lane], self.until[row, lane] = span.from_m, span.until_m
             if self._network.lanes[lane].connector and span.until_m == np.inf:
-                ways.append((span.begin_m, span.end_m, lane))
+                connectors.append((span.begin_m, span.end_m, lane))
             for number, along in self._crossings.get(lane, ()):
                 crossings.append((span.begin_m + span.scale * along, number))
-        for k, (begin, end, lane) in enumerate(sorted(ways)[: self.way.shape[1]]):
-            self.way[row, k], self.way_begin[row, k], self.way_end[row, k] = lane, begin, end
+        for k, (begin, end, lane) in enumerate(sorted(connectors)[: self.connector.shape[1]]):
+            self.connector[row, k], self.connector_begin[row, k], self.connector_end[row, k] = (
+                lane,
+                begin,
+                end,
+            )
         if len(crossings) > self.crossing.shape[1]:
             more = len(crossings) - self.crossing.shape[1]
             self.crossing = np.pad(self.crossing, ((0, 0), (0, more)), constant_values=-1)
@@ -104,7 +112,7 @@ class PathTables:
         for k, (at, number) in enumerate(sorted(crossings)):
             self.crossing_m[row, k], self.crossing[row, k] = at, number
 
-    def _make_room(self, points: int) -> None:
+    def _grow(self, points: int) -> None:
         more = points - self.table.shape[1]
         if more > 0:
             pad = ((0, 0), (0, more), (0, 0))

@@ -1,4 +1,4 @@
-"""The way that one vehicle drives: a sequence of lanes as one smooth curve, and where on it each lane lies."""
+"""The path of a vehicle: a sequence of lanes as one smooth curve, and where on it each lane lies."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class LaneChange:
     """A planned change from one lane to its neighbour, both in sections that run side by side.
 
     Attributes:
-        section: Index in the lane sequence of the lane that is left; the next one in the sequence is beside it.
+        section: Index in the lane sequence of the lane that is left; the next one in the sequence is adjacent.
         begin_m: Where on that lane the change begins, m.
         length_m: Distance over which it is carried out, m.
     """
@@ -88,23 +88,23 @@ class LaneChange:
 
 
 def onward(network: RoadNetwork, lanes: list[int]) -> list[int]:
-    """Where a way along lanes can go on: nobody goes round a roundabout twice, no lane comes twice on a path."""
+    """Return successors that keep a path free of repeated lanes and full roundabout turns."""
     seen = set(lanes)
     return [
-        way
-        for way in network.lanes[lanes[-1]].successors
-        if way not in seen and not seen.issuperset(network.lanes[way].successors or (-1,))
+        lane
+        for lane in network.lanes[lanes[-1]].successors
+        if lane not in seen and not seen.issuperset(network.lanes[lane].successors or (-1,))
     ]
 
 
 def random_lanes(
     network: RoadNetwork, first: int, rng: np.random.Generator, preferred: frozenset[int] = frozenset()
 ) -> tuple[int, ...]:
-    """A random way from a lane to the end of the map; where lanes fork each way is as likely, preferred ones apart."""
+    """Draw lanes to the end of the map, uniformly at forks, among preferred successors if there are any."""
     lanes = [first]
     while network.lanes[lanes[-1]].successors:
-        ways = onward(network, lanes)
-        lanes.append(int(rng.choice([way for way in ways if way in preferred] or ways)))
+        options = onward(network, lanes)
+        lanes.append(int(rng.choice([lane for lane in options if lane in preferred] or options)))
     return tuple(lanes)
 
 
@@ -168,7 +168,7 @@ def _turned(angle: Float64[np.ndarray, " point"]) -> Float64[np.ndarray, " point
 
 
 def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[LaneSpan]) -> Path:
-    """Adds curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
+    """Add curvature, limits and the lane slots; straying makes the curve longer, so spans are stretched."""
     stretch = float(curve.arc_m[-1]) / length
     step = float(curve.arc_m[-1]) / (len(curve.xy) - 1)
     spans = [span.stretched(stretch) for span in spans]
@@ -186,10 +186,10 @@ def _finished(network: RoadNetwork, curve: Curve, length: float, spans: list[Lan
         here = at[part]
         inside = (here >= span.from_m) & (here <= span.until_m)
         along = np.maximum(here - span.begin_m, 0.0) / span.scale
-        for name, shared in _sharing(network, span.lane, along):
+        for shared_lane, shared in _sharing(network, span.lane, along):
             chosen = np.flatnonzero(inside & shared & (used[part] < SLOTS))
             slot = used[part][chosen]
-            lane[part][chosen, slot] = name
+            lane[part][chosen, slot] = shared_lane
             lane_m[part][chosen, slot] = along[chosen]
             used[part][chosen] += 1
     return Path(curve, step, smoothed_curvature(curve, step), limit, tuple(spans), lane, lane_m)

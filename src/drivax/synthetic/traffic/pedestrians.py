@@ -17,7 +17,7 @@ from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
 from drivax.synthetic.traffic.roles import Walker
 
-#: Where people wait, m before the kerb, how near to it they claim the crossing, and from where on they look.
+#: Where people wait, m before the kerb, how near to it they occupy the crossing, and from where on they look.
 _WAIT_M, _CLAIM_M, _LOOK_M = 0.4, 1.0, 1.8
 #: How fast a walker gains and loses speed, m/s2.
 _ACCELERATION_MPS2 = 1.5
@@ -25,25 +25,26 @@ _ACCELERATION_MPS2 = 1.5
 _YIELDING_MPS2, _STOP_SHORT_M = 2.5, 2.0
 #: Slower vehicles count as standing, m/s.
 _STANDING_MPS = 0.3
-#: Time beyond the crossing time that is wanted to the next vehicle, s: where drivers yield, and where they need not.
+#: Safety margin of the time to the next vehicle beyond the crossing time, s: where drivers yield, and where they need
+#: not.
 _MARGIN_S, _GAP_MARGIN_S = 1.0, 1.5
 #: Vehicles that see the crossing under a larger angle or head another way do not come to it.
 _BEARING, _ASIDE = math.radians(75.0), math.radians(80.0)
 #: People keep this distance from the side of a vehicle, m.
 _BERTH_M = 0.4
-#: They look at vehicles every so many steps.
+#: Steps between looks at vehicles.
 _LOOK_STEPS = 2
 #: Lanes that begin or end so near to a crossing have the lights of their neighbours, m.
 _NEAR_JUNCTION_M = 25.0
 
 
 @dataclass(frozen=True)
-class _Meetings:
+class _CrossingConflicts:
     """Where crossings meet lanes, one row per meeting, and what the lights say there.
 
     Attributes:
-        red: Per crossing the connectors whose lights must be red while people cross: everybody's but those who
-            turn into the crossed road at green, who must yield.
+        red: Per crossing the connectors whose lights must be red while people cross: all but those that turn
+            into the crossed road at green and must yield.
     """
 
     xy: Float64[np.ndarray, "meeting 2"]
@@ -54,7 +55,7 @@ class _Meetings:
     red: Bool[np.ndarray, "crossing lane"]
 
 
-def _meetings(network: RoadNetwork) -> _Meetings:
+def _crossing_conflicts(network: RoadNetwork) -> _CrossingConflicts:
     xy, heading, owner = [], [], []
     for index, crossing in enumerate(network.crossings):
         for lane, along in crossing.lanes:
@@ -70,7 +71,7 @@ def _meetings(network: RoadNetwork) -> _Meetings:
     strip = np.column_stack(
         [axes.mean(axis=1), across / length[:, None], length, np.ones(len(axes))],
     )
-    return _Meetings(
+    return _CrossingConflicts(
         xy=np.array(xy).reshape(-1, 2),
         heading=np.array(heading, float),
         crossing=np.array(owner, int),
@@ -83,7 +84,7 @@ def _meetings(network: RoadNetwork) -> _Meetings:
 
 
 def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, " lane"]:
-    """See :attr:`_Meetings.red`."""
+    """See :attr:`_CrossingConflicts.red`."""
     result = np.zeros(len(network.lanes), bool)
     if network.signals is None:
         return result
@@ -98,13 +99,13 @@ def _must_be_red(network: RoadNetwork, crossing: Crossing) -> Bool[np.ndarray, "
             entering = this.successors
         elif along < _NEAR_JUNCTION_M:
             leaving = this.predecessors
-        for way in (*entering, *leaving):
-            curve = network.lanes[way].curve
+        for connector in (*entering, *leaving):
+            curve = network.lanes[connector].curve
             straight = abs(float(curve.heading[-1] - curve.heading[0])) < math.radians(45.0)
-            if network.lanes[way].control == Control.SIGNAL and (
-                way in entering or straight or way in arrows
+            if network.lanes[connector].control == Control.SIGNAL and (
+                connector in entering or straight or connector in arrows
             ):
-                result[way] = True
+                result[connector] = True
     return result
 
 
@@ -120,29 +121,29 @@ class Walkers:
     def __init__(
         self, network: RoadNetwork, walkers: tuple[Walker, ...], times_s: Float64[np.ndarray, " time"]
     ) -> None:
-        self._meet = _meetings(network)
-        self._red_left_s = _red_left(network, self._meet.red, times_s)
-        ways = [resampled(walker.way, STEP_M) for walker in walkers]
-        self._last = np.array([len(way.xy) - 1 for way in ways], int)
-        self._table = np.zeros((len(ways), max([*self._last, 0]) + 1, 3))
-        self._begin = np.arange(len(ways)) * self._table.shape[1]
-        for row, way in zip(self._table, ways, strict=True):
-            row[: len(way.xy)] = np.column_stack([way.xy, way.heading])
-            row[len(way.xy) :] = row[len(way.xy) - 1]
-        self._step_m = np.array([float(way.arc_m[-1]) / (len(way.xy) - 1) for way in ways])
+        self._conflicts = _crossing_conflicts(network)
+        self._red_left_s = _red_left(network, self._conflicts.red, times_s)
+        curves = [resampled(walker.curve, STEP_M) for walker in walkers]
+        self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
+        self._table = np.zeros((len(curves), max([*self._last, 0]) + 1, 3))
+        self._begin = np.arange(len(curves)) * self._table.shape[1]
+        for row, curve in zip(self._table, curves, strict=True):
+            row[: len(curve.xy)] = np.column_stack([curve.xy, curve.heading])
+            row[len(curve.xy) :] = row[len(curve.xy) - 1]
+        self._step_m = np.array([float(curve.arc_m[-1]) / (len(curve.xy) - 1) for curve in curves])
         self._at = np.array([walker.start_m for walker in walkers], float)
-        self._wanted = np.array([walker.speed_mps for walker in walkers], float)
+        self._free_speed = np.array([walker.speed_mps for walker in walkers], float)
         self._size_m = np.array([walker.size_m[:2] for walker in walkers], float).reshape(-1, 2)
-        self._speed = self._wanted.copy()
+        self._speed = self._free_speed.copy()
         self._crossing = np.array([walker.crossing for walker in walkers], int)
         self._kerb = np.array([walker.kerb_m for walker in walkers], float)
         self._across = np.array([walker.across_m for walker in walkers], float)
         self._crosses = self._crossing >= 0
         self._any_crosses = bool(self._crosses.any())
-        # At lights and where nobody has to yield only those count who are on their way over.
-        asking = self._meet.marked & ~self._meet.red.any(axis=1)
-        self._asking = asking[self._crossing] if len(asking) else np.zeros(len(ways), bool)
-        self._released, self._into = np.zeros((2, len(ways)), bool)
+        # At lights and unmarked crossings only users on the crossing count.
+        asking = self._conflicts.marked & ~self._conflicts.red.any(axis=1)
+        self._asking = asking[self._crossing] if len(asking) else np.zeros(len(curves), bool)
+        self._released, self._into = np.zeros((2, len(curves)), bool)
 
     def step(
         self,
@@ -151,37 +152,37 @@ class Walkers:
         active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
     ) -> tuple[Boxes, Bool[np.ndarray, " crossing"]]:
-        """Tells where everybody is at step ``t``, and moves them on to the next one.
+        """Return all walkers at step ``t``, then advance them.
 
         Args:
             t: The step; steps come in order.
-            vehicles: Everybody to be careful of.
+            vehicles: All vehicles.
             active: Which of them are there.
             colour_row: What every lane's light shows now.
 
         Returns:
-            The walkers, and which crossings drivers have to leave free: somebody is on it or, where drivers must
-            yield, about to step on it.
+            The walkers, and which crossings drivers must keep free: a walker is on it or, where drivers must yield,
+            about to step on it.
         """
         place = np.minimum(np.maximum(self._at / self._step_m, 0.0), self._last)
         index = np.minimum(place.astype(int), self._last - 1)
         flat, rows = self._table.reshape(-1, 3), index + self._begin
         low = flat.take(rows, axis=0)
         pose = low + (place - index)[:, None] * (flat.take(rows + 1, axis=0) - low)
-        claims = np.zeros(len(self._meet.marked), bool)
+        occupied = np.zeros(len(self._conflicts.marked), bool)
         if t % _LOOK_STEPS == 0:
             self._into = _walks_into(pose, vehicles, active)
             self._release(t, vehicles, active, colour_row)
         if self._any_crosses:
-            self._claim(claims)
+            self._mark_occupied(occupied)
         result = Boxes(pose[:, :2], wrap(pose[:, 2]), self._speed, self._size_m)
         self._advance()
-        return result, claims
+        return result, occupied
 
-    def _claim(self, claims: Bool[np.ndarray, " crossing"]) -> None:
+    def _mark_occupied(self, occupied: Bool[np.ndarray, " crossing"]) -> None:
         some = self._crosses & (self._at < self._across) & (self._at > self._kerb - _CLAIM_M)
         some &= self._released | self._asking | (self._at > self._kerb)
-        claims[self._crossing[some]] = True
+        occupied[self._crossing[some]] = True
 
     def _release(
         self,
@@ -190,21 +191,21 @@ class Walkers:
         active: Bool[np.ndarray, " v"],
         colour_row: Int8[np.ndarray, " lane"],
     ) -> None:
-        """Lets those go who are at the kerb of a crossing that is safe for as long as they need."""
+        """Release walkers at the kerb of a crossing that is safe for long enough."""
         before = self._kerb - self._at
         asks = self._crosses & ~self._released & (before >= 0) & (before < _LOOK_M)
         if not np.count_nonzero(asks):
             return
-        meet, crossing = self._meet, self._crossing[asks]
+        conflicts, crossing = self._conflicts, self._crossing[asks]
         boxes = np.column_stack([vehicles.xy, *vehicles.direction, vehicles.size_m])[active]
-        any_s, hard_s = _arrivals(meet, boxes, vehicles.speed[active])
+        any_s, hard_s = _arrivals(conflicts, boxes, vehicles.speed[active])
         # Who stands first has to gain speed, which takes v / (2 a) longer.
-        start_s = self._wanted / (2 * _ACCELERATION_MPS2)
-        needed = ((self._across - self._at) / self._wanted + start_s)[asks]
-        # Nobody squeezes through a queue.
-        free = ~overlap(meet.strip[:, None], boxes[None]).any(axis=1)
-        red = ~(meet.red & (colour_row != Colour.RED)).any(axis=1)
-        yielded = meet.marked | meet.red.any(axis=1)
+        start_s = self._free_speed / (2 * _ACCELERATION_MPS2)
+        needed = ((self._across - self._at) / self._free_speed + start_s)[asks]
+        # A standing queue blocks the crossing.
+        free = ~overlap(conflicts.strip[:, None], boxes[None]).any(axis=1)
+        red = ~(conflicts.red & (colour_row != Colour.RED)).any(axis=1)
+        yielded = conflicts.marked | conflicts.red.any(axis=1)
         gap = np.where(
             yielded[crossing],
             hard_s[crossing] > needed + _MARGIN_S,
@@ -214,7 +215,7 @@ class Walkers:
         self._released[asks] = gap & free[crossing] & red[crossing] & lasting
 
     def _advance(self) -> None:
-        """One step on; who is not released stops at the kerb, and nobody walks into a vehicle."""
+        """Advance by one step; unreleased walkers stop at the kerb, and none walks into a vehicle."""
         room = self._last * self._step_m - self._at
         if self._any_crosses:
             waits = self._crosses & ~self._released & (self._at <= self._kerb)
@@ -222,7 +223,7 @@ class Walkers:
             room = np.minimum(np.maximum(kerb, 0.0), room)
         # v^2 / (2 a) is the way to stop; a step ahead, so that the end is not passed.
         stopping = np.sqrt(2 * _ACCELERATION_MPS2 * np.maximum(room - self._speed * DT_S / 2, 0.0))
-        after = np.minimum(self._wanted, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
+        after = np.minimum(self._free_speed, np.minimum(self._speed + _ACCELERATION_MPS2 * DT_S, stopping))
         after = np.maximum(after, 0.0)
         moved = np.minimum((self._speed + after) / 2 * DT_S, np.maximum(room, 0.0))
         after[self._into], moved[self._into] = 0.0, 0.0
@@ -249,31 +250,33 @@ def _red_left(
 
 
 def _arrivals(
-    meet: _Meetings, boxes: Float64[np.ndarray, "v 6"], speed: Float64[np.ndarray, " v"]
+    conflicts: _CrossingConflicts, boxes: Float64[np.ndarray, "v 6"], speed: Float64[np.ndarray, " v"]
 ) -> tuple[Float64[np.ndarray, " crossing"], Float64[np.ndarray, " crossing"]]:
     """When the next vehicle reaches each crossing, s: any that moves, and any that cannot stop with ease."""
-    any_s, hard_s = np.full(len(meet.marked), math.inf), np.full(len(meet.marked), math.inf)
+    any_s, hard_s = np.full(len(conflicts.marked), math.inf), np.full(len(conflicts.marked), math.inf)
     if not len(boxes):
         return any_s, hard_s
-    rel = meet.xy[:, None] - boxes[None, :, :2]
+    rel = conflicts.xy[:, None] - boxes[None, :, :2]
     cos, sin = boxes[:, 2], boxes[:, 3]
     ahead = rel[..., 0] * cos + rel[..., 1] * sin
     aside = np.abs(rel[..., 1] * cos - rel[..., 0] * sin)
-    same = np.cos(meet.heading)[:, None] * cos + np.sin(meet.heading)[:, None] * sin > math.cos(_ASIDE)
+    same = np.cos(conflicts.heading)[:, None] * cos + np.sin(conflicts.heading)[:, None] * sin > math.cos(
+        _ASIDE
+    )
     coming = (ahead > -1.0) & (aside < 2.0 + math.tan(_BEARING) * np.maximum(ahead, 0.0))
     coming &= same & (speed > _STANDING_MPS)
     distance = np.maximum(np.hypot(ahead, aside) - boxes[:, 4] / 2, 0.0)
     time = np.where(coming, distance / np.maximum(speed, _STANDING_MPS), math.inf)
     braking = speed**2 / (2 * np.maximum(distance - _STOP_SHORT_M, 0.05))
-    np.minimum.at(any_s, meet.crossing, time.min(axis=1))
-    np.minimum.at(hard_s, meet.crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
+    np.minimum.at(any_s, conflicts.crossing, time.min(axis=1))
+    np.minimum.at(hard_s, conflicts.crossing, np.where(braking > _YIELDING_MPS2, time, math.inf).min(axis=1))
     return any_s, hard_s
 
 
 def _walks_into(
     pose: Float64[np.ndarray, "w 3"], vehicles: Boxes, active: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, " w"]:
-    """Who would come too near to a vehicle right ahead, and is not near one already."""
+    """Mask of walkers about to come too near to a vehicle, and not near one already."""
     x, y, angle = pose.T
     into = _within(x + 0.6 * np.cos(angle), y + 0.6 * np.sin(angle), vehicles, active)
     if np.count_nonzero(into):
@@ -299,10 +302,10 @@ def _within(
     return np.logical_or.reduce(inside, axis=1)
 
 
-def placed_walkers(
+def place_walkers(
     network: RoadNetwork, per_100m: float, rng: np.random.Generator, times_s: Float64[np.ndarray, " time"]
 ) -> tuple[Walker, ...]:
-    """Draws who walks: along the sidewalks in both directions, and over the crossings.
+    """Draw walkers: along the sidewalks in both directions, and over the crossings.
 
     Args:
         network: The roads.
@@ -315,10 +318,10 @@ def placed_walkers(
     for walk in network.walks:
         length = float(walk.arc_m[-1])
         for _ in range(int(rng.poisson(per_100m * length / 100.0))):
-            way = walk if rng.random() < 0.5 else walk.reversed()
+            curve = walk if rng.random() < 0.5 else walk.reversed()
             # People keep to the right of each other.
-            way = way.shifted(-float(rng.uniform(0.1, 0.6)))
-            people.append(Walker(way, float(rng.uniform(0.0, length)), _pace(rng)))
+            curve = curve.shifted(-float(rng.uniform(0.1, 0.6)))
+            people.append(Walker(curve, float(rng.uniform(0.0, length)), _pace(rng)))
     for index, crossing in enumerate(network.crossings):
         for _ in range(int(rng.poisson(per_100m / 2))):
             people.append(_crosser(network, index, crossing, float(times_s[0]), rng))
@@ -333,7 +336,7 @@ def _pace(rng: np.random.Generator) -> float:
 def _crosser(
     network: RoadNetwork, index: int, crossing: Crossing, begin_s: float, rng: np.random.Generator
 ) -> Walker:
-    """Somebody who comes along the sidewalk, crosses, and walks on on the other side."""
+    """Draw a walker that comes along the sidewalk, crosses, and continues on the other side."""
     near, far = crossing.axis if rng.random() < 0.5 else crossing.axis[::-1]
     aside = rng.uniform(-0.3, 0.3) * crossing.width_m
     ahead = (far - near) / np.hypot(*(far - near))
@@ -367,13 +370,13 @@ def _along_walk(
         return kerb + np.outer([2.0, 20.0], out)
     _, walk, place = best
     pieces = [piece for piece in (walk.xy[place:], walk.xy[place::-1]) if len(piece) > 4]
-    # The crossing's axis is met at a right angle, some way beside the kerb.
+    # The crossing's axis is met at a right angle, some way from the kerb.
     piece = pieces[int(rng.integers(len(pieces)))]
     return piece[1:81]
 
 
 def _polyline(points: Float64[np.ndarray, "point 2"]) -> Curve:
-    """A way through points; the heading turns at the corners."""
+    """Return a curve through points; the heading turns at the corners."""
     steps = np.diff(points, axis=0)
     kept = np.concatenate([[True], np.hypot(*steps.T) > 1e-6])
     points = points[kept]

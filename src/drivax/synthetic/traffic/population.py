@@ -1,7 +1,8 @@
-"""Who is on the road: vehicles of many sizes with drivers of many tempers, placed with safe gaps."""
+"""Vehicles, drivers and parked cars, placed with safe gaps."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -9,22 +10,115 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import AgentKind, RoadKind
-from drivax.synthetic.roads.network import Lane, RoadNetwork
+from drivax.synthetic.roads.curves import Pose
+from drivax.synthetic.roads.network import Bay, Lane, RoadNetwork
 from drivax.synthetic.traffic.drivers import Drivers
 from drivax.synthetic.traffic.paths import Path, Sway, lane_path
 from drivax.synthetic.traffic.roles import Scripted
+
+#: Who passes a double-parked car without leaving the road needs this width, m.
+_PASSAGE_M = 2.3
+#: Room that is left in a bay before and behind the car, m.
+_MANOEUVRE_M = 0.6
+#: Double-parked cars keep so far from the ends of lanes, m.
+_FROM_ENDS_M = 15.0
+
+
+def parked_cars(
+    network: RoadNetwork, share: float, double_share: float, rng: np.random.Generator, steps: int
+) -> tuple[Scripted, ...]:
+    """Draw parked cars in bays, and sometimes a double-parked one.
+
+    Args:
+        network: The roads.
+        share: Share of bays that are taken.
+        double_share: Chance of a double-parked car next to a bay, where others can pass: on a lane of the
+            same direction, on the oncoming lane, or because 2.3 m are left.
+        rng: Source of chance.
+        steps: Length of the result, time steps.
+    """
+    result = []
+    for bay in network.bays:
+        # All values are drawn for every bay: the share must not change other cars.
+        size = _size(rng, bay.length_m)
+        along, aside = rng.normal(0.0, 0.15), rng.normal(0.0, 0.07)
+        turn = math.pi * (rng.random() < 0.03) + rng.normal(0.0, math.radians(1.2))
+        occupied = rng.random() < share
+        if occupied and size[0] < bay.length_m:
+            play = (bay.length_m - size[0]) / 2
+            pose = _moved(bay.pose, float(np.clip(along, -play, play)), float(np.clip(aside, -0.15, 0.15)))
+            pose = Pose(pose.x, pose.y, pose.heading + turn)
+            result.append(Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+    doubled, gap_m = rng.random() < double_share, float(rng.uniform(0.0, 0.25))
+    for place in rng.permutation(len(network.bays)).tolist() if doubled else ():
+        bay, size = network.bays[place], _size(rng, network.bays[place].length_m)
+        if _passable(network, bay, size[1], gap_m):
+            pose = _double_parked_pose(network, bay, size[1], gap_m)
+            return (*result, Scripted.standing(AgentKind.VEHICLE, size, pose, steps))
+    return tuple(result)
+
+
+def _size(rng: np.random.Generator, room_m: float) -> tuple[float, float, float]:
+    """A car or, in one case of eight, a van, that fits the bay."""
+    length = float(np.clip(rng.normal(4.5, 0.35), 3.6, 5.2))
+    van = rng.random() < 0.125 and room_m > 6.2
+    if van:
+        return min(length + 0.8, room_m - _MANOEUVRE_M), 2.0, 2.3
+    return min(length, room_m - _MANOEUVRE_M), float(np.clip(rng.normal(1.82, 0.06), 1.65, 1.95)), 1.55
+
+
+def _moved(pose: Pose, ahead_m: float, left_m: float) -> Pose:
+    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+    return Pose(pose.x + ahead_m * cos - left_m * sin, pose.y + ahead_m * sin + left_m * cos, pose.heading)
+
+
+def _double_parked_pose(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> Pose:
+    """Return the pose in the lane next to a bay, as near to it as the lane's border allows."""
+    lane = network.lanes[bay.lane]
+    centre = _pose_at(lane, bay.along_m)
+    dx, dy = bay.pose.x - centre.x, bay.pose.y - centre.y
+    side = math.copysign(1.0, dy * math.cos(centre.heading) - dx * math.sin(centre.heading))
+    return _moved(centre, 0.0, side * ((lane.width_m - width_m) / 2 - gap_m))
+
+
+def _passable(network: RoadNetwork, bay: Bay, width_m: float, gap_m: float) -> bool:
+    lane = network.lanes[bay.lane]
+    if lane.connector or not _FROM_ENDS_M < bay.along_m < lane.length_m - _FROM_ENDS_M:
+        return False
+    if lane.left >= 0 or lane.right >= 0 or lane.width_m - width_m - gap_m >= _PASSAGE_M:
+        return True
+    return _oncoming(network, lane, bay.along_m)
+
+
+def _oncoming(network: RoadNetwork, lane: Lane, along_m: float) -> bool:
+    """Whether a lane of the other direction is adjacent here."""
+    here = _pose_at(lane, along_m)
+    for other in network.lanes:
+        gap = np.hypot(other.curve.xy[:, 0] - here.x, other.curve.xy[:, 1] - here.y)
+        place = int(np.argmin(gap))
+        apart = (lane.width_m + other.width_m) / 2 + 0.5
+        if gap[place] < apart and math.cos(other.curve.heading[place] - here.heading) < -0.9:
+            return True
+    return False
+
+
+def _pose_at(lane: Lane, along_m: float) -> Pose:
+    arc = lane.curve.arc_m
+    x, y = (float(np.interp(along_m, arc, lane.curve.xy[:, axis])) for axis in (0, 1))
+    return Pose(x, y, float(np.interp(along_m, arc, lane.curve.heading)))
+
 
 #: Smallest bumper-to-bumper gap between vehicles placed on a lane, m, and the time added per m/s.
 _GAP_M, _GAP_S = 5.0, 0.9
 #: Free gaps on busy lanes as a share of those elsewhere.
 _BUSY = 0.4
-#: Nobody cycles where cars may go faster, m/s.
+#: No cyclists where the speed limit is higher, m/s.
 _CYCLED_MPS = 16.0
 #: How far from the lane's right side cyclists ride, m.
 _KERB_M = 0.55
-#: Nobody is placed so little time before a lane ends although the road goes on, s.
+#: No vehicle is placed within this time of a lane's end, s.
 _MERGE_S = 5.0
-#: From where ahead of a standing thing to where behind it nobody is placed in its lane, m, and the widest vehicle.
+#: No vehicle is placed this far before and behind an obstacle in its lane, m; the widest vehicle, m.
 _BEFORE_M, _BEHIND_M, _WIDEST_M = 30.0, 14.0, 2.55
 #: Vehicles on different lanes that take up the same strip are this far apart, centre to centre, m.
 _APART_M = 15.0
@@ -49,10 +143,10 @@ class Density:
 
     Attributes:
         spacing_m: Mean free gap between vehicles of a lane, drawn per scenario, low and high.
-        vehicles: Most vehicles beside ego; the nearest to ego are kept.
+        vehicles: Most vehicles besides ego; the nearest to ego are kept.
         van_share, truck_share, bus_share: Shares of these among all; the rest are cars.
         cyclist_share: Share of cyclists among those who are placed on streets.
-        leader_share: Share of scenarios in which somebody is placed right ahead of ego.
+        leader_share: Share of scenarios in which a vehicle is placed right ahead of ego.
     """
 
     spacing_m: tuple[float, float] = (25.0, 90.0)
@@ -81,7 +175,7 @@ def placed(
     parked: tuple[Scripted, ...] = (),
     busy: Collection[int] = (),
 ) -> Placement:
-    """Draws where the others begin: nobody on a connector, and nobody too close to ego or to another.
+    """Draw initial positions: none on a connector, none too close to ego or another vehicle.
 
     Args:
         network: The roads.
@@ -89,44 +183,44 @@ def placed(
         ego_along_m: Distance of ego along that lane, m.
         density: How full the roads are.
         rng: Source of chance.
-        parked: Who stands somewhere all the time: nobody begins in it or right behind it.
+        parked: Parked cars; no vehicle begins in or right behind one.
         busy: Lanes that are as full as the network's busy ones.
     """
     spacing = rng.uniform(*density.spacing_m)
-    found: list[tuple[int, float]] = []
+    vehicles: list[tuple[int, float]] = []
     if rng.random() < density.leader_share:
         ahead = ego_along_m + rng.uniform(18.0, 45.0)
         if ahead < network.lanes[ego_lane].length_m - 6.0:
-            found.append((ego_lane, ahead))
+            vehicles.append((ego_lane, ahead))
     for index, lane in enumerate(network.lanes):
         if lane.connector:
             continue
         least = 10.0 + _GAP_M + _GAP_S * lane.limit_mps
-        taken = [along for where, along in found if where == index]
-        taken += [ego_along_m] if index == ego_lane else []
+        occupied = [along for where, along in vehicles if where == index]
+        occupied += [ego_along_m] if index == ego_lane else []
         mean = spacing * (_BUSY if index in network.busy or index in busy else 1.0)
         at = rng.uniform(6.0, 6.0 + mean)
         while at < lane.length_m - (_MERGE_S * lane.limit_mps if lane.ends else 6.0):
-            if all(abs(at - other) > least for other in taken):
-                found.append((index, float(at)))
-                taken.append(float(at))
+            if all(abs(at - other) > least for other in occupied):
+                vehicles.append((index, float(at)))
+                occupied.append(float(at))
             at += least + rng.exponential(mean)
-    found = [place for place in found if not _blocked(network, *place, parked)]
-    found = _apart_at_joints(network, found, ego_lane, ego_along_m)
+    vehicles = [place for place in vehicles if not _blocked(network, *place, parked)]
+    vehicles = _apart_at_joints(network, vehicles, ego_lane, ego_along_m)
     here = network.lanes[ego_lane].curve
     ego_xy = here.xy[np.searchsorted(here.arc_m, ego_along_m).clip(max=len(here.xy) - 1)]
-    found.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
-    found = _apart_in_space(network, found, (ego_lane, ego_along_m))[: density.vehicles]
-    return Placement(tuple(lane for lane, _ in found), tuple(along for _, along in found))
+    vehicles.sort(key=lambda item: float(np.hypot(*(_point(network, *item) - ego_xy))))
+    vehicles = _apart_in_space(network, vehicles, (ego_lane, ego_along_m))[: density.vehicles]
+    return Placement(tuple(lane for lane, _ in vehicles), tuple(along for _, along in vehicles))
 
 
 def _apart_in_space(
-    network: RoadNetwork, found: list[tuple[int, float]], ego: tuple[int, float]
+    network: RoadNetwork, vehicles: list[tuple[int, float]], ego: tuple[int, float]
 ) -> list[tuple[int, float]]:
-    """Drops who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
+    """Drop who stands in another's place on another lane, as where lanes fork or merge; the first ones stay."""
     kept: list[tuple[float, float]] = []
     result = []
-    for place in [ego, *found]:
+    for place in [ego, *vehicles]:
         lane, along = network.lanes[place[0]], place[1]
         x, y = _point(network, *place)
         heading = float(np.interp(along, lane.curve.arc_m, lane.curve.heading))
@@ -142,7 +236,7 @@ def _apart_in_space(
 
 
 def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Scripted, ...]) -> bool:
-    """Whether somebody stands in the lane here or so near ahead that it could not be passed."""
+    """Whether a parked car is in the lane here or too near ahead to be passed."""
     curve = network.lanes[lane].curve
     place = min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)
     cos, sin = np.cos(curve.heading[place]), np.sin(curve.heading[place])
@@ -155,17 +249,17 @@ def _blocked(network: RoadNetwork, lane: int, along: float, parked: tuple[Script
 
 
 def _apart_at_joints(
-    network: RoadNetwork, found: list[tuple[int, float]], ego_lane: int, ego_along_m: float
+    network: RoadNetwork, vehicles: list[tuple[int, float]], ego_lane: int, ego_along_m: float
 ) -> list[tuple[int, float]]:
-    """Drops who stands too close behind the first vehicle of a following lane."""
+    """Drop who stands too close behind the first vehicle of a following lane."""
     kept = []
     first: dict[int, float] = {}
-    for lane, along in [*found, (ego_lane, ego_along_m)]:
+    for lane, along in [*vehicles, (ego_lane, ego_along_m)]:
         first[lane] = min(along, first.get(lane, np.inf))
     last: dict[int, float] = {ego_lane: ego_along_m}
-    for lane, along in found:
+    for lane, along in vehicles:
         last[lane] = max(along, last.get(lane, 0.0))
-    for lane, along in found:
+    for lane, along in vehicles:
         this = network.lanes[lane]
         least = 10.0 + _GAP_M + _GAP_S * this.limit_mps
         after = min((first.get(b, np.inf) for b in this.successors), default=np.inf)
@@ -182,20 +276,20 @@ def _point(network: RoadNetwork, lane: int, along: float) -> Float64[np.ndarray,
     return curve.xy[min(int(along / network.lanes[lane].length_m * len(curve.xy)), len(curve.xy) - 1)]
 
 
-def drawn_drivers(
+def draw_drivers(
     count: int, density: Density, rng: np.random.Generator, lanes: Sequence[Lane] | None = None
 ) -> Drivers:
-    """Draws vehicles and drivers: hurried and patient, close and careful.
+    """Draw vehicles and drivers.
 
     Args:
         count: How many.
         density: Shares of the types.
         rng: Source of chance.
-        lanes: Where each begins: nobody cycles on fast roads, and only cyclists are on bicycle lanes.
+        lanes: First lane of each: no cyclists on fast roads, only cyclists on bicycle lanes.
     """
     shares = np.cumsum([density.van_share, density.truck_share, density.bus_share, density.cyclist_share])
     drawn = np.searchsorted(shares, rng.random(count), side="right")
-    # The types in the order of the shares; whoever is left drives a car.
+    # The types in the order of the shares; the rest are cars.
     kind = (drawn + 1) % (len(shares) + 1)
     if lanes is not None:
         fast = np.array([lane.limit_mps > _CYCLED_MPS for lane in lanes], bool)
@@ -226,15 +320,15 @@ def drawn_drivers(
 def driven_path(
     network: RoadNetwork, lanes: tuple[int, ...], cyclist: bool, rng: np.random.Generator
 ) -> Path:
-    """The path of somebody along lanes: cars near the middle, cyclists near the right side."""
+    """Draw a path along lanes: cars near the centre, cyclists near the right side."""
     if not cyclist:
         return lane_path(network, lanes, Sway.drawn(rng, 0.2))
     narrowest = min(network.lanes[lane].width_m for lane in lanes)
     return lane_path(network, lanes, Sway.drawn(rng, 0.1, aside_m=_KERB_M - narrowest / 2))
 
 
-def joined_drivers(first: Drivers, rest: Drivers) -> Drivers:
-    """One table of both."""
+def join_drivers(first: Drivers, rest: Drivers) -> Drivers:
+    """Concatenate two sets of drivers."""
     return Drivers(
         **{name: np.concatenate([value, getattr(rest, name)]) for name, value in vars(first).items()}
     )

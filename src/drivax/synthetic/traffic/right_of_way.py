@@ -1,7 +1,7 @@
-"""Who may enter a connector, and when: lights, signs, priority, and room to leave it again.
+"""Right of way at connectors: lights, signs, priority, and room to leave.
 
 A driver asks for a connector when it comes so near that it would have to begin to brake for its line. Once granted,
-the connector is held until the tail has left what others need of it; nobody is granted what conflicts with it.
+the connector is held until the tail has left what others need of it; conflicting connectors are not granted.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from drivax.synthetic.traffic.path_arrays import PathTables
 
 #: A driver asks for the way when it would brake this gently for the line, m/s2, with this much time and room to spare.
 _ASK_MPS2, _ASK_S, _ASK_M = 2.0, 0.7, 3.5
-#: Whoever expects another to clear the way in time waits no longer with braking than for this, m/s2; speed of turns.
+#: A driver that expects a blocker to clear in time brakes at this deceleration at the latest, m/s2; turning speed.
 _LATEST_MPS2, _TURNING_MPS = 3.4, 7.0
-#: Nobody stops for others who would have to brake harder, m/s2.
+#: A driver that would have to brake harder than this does not stop for others, m/s2.
 _HARDEST_MPS2 = 6.5
 #: Standing at a stop sign: slower than this, and nearer to the line.
 _STANDS_MPS, _STANDS_M = 0.2, 4.5
@@ -42,15 +42,15 @@ _RED, _YELLOW = int(Colour.RED), int(Colour.YELLOW)
 
 
 @dataclass(frozen=True)
-class Moment:
-    """Where everyone is when drivers decide.
+class TrafficState:
+    """State of all vehicles when drivers decide.
 
     Attributes:
         step, colour, to_red: The step, and what each lane's light shows and how long until it turns red, s.
         front_m, rear_m: Positions of both bumpers on the own paths.
         room_m, leader, leader_speed: Gap to the vehicle ahead, its row and its speed.
         promised: Number of connectors on the path that a vehicle will enter whatever others do (-1: it asks).
-        told: Whether anybody has promised.
+        promises: Whether any vehicle has promised.
     """
 
     step: int
@@ -64,7 +64,7 @@ class Moment:
     leader: Int64[np.ndarray, " v"]
     leader_speed: Float64[np.ndarray, " v"]
     promised: Int64[np.ndarray, " v"]
-    told: bool
+    promises: bool
 
 
 def conflict_zones(
@@ -78,14 +78,14 @@ def conflict_zones(
     begin, end = np.full((count, count), np.nan), np.full((count, count), np.nan)
     points = {i: resampled(lane.curve, 1.0).xy for i, lane in enumerate(network.lanes) if lane.connector}
     box = {i: (xy.min(axis=0), xy.max(axis=0)) for i, xy in points.items()}
-    for a, one in points.items():
+    for a, xy_a in points.items():
         origin = set(network.lanes[a].predecessors)
         for b, other in points.items():
             if b <= a or origin & set(network.lanes[b].predecessors):
                 continue
             if np.any(box[a][0] > box[b][1] + CLEARANCE_M) or np.any(box[b][0] > box[a][1] + CLEARANCE_M):
                 continue
-            near = np.sum((one[:, None] - other) ** 2, axis=-1) < CLEARANCE_M**2
+            near = np.sum((xy_a[:, None] - other) ** 2, axis=-1) < CLEARANCE_M**2
             for i, j, hit in ((a, b, near.any(axis=1)), (b, a, near.any(axis=0))):
                 if hit.any():
                     step = network.lanes[i].length_m / (len(hit) - 1)
@@ -134,7 +134,7 @@ class RightOfWay:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything: a new run begins."""
+        """Reset for a new run."""
         count = len(self._length)
         self._granted = np.zeros(count, int)
         self._stood = np.full(count, np.inf)
@@ -143,47 +143,47 @@ class RightOfWay:
 
     def swapped(self, row: int, tables: PathTables, front_m: float) -> None:
         """A vehicle has gone over to another path: it holds what it has entered there, and asks for the rest."""
-        self._granted[row] = int(np.sum(tables.way_begin[row] < front_m))
+        self._granted[row] = int(np.sum(tables.connector_begin[row] < front_m))
         self._stood[row], self._asked[row] = np.inf, -1
 
-    def lines(self, now: Moment, tables: PathTables) -> Float64[np.ndarray, " v"]:
+    def lines(self, state: TrafficState, tables: PathTables) -> Float64[np.ndarray, " v"]:
         """Distance from the front bumper to the next line at which to stop (infinite: none)."""
-        ways = tables.way.shape[1]
-        entered = _number(tables.way_begin < now.front_m[:, None])
+        connectors = tables.connector.shape[1]
+        entered = _number(tables.connector_begin < state.front_m[:, None])
         self._granted = np.maximum(self._granted, entered)
-        stop, halts = self._lights(now, tables)
+        stop, halts = self._lights(state, tables)
         self._granted = np.maximum(np.minimum(self._granted, halts), entered)
-        ask = now.speed**2 / (2 * _ASK_MPS2) + _ASK_S * now.speed + _ASK_M
-        if now.told:
-            self._granted = np.where(now.promised >= 0, np.maximum(now.promised, entered), self._granted)
-        place = np.minimum(self._granted, ways - 1)
-        flat = place + ways * self._rows
-        distance = tables.way_begin.ravel().take(flat) - now.front_m
+        ask = state.speed**2 / (2 * _ASK_MPS2) + _ASK_S * state.speed + _ASK_M
+        if state.promises:
+            self._granted = np.where(state.promised >= 0, np.maximum(state.promised, entered), self._granted)
+        place = np.minimum(self._granted, connectors - 1)
+        flat = place + connectors * self._rows
+        distance = tables.connector_begin.ravel().take(flat) - state.front_m
         # Where there is no connector ahead, it is infinitely far away.
-        asks = (distance >= 0) & (distance <= ask) & now.active & (halts > place)
-        if now.told:
-            told = now.promised >= 0
-            asks &= ~told
-            stop[told] = np.inf
+        asks = (distance >= 0) & (distance <= ask) & state.active & (halts > place)
+        if state.promises:
+            promises = state.promised >= 0
+            asks &= ~promises
+            stop[promises] = np.inf
         self._denied &= asks
-        who = asks.nonzero()[0]
-        if len(who):
-            self._hear(now, tables, who, place, stop)
+        asking = asks.nonzero()[0]
+        if len(asking):
+            self._decide(state, tables, asking, place, stop)
         return stop
 
     def _lights(
-        self, now: Moment, tables: PathTables
+        self, state: TrafficState, tables: PathTables
     ) -> tuple[Float64[np.ndarray, " v"], Int64[np.ndarray, " v"]]:
         """Distance to the nearest line held by a light, and which connector it is (none: their number)."""
-        begin, count = tables.way_begin, tables.way.shape[1]
-        if not np.count_nonzero(now.colour):
+        begin, count = tables.connector_begin, tables.connector.shape[1]
+        if not np.count_nonzero(state.colour):
             return np.full(len(begin), np.inf), np.full(len(begin), count)
-        distance = begin - now.front_m[:, None]
+        distance = begin - state.front_m[:, None]
         distance[distance < 0.0] = np.inf
-        speed = now.speed[:, None]
+        speed = state.speed[:, None]
         needed = speed**2 / (2 * np.maximum(distance, 0.05))
-        colour = now.colour.take(tables.way)
-        late = distance > speed * now.to_red.take(tables.way)
+        colour = state.colour.take(tables.connector)
+        late = distance > speed * state.to_red.take(tables.connector)
         yellow = (colour == _YELLOW) & (
             (needed <= self._drivers.yellow_mps2[:, None]) | (late & (needed <= 5.0))
         )
@@ -193,150 +193,172 @@ class RightOfWay:
         held = halt.ravel().take(flat)
         return np.where(held, distance.ravel().take(flat), np.inf), np.where(held, first, count)
 
-    def _hear(
+    def _decide(
         self,
-        now: Moment,
+        state: TrafficState,
         tables: PathTables,
-        who: Int64[np.ndarray, " asking"],
+        asking: Int64[np.ndarray, " asking"],
         place: Int64[np.ndarray, " v"],
         stop: Float64[np.ndarray, " v"],
     ) -> None:
-        """Grants or denies what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
-        index = np.arange(tables.way.shape[1])
-        held = (index < self._granted[:, None]) & (tables.way_end > now.rear_m[:, None]) & now.active[:, None]
-        holder, slot = np.nonzero(held & (tables.way >= 0))
-        holders = list(zip(holder.tolist(), tables.way[holder, slot].tolist(), strict=True))
-        for i in who.tolist():
-            self._note_standing(now, tables, i, int(place[i]))
-        before: list[tuple[int, int]] = []  # who stands at an all-way stop and has not been let in
-        for i in self._in_order(now, tables, who, place):
-            way = int(tables.way[i, place[i]])
-            distance = float(tables.way_begin[i, place[i]] - now.front_m[i])
-            hard = now.speed[i] ** 2 / (2 * max(distance, 0.05)) > _HARDEST_MPS2
-            ok = self._free[way] or (hard and now.speed[i] > 2.0)
-            ok = ok or self._may(now, tables, (i, way, int(place[i])), holders, before)
-            if not ok and self._clears_in_time(now, tables, (i, way, int(place[i])), holders):
+        """Grant or deny what drivers ask for, nearest in time first, at all-way stops in the order of standing."""
+        index = np.arange(tables.connector.shape[1])
+        held = (
+            (index < self._granted[:, None])
+            & (tables.connector_end > state.rear_m[:, None])
+            & state.active[:, None]
+        )
+        holder, slot = np.nonzero(held & (tables.connector >= 0))
+        holders = list(zip(holder.tolist(), tables.connector[holder, slot].tolist(), strict=True))
+        for i in asking.tolist():
+            self._note_standing(state, tables, i, int(place[i]))
+        waiting: list[tuple[int, int]] = []  # who stands at an all-way stop and has not been let in
+        for i in self._in_order(state, tables, asking, place):
+            connector = int(tables.connector[i, place[i]])
+            distance = float(tables.connector_begin[i, place[i]] - state.front_m[i])
+            hard = state.speed[i] ** 2 / (2 * max(distance, 0.05)) > _HARDEST_MPS2
+            ok = self._free[connector] or (hard and state.speed[i] > 2.0)
+            ok = ok or self._may_enter(state, tables, (i, connector, int(place[i])), holders, waiting)
+            if not ok and self._clears_in_time(state, tables, (i, connector, int(place[i])), holders):
                 continue
             self._denied[i] = not ok
             if ok:
                 self._granted[i] = place[i] + 1
                 self._stood[i] = np.inf
-                holders.append((i, way))
+                holders.append((i, connector))
             else:
                 stop[i] = min(stop[i], distance)
-                if self._control[way] == _ALL_WAY_STOP and np.isfinite(self._stood[i]):
-                    before.append((i, way))
+                if self._control[connector] == _ALL_WAY_STOP and np.isfinite(self._stood[i]):
+                    waiting.append((i, connector))
 
-    def _note_standing(self, now: Moment, tables: PathTables, i: int, place: int) -> None:
-        way, distance = int(tables.way[i, place]), tables.way_begin[i, place] - now.front_m[i]
-        if self._asked[i] != way:
-            self._asked[i], self._stood[i] = way, np.inf
-        if now.speed[i] < _STANDS_MPS and distance < _STANDS_M and not np.isfinite(self._stood[i]):
-            self._stood[i] = now.step * DT_S
+    def _note_standing(self, state: TrafficState, tables: PathTables, i: int, place: int) -> None:
+        connector, distance = (
+            int(tables.connector[i, place]),
+            tables.connector_begin[i, place] - state.front_m[i],
+        )
+        if self._asked[i] != connector:
+            self._asked[i], self._stood[i] = connector, np.inf
+        if state.speed[i] < _STANDS_MPS and distance < _STANDS_M and not np.isfinite(self._stood[i]):
+            self._stood[i] = state.step * DT_S
 
     def _in_order(
         self,
-        now: Moment,
+        state: TrafficState,
         tables: PathTables,
-        who: Int64[np.ndarray, " asking"],
+        asking: Int64[np.ndarray, " asking"],
         place: Int64[np.ndarray, " v"],
     ) -> list[int]:
-        ways = tables.way[who, place[who]]
-        arrival = (tables.way_begin[who, place[who]] - now.front_m[who]) / np.maximum(now.speed[who], 1.0)
-        all_way = self._control[ways] == _ALL_WAY_STOP
-        stood = self._stood[who]
+        connectors = tables.connector[asking, place[asking]]
+        arrival = (tables.connector_begin[asking, place[asking]] - state.front_m[asking]) / np.maximum(
+            state.speed[asking], 1.0
+        )
+        all_way = self._control[connectors] == _ALL_WAY_STOP
+        stood = self._stood[asking]
         key = np.where(all_way, 1e3 + np.minimum(stood, 1e6), arrival)
         for k in np.flatnonzero(all_way & np.isfinite(stood)):
-            # Of those who came together the one with nobody to its right goes first.
+            # Of those who came together the vehicle without another to its right goes first.
             tied = all_way & (np.abs(stood - stood[k]) < _TIE_S)
-            here = self._lanes[ways[k]].curve.heading[0]
-            turned = np.array([wrap(self._lanes[w].curve.heading[0] - here) for w in ways[tied]])
+            here = self._lanes[connectors[k]].curve.heading[0]
+            turned = np.array([wrap(self._lanes[w].curve.heading[0] - here) for w in connectors[tied]])
             key[k] += 0.5 * _TIE_S * bool(np.any((turned > math.pi / 4) & (turned < 3 * math.pi / 4)))
-        return who[np.lexsort((who, key))].tolist()
+        return asking[np.lexsort((asking, key))].tolist()
 
-    def _may(
+    def _may_enter(
         self,
-        now: Moment,
+        state: TrafficState,
         tables: PathTables,
         request: tuple[int, int, int],
         holders: list[tuple[int, int]],
-        before: list[tuple[int, int]],
+        waiting: list[tuple[int, int]],
     ) -> bool:
-        i, way, place = request
-        control = self._control[way]
-        if control >= _STOP and now.step * DT_S - self._stood[i] < _PAUSE_S:
+        i, connector, place = request
+        control = self._control[connector]
+        if control >= _STOP and state.step * DT_S - self._stood[i] < _PAUSE_S:
             return False
-        ahead = int(now.leader[i])
-        line = tables.way_begin[i, place]
-        tail = now.front_m[i] + now.room_m[i]
+        ahead = int(state.leader[i])
+        line = tables.connector_begin[i, place]
+        tail = state.front_m[i] + state.room_m[i]
         if tail < line and self._denied[ahead]:
             return False
-        if self._in_the_way(now, tables, i, way, holders):
+        if self._blockers(state, tables, i, connector, holders):
             return False
-        if any(self._conflict[way, other] for _, other in before):
+        if any(self._conflict[connector, other] for _, other in waiting):
             return False
-        full = tail < tables.way_end[i, place] + self._length[i] + 1.5 and now.leader_speed[i] < 1.5
+        full = tail < tables.connector_end[i, place] + self._length[i] + 1.5 and state.leader_speed[i] < 1.5
         if full and tail >= line - 1.0 and control != _NONE:
             return False
-        return not len(self._yields[way]) or self._gap_is_accepted(now, tables, request)
+        return not len(self._yields[connector]) or self._gap_is_accepted(state, tables, request)
 
-    def _in_the_way(
-        self, now: Moment, tables: PathTables, i: int, way: int, holders: list[tuple[int, int]]
+    def _blockers(
+        self, state: TrafficState, tables: PathTables, i: int, connector: int, holders: list[tuple[int, int]]
     ) -> list[tuple[int, int, float]]:
         """Who holds what a driver needs: its row, its connector, and how far its tail has to go to leave it, m."""
         result = []
         for j, other in holders:
-            if j != i and self._conflict[way, other]:
-                past = tables.begin[j, other] + tables.scale[j, other] * self._zone_end[other, way]
-                if now.rear_m[j] < past + 0.3:
-                    result.append((j, other, float(past - now.rear_m[j]) + 0.3))
+            if j != i and self._conflict[connector, other]:
+                past = tables.begin[j, other] + tables.scale[j, other] * self._zone_end[other, connector]
+                if state.rear_m[j] < past + 0.3:
+                    result.append((j, other, float(past - state.rear_m[j]) + 0.3))
         return result
 
     def _clears_in_time(
-        self, now: Moment, tables: PathTables, request: tuple[int, int, int], holders: list[tuple[int, int]]
+        self,
+        state: TrafficState,
+        tables: PathTables,
+        request: tuple[int, int, int],
+        holders: list[tuple[int, int]],
     ) -> bool:
         """Whether a driver with priority need not brake yet: those in its way move and will be gone."""
-        i, way, place = request
-        away = float(tables.way_begin[i, place] - now.front_m[i])
-        gentle = now.speed[i] ** 2 / (2 * max(away, 0.05)) < _LATEST_MPS2
-        found = self._in_the_way(now, tables, i, way, holders)
-        ways = {other for _, other, _ in found}
-        if not found or not gentle or self._control[way] >= _STOP or ways & set(self._yields[way].tolist()):
+        i, connector, place = request
+        away = float(tables.connector_begin[i, place] - state.front_m[i])
+        gentle = state.speed[i] ** 2 / (2 * max(away, 0.05)) < _LATEST_MPS2
+        blockers = self._blockers(state, tables, i, connector, holders)
+        connectors = {other for _, other, _ in blockers}
+        if (
+            not blockers
+            or not gentle
+            or self._control[connector] >= _STOP
+            or connectors & set(self._yields[connector].tolist())
+        ):
             return False
-        for j, other, left in found:
-            leaves = time_to_cover(np.array([left]), float(now.speed[j]), 1.0, _TURNING_MPS)[0]
-            if now.speed[j] < 0.5 or leaves + 1.0 > (away + self._zone_begin[way, other]) / max(
-                now.speed[i], 1.0
+        for j, other, left in blockers:
+            leaves = time_to_cover(np.array([left]), float(state.speed[j]), 1.0, _TURNING_MPS)[0]
+            if state.speed[j] < 0.5 or leaves + 1.0 > (away + self._zone_begin[connector, other]) / max(
+                state.speed[i], 1.0
             ):
                 return False
         return True
 
-    def _gap_is_accepted(self, now: Moment, tables: PathTables, request: tuple[int, int, int]) -> bool:
-        """Whether nobody with priority would arrive too soon."""
-        i, way, place = request
-        others = self._yields[way]
+    def _gap_is_accepted(
+        self, state: TrafficState, tables: PathTables, request: tuple[int, int, int]
+    ) -> bool:
+        """Whether the gap to users with priority is accepted."""
+        i, connector, place = request
+        others = self._yields[connector]
         begin = tables.begin[:, others]
         scale = tables.scale[:, others]
-        reach = begin + scale * self._zone_begin[others, way] - now.front_m[:, None]
-        clear = begin + scale * self._zone_end[others, way] - now.rear_m[:, None]
-        coming = (clear > 0) & now.active[:, None]
+        reach = begin + scale * self._zone_begin[others, connector] - state.front_m[:, None]
+        clear = begin + scale * self._zone_end[others, connector] - state.rear_m[:, None]
+        coming = (clear > 0) & state.active[:, None]
         coming[i] = False
         # Who faces a red light or has been made to wait is not coming.
-        waits = (now.colour[others] == _RED) | (self._denied & (now.speed < 0.5))[:, None]
+        waits = (state.colour[others] == _RED) | (self._denied & (state.speed < 0.5))[:, None]
         coming &= ~(waits & (reach > 0))
         if not coming.any():
             return True
         rows, columns = np.nonzero(coming)
-        speed = now.speed[rows]
+        speed = state.speed[rows]
         arrival = np.maximum(reach[rows, columns], 0.0) / np.maximum(speed, _EXPECTED_MPS)
         gone = clear[rows, columns] / np.maximum(speed, 0.3)
         own = others[columns]
-        start = tables.way_begin[i, place] - now.front_m[i]
-        top = float(tables.at(np.array([tables.way_begin[i, place] + 5.0]), np.array([i]))[0, 3])
+        start = tables.connector_begin[i, place] - state.front_m[i]
+        top = float(tables.at(np.array([tables.connector_begin[i, place] + 5.0]), np.array([i]))[0, 3])
         push = float(self._drivers.acceleration_mps2[i])
-        enter = time_to_cover(start + self._zone_begin[way, own], now.speed[i], push, top)
-        leave = time_to_cover(start + self._zone_end[way, own] + self._length[i], now.speed[i], push, top)
-        waited = now.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
+        enter = time_to_cover(start + self._zone_begin[connector, own], state.speed[i], push, top)
+        leave = time_to_cover(
+            start + self._zone_end[connector, own] + self._length[i], state.speed[i], push, top
+        )
+        waited = state.step * DT_S - self._stood[i] if np.isfinite(self._stood[i]) else 0.0
         patience = 1.0 - min(waited / _IMPATIENT_S, 1.0) / 3.0
         needed = np.maximum(self._drivers.critical_gap_s[i] * patience, leave + 0.5)
         return not np.any((arrival < needed) & (gone > enter - 0.3))

@@ -1,10 +1,11 @@
-"""Who takes part in a scenario: ego on its way, the others with their drivers, people on foot, parked cars, lights."""
+"""Assign the roles of a scenario: ego's route, other vehicles and drivers, walkers, parked cars, lights."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,55 +15,105 @@ from drivax.synthetic.events.destinations import Aim, AimedWay, drawn_aimed_way,
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
-from drivax.synthetic.traffic.conflicts import giving_way, met_on, with_feeders
 from drivax.synthetic.traffic.drivers import Drivers
-from drivax.synthetic.traffic.parking import parked_cars
 from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path, random_lanes
-from drivax.synthetic.traffic.pedestrians import placed_walkers
-from drivax.synthetic.traffic.population import drawn_drivers, driven_path, joined_drivers, placed
-from drivax.synthetic.traffic.roles import Cast
+from drivax.synthetic.traffic.pedestrians import place_walkers
+from drivax.synthetic.traffic.population import (
+    draw_drivers,
+    driven_path,
+    join_drivers,
+    parked_cars,
+    placed,
+)
+from drivax.synthetic.traffic.roles import Roles
+
+#: Lanes that lead to a meeting are followed back for this long, m.
+_BACK_M = 160.0
+#: When ego would come to where it gives way if nothing held it up, s after the recording's beginning.
+_WHEN_S = (0.4, 4.0)
+
+
+def giving_way(network: RoadNetwork) -> tuple[Aim, ...]:
+    """Return destinations on connectors that yield to users with unconditional priority."""
+    return tuple(
+        Aim(index, (0.0, min(3.0, lane.length_m)), _WHEN_S)
+        for index, lane in enumerate(network.lanes)
+        if lane.control == Control.ALL_WAY_STOP or any(not network.lanes[k].yields_to for k in lane.yields_to)
+    )
+
+
+def conflicts_on(network: RoadNetwork, path: Path) -> frozenset[int]:
+    """Return connectors that a path yields to (unless they yield themselves) and lanes it changes to.
+
+    Args:
+        network: The roads.
+        path: Ego's.
+    """
+    result: set[int] = set()
+    for before, span in pairwise((path.spans[0], *path.spans)):
+        lane, previous = network.lanes[span.lane], network.lanes[before.lane]
+        if span.lane in (previous.left, previous.right):
+            result.add(span.lane)
+        if lane.control == Control.ALL_WAY_STOP:
+            result.update(np.flatnonzero(network.conflicts[span.lane]).tolist())
+        result.update(rival for rival in lane.yields_to if not network.lanes[rival].yields_to)
+    return frozenset(result)
+
+
+def with_feeders(network: RoadNetwork, lanes: frozenset[int]) -> frozenset[int]:
+    """Lanes, and those from which they are reached within 160 m."""
+    result: set[int] = set()
+    ahead = [(lane, 0.0) for lane in sorted(lanes)]
+    while ahead:
+        lane, away = ahead.pop()
+        if lane not in result and away < _BACK_M:
+            result.add(lane)
+            this = network.lanes[lane]
+            ahead += [(before, away + this.length_m) for before in this.predecessors]
+    return frozenset(result)
+
 
 #: Shares of what the light does for ego: green on arrival, turning green, turning red.
 SignalTiming = tuple[float, float, float]
-#: Ego begins at least this far along its way, m.
+#: Ego begins at least this far along its path, m.
 _LEAST_M = 12.0
-#: Further ways that are drawn for ego in the hope that it has to give way.
-_WAYS = 4
+#: Further routes drawn for ego until it has to give way.
+_ROUTES = 4
 
 
-def draw_cast(
+def assign_roles(
     network: RoadNetwork,
     domain: Domain,
     times_s: Float64[np.ndarray, " time"],
     lane_change_share: float,
     timing: SignalTiming,
     rng: np.random.Generator,
-    aims: Sequence[Aim] = (),
+    destinations: Sequence[Aim] = (),
     critical: bool = False,
-) -> Cast:
-    """Draws ego, its way and lights, then the others and theirs.
+) -> Roles:
+    """Draw ego, its route and lights, then the others.
 
     Args:
         network: The roads.
-        domain: How full they are, and of whom.
+        domain: Traffic density and composition.
         times_s: Times of all steps; the recording begins at time 0, before it traffic warms up.
         lane_change_share: Share of scenarios with room for it in which ego plans a lane change.
         timing: Shares of what the light does for ego.
         rng: Source of chance.
-        aims: Places of which ego should pass one unhindered; without any it begins and goes where it likes.
-        critical: Ego takes a way on which it has to give way to others if there is one, and these are many.
+        destinations: Places of which ego should pass one unhindered; without any it begins and goes where it likes.
+        critical: Ego's route leads where it must give way to dense traffic, if the roads allow it.
     """
-    driver = expert.drawn_expert(rng)
-    aimed = drawn_aimed_way(network, giving_way(network) if critical else aims, rng)
+    driver = expert.draw_expert(rng)
+    aimed = drawn_aimed_way(network, giving_way(network) if critical else destinations, rng)
     first_s = float(times_s[0])
-    way = _drawn_way(network, driver, first_s, lane_change_share, rng, aimed)
-    for _ in range(_WAYS if critical and aimed is None else 0):
-        if met_on(network, way.path):
+    route = _draw_route(network, driver, first_s, lane_change_share, rng, aimed)
+    for _ in range(_ROUTES if critical and aimed is None else 0):
+        if conflicts_on(network, route.path):
             break
-        way = _drawn_way(network, driver, first_s, lane_change_share, rng, None)
-    rivals = with_feeders(network, met_on(network, way.path)) if critical else frozenset()
-    path, lanes, at = way.path, way.lanes, way.at_m
+        route = _draw_route(network, driver, first_s, lane_change_share, rng, None)
+    rivals = with_feeders(network, conflicts_on(network, route.path)) if critical else frozenset()
+    path, lanes, at = route.path, route.lanes, route.at_m
     network = replace(network, signals=_lights(network, lanes, timing, aimed, rng))
     here = max((span for span in path.spans if span.begin_m <= at), key=lambda span: span.begin_m)
     density = domain.density
@@ -73,25 +124,25 @@ def draw_cast(
     if aimed is not None:
         others = rearranged(others, aimed, (here.lane, at - here.begin_m), rng)
     begin = [network.lanes[lane] for lane in others.lane]
-    drivers = joined_drivers(driver, drawn_drivers(len(begin), density, rng, begin))
+    drivers = join_drivers(driver, draw_drivers(len(begin), density, rng, begin))
     paths = [path]
     for lane, cyclist in zip(others.lane, drivers.cyclist[1:], strict=True):
         paths.append(driven_path(network, random_lanes(network, lane, rng, rivals), bool(cyclist), rng))
     distance = np.array([at, *others.along_m])
-    return Cast(
+    return Roles(
         network=network,
         paths=paths,
         drivers=drivers,
         distance_m=distance,
         speed_mps=_first_speeds(network, paths, drivers, distance, rng),
         route=lanes,
-        walkers=placed_walkers(network, float(rng.uniform(*domain.walkers)), rng, times_s),
+        walkers=place_walkers(network, float(rng.uniform(*domain.walkers)), rng, times_s),
         parked=parked,
     )
 
 
 @dataclass(frozen=True)
-class _Way:
+class _Route:
     """Ego's lanes, its path along them, and where on it it begins."""
 
     lanes: tuple[int, ...]
@@ -99,14 +150,14 @@ class _Way:
     at_m: float
 
 
-def _drawn_way(
+def _draw_route(
     network: RoadNetwork,
     driver: Drivers,
     first_s: float,
     lane_change_share: float,
     rng: np.random.Generator,
     aimed: AimedWay | None,
-) -> _Way:
+) -> _Route:
     """Ego begins so far back that the warm-up brings it to where the recording should begin."""
     if aimed is None:
         start = network.starts[int(rng.integers(len(network.starts)))]
@@ -117,7 +168,7 @@ def _drawn_way(
     cruise = 0.9 * float(driver.speed_factor[0]) * network.lanes[start.lane].limit_mps
     first = next(span for span in path.spans if span.lane == start.lane)
     at = max(_LEAST_M, float(first.begin_m + rng.uniform(start.low_m, start.high_m) + first_s * cruise))
-    return _Way(lanes, path, at)
+    return _Route(lanes, path, at)
 
 
 def _lights(
@@ -138,10 +189,10 @@ def _lights(
 
 
 def _timed(
-    plan: SignalPlan, way: int, shares: tuple[float, float, float], rng: np.random.Generator
+    plan: SignalPlan, route: int, shares: tuple[float, float, float], rng: np.random.Generator
 ) -> SignalPlan:
-    """Sets the plan's clock so that ego's light does something of interest during the recording (time 0 on)."""
-    phase = plan.phase_of(way)
+    """Set the plan's clock so that ego's light does something of interest during the recording (time 0 on)."""
+    phase = plan.phase_of(route)
     what = int(rng.choice(3, p=shares))
     if what == 0:  # green for a while before ego comes
         green_at = -rng.uniform(0.0, 3.0)
@@ -159,7 +210,7 @@ def _first_speeds(
     distance: Float64[np.ndarray, " vehicle"],
     rng: np.random.Generator,
 ) -> Float64[np.ndarray, " vehicle"]:
-    """Speeds from which everybody can still stop at the next stop line, whatever the light will do."""
+    """Draw speeds from which each vehicle can stop at the next stop line, whatever the light will do."""
     speeds = []
     for i, path in enumerate(paths):
         fastest = speed_profile(

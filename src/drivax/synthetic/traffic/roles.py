@@ -1,4 +1,4 @@
-"""Who is in a scenario and what is staged in it: everything that is decided before anybody moves, and what they did."""
+"""The roles of a scenario, the staged changes, and the resulting motion."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Walker:
     """A pedestrian: walks along a curve and waits at kerbs.
 
     Attributes:
-        way: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
-        start_m: Position along the way when traffic begins, before the warm-up.
-        speed_mps: Wanted speed.
-        crossing: Index of the crossing that the way leads over, -1 none.
-        kerb_m, across_m: Where on the way the kerbs are: where to wait, and where the road is left again.
+        curve: Where the feet go: along a sidewalk, or over a crossing from one sidewalk to the other.
+        start_m: Position along the curve when traffic begins, before the warm-up.
+        speed_mps: Free walking speed.
+        crossing: Index of the crossing that the curve leads over, -1 none.
+        kerb_m, across_m: Where on the curve the kerbs are: where to wait, and where the road is left again.
         size_m: Length, width, height.
     """
 
-    way: Curve
+    curve: Curve
     start_m: float
     speed_mps: float
     crossing: int = -1
@@ -38,7 +38,7 @@ class Walker:
 
 @dataclass(frozen=True)
 class Scripted:
-    """A road user that moves as told, whatever happens: parked, or part of an event.
+    """A road user with a fixed trajectory: parked, or part of an event.
 
     Attributes:
         speed: Along the heading; negative when reversing.
@@ -56,20 +56,20 @@ class Scripted:
     def standing(
         cls, kind: AgentKind, size_m: tuple[float, float, float], pose: Pose, steps: int
     ) -> Scripted:
-        """Somebody who stays where it is."""
+        """Return a user that never moves."""
         xy = np.tile([pose.x, pose.y], (steps, 1))
         return cls(kind, size_m, xy, np.full(steps, pose.heading), np.zeros(steps), np.ones(steps, bool))
 
 
 @dataclass(frozen=True)
-class Cast:
-    """Everybody in a scenario; row 0 of ``paths`` and ``drivers`` is ego.
+class Roles:
+    """All users of a scenario; row 0 of ``paths`` and ``drivers`` is ego.
 
     Attributes:
         paths: Of vehicles and of cyclists who ride on lanes.
         distance_m: Where on its path each centre begins.
         route: Lanes of ego's intended route, in order.
-        parked: Cars that stand beside or in the lanes all the time.
+        parked: Cars parked next to or in the lanes.
     """
 
     network: RoadNetwork
@@ -84,7 +84,7 @@ class Cast:
 
 @dataclass(frozen=True)
 class Override:
-    """From one step to another (both included) a vehicle accelerates as told, or less."""
+    """Upper bound on a vehicle's acceleration from one step to another (both included)."""
 
     vehicle: int
     first_step: int
@@ -94,7 +94,7 @@ class Override:
 
 @dataclass(frozen=True)
 class Tailgate:
-    """A vehicle keeps only this time gap to whoever is ahead, all the time."""
+    """A vehicle that keeps this time gap to its leader."""
 
     vehicle: int
     headway_s: float
@@ -102,7 +102,7 @@ class Tailgate:
 
 @dataclass(frozen=True)
 class Staging:
-    """What an event changes in how traffic goes; vehicles in the way of its making (``removed``) do not take part."""
+    """Changes of an event to traffic; vehicles that would prevent it (``removed``) do not take part."""
 
     overrides: tuple[Override, ...] = ()
     extras: tuple[Scripted, ...] = ()
@@ -112,7 +112,7 @@ class Staging:
 
 @dataclass(frozen=True)
 class EgoPlan:
-    """Ego drives as told from a step on: its pose and signed speed at that step and all later ones."""
+    """Ego's planned pose and signed speed from a step on."""
 
     first_step: int
     xy: Float64[np.ndarray, "time 2"]
@@ -122,7 +122,7 @@ class EgoPlan:
 
 @dataclass(frozen=True)
 class Motion:
-    """What everyone did. Users are, in this order: vehicles and cyclists (ego first), walkers, parked, extras.
+    """Motion of all users, in this order: vehicles and cyclists (ego first), walkers, parked, extras.
 
     Attributes:
         kind: ``AgentKind`` of each user.
@@ -145,19 +145,19 @@ class Motion:
 
     @property
     def vehicles(self) -> int:
-        """How many of the users are vehicles or cyclists on paths."""
+        """Number of vehicles and cyclists on paths."""
         return len(self.distance_m)
 
     def since(self, step: int) -> Motion:
-        """The same from a step on."""
+        """Return the motion from a step on."""
         return self._at(slice(step, None))
 
     def until(self, step: int) -> Motion:
-        """The same before a step."""
+        """Return the motion before a step."""
         return self._at(slice(step))
 
     def every(self, stride: int) -> Motion:
-        """The same at every so-manieth step."""
+        """Return the motion at every n-th step."""
         return self._at(slice(None, None, stride))
 
     def _at(self, steps: slice) -> Motion:

@@ -1,0 +1,10 @@
+from .conversion import Conversion as Conversion
+from .conversion import Converted as Converted
+from .conversion import convert as convert
+from .doctor import Diagnosis as Diagnosis
+from .doctor import diagnose as diagnose
+from .export.writer import Export as Export
+from .formats import detect as detect
+from .formats import survey as survey
+from .reader import BadRecord as BadRecord
+from .reader import Reader as Reader

@@ -1,0 +1,251 @@
+"""Scenario sets written for others: a part of a set as a set again, tf.Examples, GPUDrive JSON."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from drivax.datasets.export import gpudrive as export_gpudrive
+from drivax.datasets.export.gpudrive import gpudrive_scene
+from drivax.datasets.export.tfexample import PATHS, tf_example
+from drivax.datasets.womd.tfrecord import example, shard_name, write_record
+from drivax.errors import UsageError
+from drivax.files import PartialFolder, check_output, sync_and_close, write_json
+from drivax.scenario.select.selection import select_scenarios
+from drivax.scenario.store import ScenarioSet, ScenarioWriter
+
+#: What an export in another format says about itself.
+NOTE = "export.json"
+
+#: Called with (scenarios done, scenarios).
+Progress = Callable[[int, int], None]
+Format = Literal["set", "tfexample", "gpudrive"]
+
+
+@dataclass(frozen=True)
+class Export:
+    """What to export and how.
+
+    Attributes:
+        format: ``set`` (a scenario set again), ``tfexample`` (TFRecord shards) or ``gpudrive`` (JSON files).
+        filters: Conditions that all must hold (``scenario.select.selection``).
+        ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None for all.
+        limit: Write only the first of the selected scenarios; None: all.
+        paths: Form of ``path_samples`` in tf.Examples, a name in ``export_tfexample.PATHS``.
+        shard_size: Scenarios per TFRecord shard.
+        overwrite: Replace an earlier export of the same kind; other folders are never replaced.
+    """
+
+    format: Format = "set"
+    filters: tuple[str, ...] = ()
+    ids: Path | None = None
+    limit: int | None = None
+    paths: Literal["vmax", "published"] = "vmax"
+    shard_size: int = 500
+    overwrite: bool = False
+
+    def check(self) -> None:
+        """Refuses options that cannot be meant.
+
+        Raises:
+            UsageError: The first of them.
+        """
+        for name in ("limit", "shard_size"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UsageError(f"{name.replace('_', '-')} is {value}", cure="use 1 or more")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        path: The folder.
+        scenarios: How many scenarios.
+        files: How many files hold them.
+        lost: What the format has no room for, by name; only what is not zero.
+    """
+
+    path: Path
+    scenarios: int
+    files: int
+    lost: Mapping[str, int]
+
+
+def export(
+    set_path: str | Path, out: str | Path, options: Export | None = None, progress: Progress | None = None
+) -> Exported:
+    """Write scenarios of a set in another format, or as a set of their own.
+
+    The export appears under ``out`` when it is complete.
+
+    Args:
+        set_path: Scenario set to read.
+        out: Folder to create.
+        options: What to export and how; everything, as a set, by default.
+        progress: Called with (scenarios done, scenarios).
+
+    Raises:
+        DataError: The set is damaged, an id is not in it, or no scenario is selected.
+        UsageError: An option cannot be meant, or ``out`` exists.
+    """
+    options, out = options or Export(), Path(out)
+    options.check()
+    opened = ScenarioSet.open(set_path)
+    names = () if options.ids is None else (options.ids,)
+    rows = select_scenarios(opened, options.filters, names, options.limit)
+    if options.format == "set":
+        return write_part(opened, rows, out, options.overwrite, progress)
+    write = {"tfexample": _write_examples, "gpudrive": _write_scenes}[options.format]
+    _refuse_existing(out, options)
+    partial = PartialFolder(out)
+    partial.open()
+    try:
+        files, lost = write(_Work(opened, rows, partial.content, out.name, options, progress))
+        write_json(partial.content / NOTE, _note(opened, rows, files, +lost, options.format))
+        _refuse_existing(out, options)  # someone may have written it in the meantime
+        partial.publish()
+    finally:
+        partial.close()
+    return Exported(out, len(rows), len(set(files)), +lost)
+
+
+def write_part(
+    opened: ScenarioSet,
+    rows: Sequence[int],
+    out: Path,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    chosen_by: Mapping[str, Any] | None = None,
+    further: Callable[[Path], None] | None = None,
+) -> Exported:
+    """Some scenarios of a set as a set of their own: the records as they are, with their entries.
+
+    Args:
+        opened: The set.
+        rows: Which, in the order in which they are written.
+        out: Folder to create.
+        overwrite: Replace an existing scenario set; other folders are never replaced.
+        progress: Called with (scenarios done, scenarios).
+        chosen_by: What the manifest says about how they were chosen, as plain JSON values.
+        further: Called with the folder of the whole set before it gets its name, to write what else it shall hold.
+
+    Raises:
+        UsageError: ``out`` exists, or is the set that is read.
+    """
+    refuse_part(opened, out)
+    part = {"set": opened.path.name, "hash": opened.hash, **(chosen_by or {})}
+    source = {**opened.manifest["source"], "part_of": part}
+    with ScenarioWriter(out, opened.capacity, source, overwrite=overwrite, further=further) as writer:
+        for done, row in enumerate(rows, start=1):
+            writer.add(opened[row])
+            if progress is not None:
+                progress(done, len(rows))
+    return Exported(out, len(rows), len(ScenarioSet.open(out).manifest["shards"]), {})
+
+
+def refuse_part(opened: ScenarioSet, out: Path) -> None:
+    """Refuses to write a part of a set over the set.
+
+    Raises:
+        UsageError: ``out`` is the set that is read.
+    """
+    if out.exists() and out.resolve() == opened.path.resolve():
+        raise UsageError("is the set that is read", file=out, cure="choose another name")
+
+
+#: The file of every scenario, and what did not fit.
+_Written = tuple[list[str], Counter[str]]
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Scenarios to write and where.
+
+    Attributes:
+        opened: The set.
+        rows: Its rows to write.
+        folder: Folder for the files.
+        name: Name that the folder will have.
+        options: How to write.
+        progress: Called with (scenarios done, scenarios).
+    """
+
+    opened: ScenarioSet
+    rows: Sequence[int]
+    folder: Path
+    name: str
+    options: Export
+    progress: Progress | None
+
+    def tell(self, done: int) -> None:
+        """Report progress."""
+        if self.progress is not None:
+            self.progress(done, len(self.rows))
+
+
+def _write_examples(work: _Work) -> _Written:
+    """TFRecord shards of tf.Examples."""
+    lost: Counter[str] = Counter()
+    files: list[str] = []
+    size = work.options.shard_size
+    shards = -(-len(work.rows) // size)
+    for number in range(shards):
+        path = work.folder / shard_name(work.name, number, shards)
+        with path.open("wb") as file:
+            for row in work.rows[number * size : (number + 1) * size]:
+                features, missing = tf_example(work.opened[row], PATHS[work.options.paths])
+                write_record(file, example(features))
+                lost.update(missing)
+                files.append(path.name)
+                work.tell(len(files))
+            sync_and_close(file)
+    return files, lost
+
+
+def _write_scenes(work: _Work) -> _Written:
+    """One JSON file per scenario."""
+    files: list[str] = []
+    for number, row in enumerate(work.rows):
+        name = export_gpudrive.file_name(number)
+        scene = gpudrive_scene(work.opened[row], name)
+        with (work.folder / name).open("wb") as file:
+            file.write(json.dumps(scene, allow_nan=False).encode())
+            sync_and_close(file)
+        files.append(name)
+        work.tell(len(files))
+    return files, Counter()
+
+
+def _note(
+    opened: ScenarioSet, rows: Sequence[int], files: Sequence[str], lost: Mapping[str, int], name: str
+) -> dict[str, Any]:
+    """Says what the export is: neither format keeps data set and segment, and shards hide which scenario is where."""
+    names = ("scenario_id", "dataset", "segment")
+    entries = [opened.entries[row] for row in rows]
+    return {
+        "drivax_version": metadata.version("drivax"),
+        "format": name,
+        "set": {"name": opened.path.name, "hash": opened.hash, "source": opened.manifest["source"]},
+        "lost": dict(lost),
+        "scenarios": [
+            {**{key: entry[key] for key in names}, "file": file}
+            for entry, file in zip(entries, files, strict=True)
+        ],
+    }
+
+
+def _refuse_existing(out: Path, options: Export) -> None:
+    if not out.exists() and not out.is_symlink():
+        return
+    if out.is_dir() and not any(out.iterdir()):
+        return
+    if not (out / NOTE).is_file():
+        raise UsageError("exists and is no export", file=out, cure="choose another name")
+    check_output(out, options.overwrite, folder=True)

@@ -1,0 +1,16 @@
+from .actor_critic import ActorCritic as ActorCritic
+from .actor_critic import Critic as Critic
+from .actor_critic import NetworkConfig as NetworkConfig
+from .actor_critic import Policy as Policy
+from .actor_critic import TwinCritic as TwinCritic
+from .actor_critic import Value as Value
+from .distributions import Distribution as Distribution
+from .encoders import Encoder as Encoder
+from .encoders import EncoderConfig as EncoderConfig
+from .encoders import MlpConfig as MlpConfig
+from .entity import EntityConfig as EntityConfig
+from .normalised import NormalisedEncoder as NormalisedEncoder
+from .transformers import LqConfig as LqConfig
+from .transformers import LqhConfig as LqhConfig
+from .transformers import MtrConfig as MtrConfig
+from .transformers import WayformerConfig as WayformerConfig

@@ -1,0 +1,17 @@
+from .actions import ActionSpace as ActionSpace
+from .actions import DeltaLocal as DeltaLocal
+from .actions import DirectState as DirectState
+from .actions import Discrete as Discrete
+from .actions import Physical as Physical
+from .actions import Published as Published
+from .features import Features as Features
+from .observations import ObservationConfig as ObservationConfig
+from .observations import OwnGroup as OwnGroup
+from .observations import observe as observe
+from .perception import Perception as Perception
+from .rewards import TERMS as TERMS
+from .rewards import OwnTerm as OwnTerm
+from .rewards import RewardConfig as RewardConfig
+from .rewards import reward_term as reward_term
+from .task import Task as Task
+from .view import View as View

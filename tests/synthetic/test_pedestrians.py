@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from drivax.synthetic.roads.curves import Pose, straight
+from drivax.synthetic.roads.draft import Draft
+from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
+from drivax.synthetic.roads.signals import Colour, LightGroup, SignalPlan
+from drivax.synthetic.traffic.obstacles import Boxes
+from drivax.synthetic.traffic.pedestrians import Walkers, place_walkers
+from drivax.synthetic.traffic.roles import Walker
+
+TIMES = (np.arange(151) - 60) * 0.1
+CAR = np.array([[4.6, 1.9, 1.6]])
+
+
+def street(marked=True, green_s=None):
+    """One lane each way along x, 3.5 m wide, crossed at x = 50; sidewalks 2 m beside the kerbs; maybe lights."""
+    draft = Draft()
+    lanes = []
+    for start in (Pose(0.0, -1.75, 0.0), Pose(100.0, 1.75, math.pi)):
+        first = draft.lane(straight(start, 45.0), 3.5, 12.0)
+        control = Control.NONE if green_s is None else Control.SIGNAL
+        way = draft.lane(straight(start.ahead(45.0), 10.0), 3.5, 12.0, connector=True, control=control)
+        last = draft.lane(straight(start.ahead(55.0), 45.0), 3.5, 12.0)
+        draft.link(first, way)
+        draft.link(way, last)
+        lanes.append(way)
+    crossing = Crossing(np.array([[50.0, -4.0], [50.0, 4.0]]), 3.0, tuple((i, 5.0) for i in lanes), marked)
+    signals = None
+    if green_s is not None:
+        groups = (LightGroup(tuple(lanes), False), LightGroup((), False))
+        signals = SignalPlan(groups, ((0,), (1,)), (green_s, 20.0), offset_s=-6.0)
+    walks = (straight(Pose(0.0, -6.0, 0.0), 100.0), straight(Pose(0.0, 6.0, 0.0), 100.0))
+    return RoadNetwork("test", tuple(draft.lanes), (), crossings=(crossing,), walks=walks, signals=signals)
+
+
+def over(speed=1.4, before=6.0):
+    """From 10 m south of the road straight over it; the kerb is 6 m along, the other one 14 m."""
+    return Walker(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 6.0 - before, speed, 0, 6.0, 14.0)
+
+
+def play(network, walkers, cars=None, times=TIMES):
+    """``cars``: function of the step that returns (xy, heading, speed) of cars."""
+    people = Walkers(network, walkers, times)
+    colours = np.zeros((len(times), len(network.lanes)), np.int8)
+    if network.signals is not None:
+        colours, _ = network.signals.colours(times, len(network.lanes))
+    out = []
+    for t in range(len(times)):
+        xy, heading, speed = cars(t) if cars else (np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+        vehicles = Boxes(xy, heading, speed, np.tile(CAR[:, :2], (len(xy), 1)))
+        seen, claims = people.step(t, vehicles, np.ones(len(xy), bool), colours[t])
+        out.append((seen.xy, seen.heading, seen.speed, claims))
+    return [np.stack(column) for column in zip(*out, strict=True)]
+
+
+def car_at(x0, speed):
+    return lambda t: (np.array([[x0 + speed * t * 0.1, -1.75]]), np.zeros(1), np.array([float(speed)]))
+
+
+def test_on_a_free_road_people_walk_on_at_their_speed():
+    xy, heading, speed, claims = play(street(), (over(),))
+    y = -10.0 + 1.4 * 0.1 * np.arange(len(xy))
+    assert xy[:, 0, 1] == pytest.approx(np.minimum(y, 10.0), abs=0.35)
+    assert np.all(xy[:, 0, 0] == 50.0) and heading[:, 0] == pytest.approx(math.pi / 2)
+    assert speed[:100, 0] == pytest.approx(1.4)
+    on = (xy[:, 0, 1] > -4.0) & (xy[:, 0, 1] < 4.0)
+    near = (xy[:, 0, 1] > -5.0) & (xy[:, 0, 1] < 4.0)
+    assert np.all(claims[on, 0]) and not np.any(claims[~near, 0])
+    # The end of the way is where people stop; they do not run through it.
+    assert xy[-1, 0, 1] <= 10.0 and speed[-1, 0] < 0.2
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_who_cannot_stop_any_more_is_waited_for(marked):
+    # The walker reaches the kerb after 4.3 s; the car is then 9 m before the crossing at 10 m/s.
+    xy, _, speed, claims = play(street(marked), (over(),), car_at(-2.0, 10.0))
+    car = -2.0 + np.arange(len(xy))
+    passing = (car > 40.0) & (car < 52.0)
+    assert np.all(xy[passing, 0, 1] < -4.0)
+    assert speed[passing, 0].min() < 0.5
+    assert xy[-1, 0, 1] > 4.0
+    gap = np.hypot(car - xy[:, 0, 0], -1.75 - xy[:, 0, 1])
+    assert gap.min() > 2.0
+    assert np.any(claims[passing]) == marked
+
+
+def test_where_drivers_must_yield_people_go_before_a_car_that_can_stop_and_else_they_do_not():
+    # 40 m away at 10 m/s: 1.3 m/s2 are enough to stop; the car would come after 4 s, crossing takes 6 s.
+    def braking(t):
+        since = max(0.0, 0.1 * t - 4.0)
+        v = max(0.0, 10.0 - 1.6 * since)
+        x = -30.0 + 10.0 * min(0.1 * t, 4.0) + (100.0 - v * v) / 3.2
+        return np.array([[x, -1.75]]), np.zeros(1), np.array([v])
+
+    marked = play(street(True), (over(),), braking)
+    assert marked[2][:, 0].min() > 1.0 or marked[0][75, 0, 1] > -2.0
+    unmarked = play(street(False), (over(),), braking)
+    assert unmarked[0][75, 0, 1] < -4.0
+
+
+def test_at_a_light_people_wait_for_red_and_for_enough_of_it():
+    # Green from step 0 to 5.4 s, yellow 3 s, then red for 24.5 s.
+    network = street(green_s=5.4)
+    xy, _, _, claims = play(network, (over(),))
+    colour, _ = network.signals.colours(TIMES, len(network.lanes))
+    on = (xy[:, 0, 1] > -4.0) & (xy[:, 0, 1] < 4.0)
+    assert on.any() and np.all(colour[on, 1] == Colour.RED)
+    assert not claims[colour[:, 1] != Colour.RED].any()
+    # Red is about to end when this one arrives: 1.5 s are left.
+    late = SignalPlan(network.signals.groups, ((0,), (1,)), (6.0, 3.1), offset_s=-20.0 + 0.3)
+    waits = RoadNetwork("test", network.lanes, (), crossings=network.crossings, signals=late)
+    xy = play(waits, (over(),))[0]
+    colour, _ = late.colours(TIMES, len(network.lanes))
+    on = (xy[:, 0, 1] > -4.0) & (xy[:, 0, 1] < 4.0)
+    assert np.all(colour[on, 1] == Colour.RED)
+
+
+def test_no_walker_enters_a_standing_queue():
+    standing = lambda t: (np.array([[50.0, -1.75]]), np.zeros(1), np.zeros(1))  # noqa: E731
+    xy, _, speed, _ = play(street(), (over(),), standing)
+    assert xy[:, 0, 1].max() < -4.0 and speed[-1, 0] == pytest.approx(0.0, abs=0.05)
+    # Off crossings too.
+    along = Walker(straight(Pose(50.0, -10.0, math.pi / 2), 20.0), 0.0, 1.4)
+    xy = play(street(), (along,), standing)[0]
+    assert xy[:, 0, 1].max() < -1.75 - 0.95
+
+
+def test_many_walkers_move_as_each_would_alone():
+    people = (over(1.1), over(1.7, before=3.0), Walker(straight(Pose(0.0, -6.0, 0.0), 100.0), 5.0, 1.3))
+    together = play(street(), people, car_at(-20.0, 8.0))
+    for i, one in enumerate(people):
+        alone = play(street(), (one,), car_at(-20.0, 8.0))
+        for a, b in zip(together[:3], alone[:3], strict=True):
+            assert np.array_equal(a[:, i], b[:, 0])
+
+
+@pytest.mark.slow
+def test_placed_walkers_are_on_their_paths_and_some_cross_during_the_recording():
+    network = street()
+    crossing, count = 0, 0
+    for seed in range(40):
+        people = place_walkers(network, 3.0, np.random.default_rng(seed), TIMES)
+        count += len(people)
+        for one in people:
+            length = float(one.curve.arc_m[-1])
+            assert 0.0 <= one.start_m <= length
+            assert 0.7 <= one.speed_mps <= 2.0
+            if one.crossing >= 0:
+                kerb = [np.interp(one.kerb_m, one.curve.arc_m, one.curve.xy[:, k]) for k in (0, 1)]
+                other = [np.interp(one.across_m, one.curve.arc_m, one.curve.xy[:, k]) for k in (0, 1)]
+                assert abs(kerb[1]) == pytest.approx(4.0, abs=0.3) and kerb[0] == pytest.approx(50.0, abs=1.2)
+                assert other[1] == pytest.approx(-kerb[1], abs=0.5)
+            else:
+                assert np.abs(one.curve.xy[:, 1]).min() > 4.5
+        xy = play(network, people)[0] if people else np.zeros((151, 0, 2))
+        crossing += int(np.sum((np.abs(xy[60:, :, 1]) < 3.0).any(axis=0)))
+    # Poisson means: 3 per 100 m of two sidewalks of 100 m, and 1.5 at the crossing.
+    assert count / 40 == pytest.approx(7.5, abs=1.5)
+    assert crossing / 40 > 0.7
+    again = place_walkers(network, 3.0, np.random.default_rng(7), TIMES)
+    same = place_walkers(network, 3.0, np.random.default_rng(7), TIMES)
+    assert [(w.start_m, w.speed_mps) for w in again] == [(w.start_m, w.speed_mps) for w in same]
+
+
+def test_without_walkers_or_crossings_nothing_happens():
+    network = RoadNetwork("test", street().lanes, ())
+    xy, _, _, claims = play(network, ())
+    assert xy.shape == (151, 0, 2) and claims.shape == (151, 0)

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivax.synthetic.expert.trajectories import (
+    SPACING_M,
+    Shift,
+    candidate_boxes,
+    candidate_corners,
+    shifted_path,
+)
+from drivax.synthetic.roads.curves import Pose, joined, resampled, straight, turn
+
+from .oracles import distance_to_polyline
+from .staged_scenes import CAR, road, scene
+
+
+def bend():
+    first = straight(Pose(0.0, 0.0, 0.0), 60.0)
+    arc = turn(first.end, np.pi / 2, 20.0)
+    return resampled(joined(first, arc, straight(arc.end, 100.0)), 0.5)
+
+
+@pytest.mark.parametrize(
+    "shift", [Shift(), Shift(3.0, 5.0, 25.0, 40.0, 60.0), Shift(-1.0, 0.0, 12.0, 30.0, 50.0)]
+)
+@pytest.mark.parametrize("pose", [Pose(30.0, 0.0, 0.0), Pose(31.3, 0.8, 0.06), Pose(29.0, -1.1, -0.1)])
+def test_a_candidate_begins_at_ego_and_its_heading_is_its_tangent(shift, pose):
+    roles, _ = scene(road(turn=bend()), 8.0)
+    way = shifted_path(roles.paths[0], roles.drivers, pose, (30.0, 110.0), shift)
+    assert np.hypot(*(way.xy[0] - [pose.x, pose.y])) < 0.03
+    assert way.heading[0] == pytest.approx(pose.heading, abs=0.01)
+    chords = np.diff(way.xy, axis=0)
+    assert np.allclose(np.hypot(*chords.T), SPACING_M, atol=0.003)
+    middle = (way.heading[1:] + way.heading[:-1]) / 2
+    turned = np.arctan2(chords[:, 1], chords[:, 0]) - middle
+    assert np.abs((turned + np.pi) % (2 * np.pi) - np.pi).max() < 0.01
+
+
+def test_a_shifted_candidate_has_its_offset_and_returns():
+    roles, _ = scene(road(turn=bend()), 8.0)
+    shift = Shift(3.0, 5.0, 25.0, 40.0, 60.0)
+    way = shifted_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), (30.0, 110.0), shift)
+    gap = distance_to_polyline(way.xy, roles.paths[0].curve.xy)
+    assert np.allclose(gap[(way.base_m > 26) & (way.base_m < 39)], 3.0, atol=0.02)
+    assert gap[(way.base_m < 5) | (way.base_m > 60)].max() < 0.02
+    assert np.all(np.diff(way.base_m) > 0)
+    # Only the part that is not on the path is checked against the edges: 4 corners each metre.
+    assert len(candidate_corners(way, np.array(CAR))) == pytest.approx(4 * 59, abs=12)
+    assert candidate_boxes(way, np.array(CAR)).shape == (len(way.xy), 6)
+
+
+def test_bends_bound_the_speed():
+    roles, _ = scene(road(turn=bend()), 8.0)
+    way = shifted_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), (30.0, 110.0), Shift())
+    curvature = np.abs(np.gradient(way.heading, SPACING_M)).max()
+    assert way.limit_mps.min() == pytest.approx(min((4.2 / curvature) ** 0.5, 0.8 / curvature), rel=0.05)
+    driver = roles.drivers.lateral_mps2[0]
+    assert way.preferred_mps.min() == pytest.approx((driver / curvature) ** 0.5, rel=0.05)
+    assert np.all(way.preferred_mps <= way.limit_mps + 1e-9)

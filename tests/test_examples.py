@@ -1,0 +1,38 @@
+"""The scripts in ``examples/`` run and print a result."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
+
+
+def test_there_are_five_examples():
+    assert [file.stem for file in EXAMPLES] == [
+        "offline_rl",
+        "own_data",
+        "own_loop",
+        "own_planner",
+        "own_reward",
+    ]
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
+def test_imports_are_at_most_one_package_deep(file: Path):
+    modules = re.findall(r"^(?:from|import) (drivax[\w.]*)", file.read_text(), re.M)
+    assert modules
+    assert all(module.count(".") <= 1 or module == "drivax.learning.algorithms" for module in modules)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
+def test_example_runs(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    runpy.run_path(str(file), run_name="__main__")
+    assert capsys.readouterr().out.strip()
