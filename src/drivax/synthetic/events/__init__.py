@@ -1,7 +1,7 @@
-"""Labelled events: something unusual that is staged in a scenario and written down with its actors and times.
+"""Labelled events: unusual situations that are staged in a scenario and stored with their actors and times.
 
-A script looks at how the scenario goes without it (``scene``), and proposes what an actor does, and when, so that an
-ego that keeps its speed would meet it; ``threat`` tells what that asks of ego, and ``choosing`` takes what is sound.
+A script reads the scenario without the event (``ego_view``) and proposes when an actor does what, so that an ego at
+constant speed would collide; ``adversary`` computes what this requires of ego, ``choosing`` checks the proposals.
 """
 
 from drivax.synthetic.events.adversary import threatens

@@ -1,4 +1,4 @@
-"""Which event happens in a scenario: scripts propose, proposals are checked, and one of the feasible kinds is drawn."""
+"""Staging of an event: a script proposes, and the first proposal that passes the checks is taken."""
 
 from __future__ import annotations
 
@@ -41,35 +41,33 @@ SCRIPTS: dict[EventKind, EventScript] = {
         LeadBrakes(tailgater=True),
     )
 }
-#: Draws of an event before it counts as impossible here, how many of them with the wanted severity, and how many
-#: with each other one.
-_DRAWS, _AS_WANTED, _PER_SEVERITY = 40, 20, 5
-#: Severities are powers of uniform numbers: below 1 the hard ones come up more often.
+#: Proposals per event, how many of them with the requested severity, and how many with each other one.
+_DRAWS, _AS_REQUESTED, _PER_SEVERITY = 40, 20, 5
+#: Exponent of the uniform number behind a severity; below 1 hard events are more frequent.
 _HARD = 0.7
-#: Kinds that hardly ever find an occasion where ego goes where it likes.
+#: Kinds that rarely succeed unless ego is sent to a suitable place.
 _PLACED = (
     EventKind.RED_LIGHT_RUNNER,
     EventKind.TURN_CONFLICT,
     EventKind.LATE_MERGE,
     EventKind.TAILGATER,
 )
-#: A proposal counts where what it requires is so near to what was drawn, m/s2.
+#: Largest difference between a proposal's severity and the one that it really requires, m/s2.
 _NEAR_MPS2 = 0.6
 
 
 def possible(kind: EventKind, network: RoadNetwork) -> bool:
-    """Whether roads have what an event needs: a light, a lane that ends, bays; quick to tell before any traffic."""
+    """Whether a network has what an event needs, such as a light, a lane that ends or bays."""
     return SCRIPTS[kind].possible(network)
 
 
 def aims(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Aim, ...]:
-    """Places of which ego should pass one at a certain time, so that an event finds an occasion; empty: anywhere.
+    """Places of which ego should pass one, so that an event can be staged; empty: anywhere.
 
     Args:
         kind: The kind of event.
         network: The roads.
-        again: Whether scenarios in which ego went where it liked offered no occasion: then also for kinds that can
-            happen on any open road.
+        again: Whether staging has failed before: then kinds that can happen anywhere get places too.
     """
     script = SCRIPTS[kind]
     if not again and kind not in _PLACED:
@@ -78,23 +76,22 @@ def aims(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Ai
 
 
 def drawn_severity(rng: np.random.Generator) -> float:
-    """The deceleration that an event should require of ego, m/s2, more often hard than mild.
+    """Draw the deceleration that an event should require of ego, m/s2.
 
-    Hard events find an occasion less often, and who brakes ahead of ego in its lane stays below 3 or so: with this
-    slope all thirds of the range are filled.
+    Hard events are drawn more often, since they are harder to stage: staged events fill all thirds of the range.
     """
     low, high = SEVERITY_MPS2
     return low + (high - low) * float(rng.random() ** _HARD)
 
 
 def stage(kind: EventKind, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Staged | None:
-    """Stages an event of a kind, or returns None where the scenario offers no occasion.
+    """Stage an event of a kind, or return None where no proposal passes.
 
     Args:
         kind: The kind.
-        scene: How the scenario goes without the event.
-        severity_mps2: What it should require of ego; where that finds no occasion something else is drawn.
-        rng: Source of chance.
+        scene: The scenario without the event.
+        severity_mps2: Requested severity; other ones are drawn where it cannot be staged.
+        rng: Source of randomness.
     """
     script = SCRIPTS[kind]
     for draw in range(_DRAWS):
@@ -111,7 +108,7 @@ def stage(kind: EventKind, scene: Scene, severity_mps2: float, rng: np.random.Ge
 
 
 def _checked(scene: Scene, proposal: Proposal) -> tuple[float, Staging] | None:
-    """The deceleration that a proposal really requires of ego, and its staging; None where it does not do."""
+    """The deceleration that a proposal requires of ego, and its staging; None where the proposal fails a check."""
     begin, threat = proposal.first_step, proposal.threat
     required = severity(scene, threat, begin + NOTICED)
     low, high = SEVERITY_MPS2
@@ -125,7 +122,7 @@ def _checked(scene: Scene, proposal: Proposal) -> tuple[float, Staging] | None:
         return None
     staging = proposal.staging
     removed = sorted(
-        {*staging.removed, *(row for one in staging.extras for row in in_its_cross_way(scene, one))}
+        {*staging.removed, *(row for extra in staging.extras for row in in_its_cross_way(scene, extra))}
     )
     if set(removed) & set(proposal.others):
         return None

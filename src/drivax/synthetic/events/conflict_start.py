@@ -1,8 +1,8 @@
-"""From when on a scene is worth recording: where a driver who gives way to nobody would hit somebody.
+"""Interactive moments of a simulation: the steps from which a driver that only follows its leader would collide.
 
-Recorded data sets are mined for scenes in which road users interact, since most of what cars see is empty road. Here
-an ego is rolled out from several steps of the same traffic that follows its leader and stops for red, but sees nobody
-who is not ahead of it in its way. Where it hits somebody, driving well takes more than following.
+Recorded data sets are mined for interactions, since most driving is on empty roads. Here a reference driver that
+follows its leader and stops at red lights, but ignores all other agents, is rolled out from several steps of the same
+traffic. Where it collides, good driving takes more than car following.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import Motion
 
-#: The driver: common parameters, at the limit, and accelerations in bends and on the way to them, m/s2.
+#: The reference driver: IDM parameters, lateral acceleration in bends and braking before them, m/s2.
 _DRIVER, _LATERAL_MPS2, _SLOWING_MPS2 = IdmParameters(), 2.5, 2.0
-#: Room that it wants on either side, m; where it stops before a line, m.
+#: Its lateral margin on either side, m; its distance to a stop line, m.
 _SIDE_M, _STOP_SHORT_M = 0.3, 1.0
-#: Others further from ego's path never matter, m.
+#: Agents further from ego's path are ignored, m.
 _NEAR_M = 12.0
-#: Every second step is enough for a driver who only has to be judged.
+#: Simulate every second step.
 _STRIDE = 2
 
 
 @dataclass(frozen=True)
 class _Others:
-    """Those near ego's path at all steps, in its coordinates, m: from where to where along it and across it."""
+    """Agents near ego's path at all steps: extents along and across it, m."""
 
     near_m: Float64[np.ndarray, "user time"]
     far_m: Float64[np.ndarray, "user time"]
@@ -50,12 +50,12 @@ def critical_steps(
     colour: Int8[np.ndarray, "time lane"],
     steps: Int64[np.ndarray, " start"],
 ) -> Bool[np.ndarray, " start"]:
-    """Whether the driver who sees only what is ahead hits somebody in the recording that begins at each of some steps.
+    """Whether the reference driver collides in the recordings that begin at some steps.
 
     Args:
         network: The roads.
-        motion: How everybody moves; row 0 is ego.
-        colour: What lights show at each time.
+        motion: Motion of all agents; row 0 is ego.
+        colour: Colours of the lights at each time.
         steps: First steps of recordings, even numbers; the driver takes over ``CURRENT_STEP`` later.
     """
     path, motion = motion.paths[0], motion.every(_STRIDE)
@@ -83,7 +83,7 @@ def critical_steps(
 
 
 def _seen(path: Path, motion: Motion) -> _Others:
-    """Everybody else."""
+    """Extents of all other agents in the coordinates of ego's path."""
     count, times = motion.valid.shape
     flat = (count - 1) * times
     boxes = Boxes(
@@ -122,7 +122,7 @@ def _leader(
     at: Float64[np.ndarray, " start"],
     size_m: tuple[float, float],
 ) -> tuple[Float64[np.ndarray, " start"], Float64[np.ndarray, " start"]]:
-    """Gap to whoever is next ahead in the way, and its speed."""
+    """Gap to the next agent ahead on the path, and its speed."""
     if not len(others.near_m):
         return np.full(len(at), np.inf), np.zeros(len(at))
     near, far = others.near_m[:, now], others.far_m[:, now]
@@ -159,7 +159,7 @@ def _hits(
     size_m: tuple[float, float],
     behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:
-    """Whether somebody is where ego is who did not come from behind; adds those who do to ``behind``."""
+    """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
     result = np.zeros(len(at), bool)
     if not len(others.near_m):
         return result

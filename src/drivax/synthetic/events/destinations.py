@@ -1,4 +1,4 @@
-"""Where ego should be, and when, so that something can happen there: its start and way are drawn to fit."""
+"""Destinations of ego for an event: places that it passes at a given time, and its route and start."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from drivax.synthetic.roads.signals import SignalPlan
 from drivax.synthetic.traffic.paths import onward
 from drivax.synthetic.traffic.population import Placement
 
-#: Ego's pace when nothing holds it up, as a share of the limit.
+#: Free speed of ego as a share of the limit.
 _PACE = 0.88
-#: Ego may have been under way for so long when the recording begins, s, and has so much road behind it at least, m.
+#: Road behind ego at the beginning of the recording: seconds at its free speed plus metres.
 _BEFORE_S, _BEHIND_M = 6.0, 15.0
-#: Ego's light turns green so early at the earliest, and where green is short it lasts until then, s.
+#: Earliest time at which ego's light turns green, and how long a short green lasts, s.
 _GREEN_S = (-5.0, 6.0)
-#: Where on an open road ego is at about the middle of the recording: so far from the lane's ends, m, and when, s.
+#: On open roads: distance of the place from the lane's ends, m, and time of ego's arrival, s.
 _BEFORE_M, _AFTER_M, _MIDWAY_S = 30.0, 30.0, (3.0, 6.0)
-#: Who is put behind ego begins so far behind it, that far from the next one and from the lane's beginning, m.
+#: A follower's distance behind ego, and its least distance to the next vehicle and to the lane's beginning, m.
 _FOLLOWS_M, _APART_M, _FROM_BEGIN_M = (16.0, 28.0), 20.0, 4.0
-#: A lane is begun this far from its end at least, m.
+#: Least distance of ego's start to the end of a lane, m.
 _FROM_END_M = 2.0
 
 
@@ -32,11 +32,10 @@ class Aim:
     """A place that ego should pass.
 
     Attributes:
-        lane: On which of ego's lanes it is.
-        along_m: How far along that lane, low and high.
-        when_s: How long after the recording's beginning ego should come there if nothing holds it up, low and high.
-        alone: Whether nobody may be ahead of ego on the way there.
-        followed: Whether somebody should be behind ego.
+        along_m: Distance along the lane, low and high.
+        when_s: Time of ego's arrival at free speed since the recording's beginning, low and high.
+        alone: Whether the lanes ahead of ego must be empty up to the place.
+        followed: Whether a vehicle must be behind ego.
     """
 
     lane: int
@@ -48,14 +47,12 @@ class Aim:
 
 @dataclass(frozen=True)
 class AimedWay:
-    """A way past such a place.
+    """A route past a destination, with the destination's ``alone`` and ``followed``.
 
     Attributes:
         start: Where ego is when the recording begins.
-        lanes: Its lanes; some lie behind it.
-        place: Which of these the place is on.
-        alone: Whether nobody may be ahead of ego on the way there.
-        followed: Whether somebody should be behind ego.
+        lanes: Lanes of the route; some lie behind ego.
+        place: Which of these the destination is on.
     """
 
     start: Start
@@ -66,12 +63,12 @@ class AimedWay:
 
 
 def open_road(network: RoadNetwork, least_mps: float = 0.0, beside: bool = False) -> tuple[Aim, ...]:
-    """Lanes on which ego may drive for a while in the middle of a recording, with others.
+    """Places on ordinary lanes away from their ends.
 
     Args:
         network: The roads.
-        least_mps: The limit is at least this.
-        beside: Whether there must be a lane beside it.
+        least_mps: Lowest speed limit of the lanes.
+        beside: Whether a lane must have a neighbour.
     """
     return tuple(
         Aim(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
@@ -84,7 +81,7 @@ def open_road(network: RoadNetwork, least_mps: float = 0.0, beside: bool = False
 
 
 def drawn_aimed_way(network: RoadNetwork, aims: Sequence[Aim], rng: np.random.Generator) -> AimedWay | None:
-    """A way past one of several places, as far as one of them can be reached; None without any."""
+    """Draw a route past one of several destinations; None where none can be reached."""
     for place in rng.permutation(len(aims)).tolist():
         way = aimed_way(network, aims[place], rng)
         if way is not None:
@@ -93,7 +90,7 @@ def drawn_aimed_way(network: RoadNetwork, aims: Sequence[Aim], rng: np.random.Ge
 
 
 def aimed_way(network: RoadNetwork, aim: Aim, rng: np.random.Generator) -> AimedWay | None:
-    """A way to a place and on to the end of the map; None where a light or a sign before it would make ego late."""
+    """Draw a route past a destination to the end of the map; None where a light or a sign before it delays ego."""
     time, lane, at = float(rng.uniform(*aim.when_s)), aim.lane, float(rng.uniform(*aim.along_m))
     lanes = [lane]
     while at < time * _pace(network, lane):
@@ -124,13 +121,13 @@ def aimed_way(network: RoadNetwork, aim: Aim, rng: np.random.Generator) -> Aimed
 def rearranged(
     others: Placement, way: AimedWay, ego: tuple[int, float], rng: np.random.Generator
 ) -> Placement:
-    """The others as the aim wants them: nobody ahead of ego up to the lane after the place's, somebody behind it.
+    """Adapt the placement of other vehicles to a destination: empty lanes ahead of ego, a follower behind it.
 
     Args:
-        others: Who is placed where.
-        way: Ego's.
-        ego: On which lane of it ego begins, and how far along that.
-        rng: Source of chance.
+        others: Placement of other vehicles.
+        way: Route of ego.
+        ego: Lane on which ego begins, and distance along it.
+        rng: Source of randomness.
     """
     places = list(zip(others.lane, others.along_m, strict=True))
     if way.alone:
@@ -145,7 +142,7 @@ def rearranged(
 
 
 def green_on_arrival(plan: SignalPlan, lane: int) -> SignalPlan:
-    """The plan with its clock set so that a lane's light is green when ego comes, and has been for long if it can."""
+    """Shift a plan so that a lane's light is green when ego arrives."""
     phase = plan.phase_of(lane)
     green_at = max(_GREEN_S[0], _GREEN_S[1] - plan.green_s[phase])
     return replace(plan, offset_s=green_at - plan.starts_s[phase])
@@ -156,6 +153,6 @@ def _pace(network: RoadNetwork, lane: int) -> float:
 
 
 def _before(network: RoadNetwork, lanes: list[int]) -> list[int]:
-    """Lanes that lead to the first one and are not yet part of the way."""
-    found = network.lanes[lanes[0]].predecessors
-    return [k for k in found if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]
+    """Predecessors of the first lane that are not part of the route."""
+    before = network.lanes[lanes[0]].predecessors
+    return [k for k in before if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]

@@ -1,4 +1,4 @@
-"""Events with somebody ahead of ego in its lane: a leader who brakes hard (tailgater or not) or breaks down."""
+"""Events in ego's lane: a leader that brakes hard, with or without a tailgater behind ego, or stalls."""
 
 from __future__ import annotations
 
@@ -15,24 +15,23 @@ from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
-#: Where everybody drives this slowly who brakes requires little of who follows, m/s.
+#: Lowest speed limit of the road, m/s: on slower roads a braking leader requires little of ego.
 _LEAST_MPS = 10.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
-#: Who stopped for no reason stands so long, s, and at least until an ego that keeps its speed would be there.
+#: Time that a leader stands after ego would have reached it at constant speed, s.
 _HOLD_S = 1.5
-#: Who can be made to tailgate ego is at most this far behind it, m.
+#: Largest distance of a vehicle behind ego that becomes a tailgater, m.
 _FOLLOWER_M = 60.0
-#: A leader who is put there appears so many steps before the recording: ego has had no time to fall far back.
+#: A new leader appears this many steps before the recording, which leaves ego no time to fall back.
 _BEFORE = 5
 
 
 def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
-    """The deceleration that a leader who brakes to a halt requires of ego from the same moment on.
+    """Deceleration that a leader braking to a halt requires of ego from the same moment on.
 
-    Ego may roll ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). That is the whole condition where
-    ego comes to rest later than the leader, v / a >= v_l / b; else they are nearest while both move, and
-    a = b + (v - v_l)^2 / (2 g).
+    Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
+    the leader, v / a >= v_l / b; else they are closest while both move, and a = b + (v - v_l)^2 / (2 g).
     """
     severity = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
     if speed_mps / severity >= leader_mps / braking_mps2:
@@ -43,7 +42,7 @@ def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_m
 def drawn_braking(
     speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """How hard the leader brakes and what that requires, which is uniform where hard braking can bring it about."""
+    """Draw the leader's deceleration and the severity, uniform over what hard braking can require; None: too little."""
     low, high = (leader_requires(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
     if high <= low + 0.05:
@@ -55,15 +54,13 @@ def drawn_braking(
 
 @dataclass(frozen=True)
 class LeadBrakes:
-    """The vehicle ahead of ego brakes to a halt for no visible reason, and drives on after a moment.
-
-    Where nobody drives close ahead somebody is put there who does.
+    """The vehicle ahead of ego, or a new one, brakes to a halt without visible reason and drives on later.
 
     Attributes:
-        within_s: Who is ahead by at most this time gap is the one who brakes.
-        headway_s: Time gap of somebody who is put there, low and high.
-        tailgater: Whether somebody must be behind ego, who then follows it closely.
-        tailgating_s: The time gap that this one keeps, low and high.
+        within_s: Largest time gap of an existing leader; else a new vehicle is added.
+        headway_s: Time gap of a new leader, low and high.
+        tailgater: Whether a vehicle behind ego follows it closely.
+        tailgating_s: Time gap of the tailgater, low and high.
     """
 
     within_s: float = 2.0
@@ -120,10 +117,10 @@ class LeadBrakes:
 
 @dataclass(frozen=True)
 class StalledVehicle:
-    """A car that drives ahead of ego loses its power, comes to a halt and stays.
+    """A car ahead of ego loses its power, comes to a halt and stays.
 
     Attributes:
-        headway_s: How far it is ahead, low and high, as time.
+        headway_s: Time gap to the car, low and high.
     """
 
     headway_s: tuple[float, float] = (0.9, 1.4)
@@ -146,7 +143,7 @@ class StalledVehicle:
 
 
 def _stands_until(speed_mps: float, severity_mps2: float) -> int:
-    """Steps until an ego that keeps its speed would be there, v / (2 a), and a moment more."""
+    """Steps that a leader stands: until ego would reach it at constant speed, v / (2 a), and a moment more."""
     return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
 
 
@@ -158,16 +155,14 @@ def _put_ahead(
     drives_on: Staging | None,
     others: tuple[int, ...],
 ) -> Proposal | None:
-    """A car that drives as ego does but ahead of it, and brakes to a halt at a step; ego keeps its distance before.
-
-    None where the car would meet a junction, or cannot brake so that it requires enough of ego.
+    """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
 
     Args:
-        scene: The scene without it.
-        step: When it brakes.
-        headway_s: How far it is ahead where ego drives freely, as time.
-        rng: Source of chance.
-        drives_on: What else is staged with a car that drives on after a moment; None: it stays.
+        scene: The scenario without it.
+        step: First step of braking.
+        headway_s: Time gap to an ego in free traffic.
+        rng: Source of randomness.
+        drives_on: Further staging of a car that drives on later; None: it stays.
         others: Further actors.
     """
     track, lead = scene.track, float(scene.motion.speed[0, step])

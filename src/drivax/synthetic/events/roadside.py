@@ -1,4 +1,4 @@
-"""Events that come from the roadside: people, cyclists, things that roll into the lane, cars that reverse out."""
+"""Events from the roadside: pedestrians, cyclists, objects that roll into the lane, reversing cars."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
 _PERSON_M, _BICYCLE_M, _THING_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
-#: Streets from whose sides things come: no faster than this, m/s.
+#: Highest limit of streets with such events, m/s.
 _STREET_MPS = 20.0
-#: How fast somebody who runs out gains speed, m/s2.
+#: Acceleration of a pedestrian, m/s2.
 _START_MPS2 = 3.0
-#: How fast a thing that falls or is pushed gains speed, m/s2.
+#: Acceleration of an object that falls or is pushed, m/s2.
 _ROLLING_MPS2 = 6.0
 
 
@@ -30,7 +30,7 @@ def _has_streets(network: RoadNetwork) -> bool:
 
 
 def _place(scene: Scene, station: float) -> bool:
-    """Whether something may come from the side here: an ordinary street away from junctions and crosswalks."""
+    """Whether a station is on an ordinary street, away from junctions and crosswalks."""
     lane = scene.lane_at(station)
     return scene.plain_road(station) and scene.roles.network.lanes[lane].limit_mps <= _STREET_MPS
 
@@ -42,7 +42,7 @@ def _across(
     kind: AgentKind,
     size: tuple[float, float, float],
 ) -> Scripted:
-    """Somebody who moves square to ego's way at a station, and faces it before."""
+    """Actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
     xy, heading = scene.track.pose(np.full(scene.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
     return moving(xy, toward, kind, size, np.ones(scene.steps, bool))
@@ -50,11 +50,11 @@ def _across(
 
 @dataclass(frozen=True)
 class Jaywalker:
-    """Somebody walks out into the road where there is no crossing.
+    """A pedestrian crosses the road away from crossings.
 
     Attributes:
-        hidden: They come from behind a parked car; else from the kerb.
-        speed_mps: How fast they go, low and high.
+        hidden: From behind a parked car; else from the kerb.
+        speed_mps: Walking speed, low and high.
     """
 
     hidden: bool = False
@@ -72,16 +72,13 @@ class Jaywalker:
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         pace = float(rng.uniform(*self.speed_mps))
-        if self.hidden:
-            found = self._behind_parked(scene, severity_mps2, pace, rng)
-        else:
-            found = self._from_kerb(scene, severity_mps2, pace, rng)
-        if found is None:
+        origin = (self._behind_parked if self.hidden else self._from_kerb)(scene, severity_mps2, pace, rng)
+        if origin is None:
             return None
-        step, station, offset = found
+        step, station, offset = origin
         if not _place(scene, station):
             return None
-        # Over to the other side of the road, and a little further.
+        # The walk ends beyond the other side of the road.
         side = -int(math.copysign(1, offset))
         over = abs(offset) + min(scene.edge_m(station, side), 14.0) + 0.6
         times = DT_S * (np.arange(scene.steps) - step)
@@ -94,7 +91,7 @@ class Jaywalker:
         return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, min(last, scene.last_step))
 
     def _needs(self, scene: Scene, offset: float, speed: float, pace: float, wanted: float) -> float | None:
-        """Room from ego's front to the walker's line at the first step, or None where ego would be gone first."""
+        """Room from ego's front to the pedestrian's line at the first step; None where ego would pass first."""
         half = (scene.ego_size_m[1] + _PERSON_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
         leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
@@ -112,7 +109,7 @@ class Jaywalker:
         speed, own = float(scene.motion.speed[0, step]), float(scene.track.at[step])
         front = own + (scene.ego_size_m[0] + _PERSON_M[1]) / 2
         station, offset = front + speed, 0.0
-        # The kerb's distance is that at the place, which depends on it: twice is near enough.
+        # The distance of the kerb depends on the station, which depends on that distance: iterate twice.
         for _ in range(2):
             offset = scene.edge_m(station, side) + back
             if not offset < 10.0:
@@ -132,8 +129,8 @@ class Jaywalker:
         station, left = scene.track.projected(centres)
         steps = np.arange(scene.first_step + EARLIEST, scene.first_step + LATEST)
         speed = scene.motion.speed[0, steps]
-        beside = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > scene.track.at[steps[0]] + 6.0)
-        order = rng.permutation(np.flatnonzero(beside & (station < scene.track.at[steps[-1]] + 40.0)))
+        near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > scene.track.at[steps[0]] + 6.0)
+        order = rng.permutation(np.flatnonzero(near & (station < scene.track.at[steps[-1]] + 40.0)))
         for car in order[:6].tolist():
             line = float(station[car]) + scene.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
@@ -148,17 +145,17 @@ class Jaywalker:
 
 @dataclass(frozen=True)
 class LaneBlocked:
-    """A thing rolls from the roadside into ego's lane and stays there.
+    """An object rolls from the roadside into ego's lane and stays there.
 
     Attributes:
-        speed_mps: How fast it rolls, low and high.
+        speed_mps: Speed of the object, low and high.
     """
 
     speed_mps: tuple[float, float] = (2.5, 7.0)
     kind: EventKind = EventKind.LANE_BLOCKED
 
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`: anywhere."""
+        """See :class:`EventScript`: on all roads."""
         return bool(network.lanes)
 
     def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
@@ -192,8 +189,8 @@ class ReversingCar:
     """A car backs out of a driveway into ego's lane and stops there.
 
     Attributes:
-        speed_mps: How fast it reverses, low and high.
-        gain_mps2: How it gains that speed.
+        speed_mps: Speed in reverse, low and high.
+        gain_mps2: Acceleration.
     """
 
     speed_mps: tuple[float, float] = (2.0, 4.0)
@@ -213,7 +210,7 @@ class ReversingCar:
         speed = float(scene.motion.speed[0, step])
         room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
         station = float(scene.track.at[step]) + room + (scene.ego_size_m[0] + CAR_M[1]) / 2
-        # Its rear bumper stands near the kerb on the right, and ends beyond the middle of ego's way.
+        # The rear bumper starts near the right kerb and ends beyond the middle of ego's path.
         rear = scene.edge_m(station, -1) + back
         if not 1.3 < rear < 7.0 or not _place(scene, station):
             return None
@@ -234,11 +231,11 @@ class ReversingCar:
 
 @dataclass(frozen=True)
 class WrongWayCyclist:
-    """A cyclist comes along the edge of ego's side against traffic and swings out into ego's lane for a while.
+    """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
         speed_mps: Speed, low and high.
-        out_s: How long they are in ego's way, low and high.
+        out_s: Time in ego's lane, low and high.
         swing_s: Duration of each swing.
     """
 
@@ -268,7 +265,7 @@ class WrongWayCyclist:
         if not edge < 4.5:
             return None
         times = DT_S * (np.arange(scene.steps) - step)
-        # The lane is clear when the way back has brought them this share of the way out of it.
+        # Share of the swing back after which ego's lane is clear.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
         begin_back = clear - _time_of_share(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
         swing = smooth_step(times, self.swing_s) - smooth_step(times - begin_back, self.swing_s)
@@ -283,6 +280,6 @@ class WrongWayCyclist:
 
 
 def _time_of_share(share: float) -> float:
-    """When the smooth step has done this share, as a share of its duration."""
+    """Inverse of the smooth step: the share of its duration at which it reaches a share."""
     t = np.linspace(0.0, 1.0, 201)
     return float(np.interp(share, smooth_step(t, 1.0), t))
