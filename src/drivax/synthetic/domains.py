@@ -39,7 +39,7 @@ class Domain:
         total = sum(share for _, share in chosen)
         return tuple((family, share / total) for family, share in chosen)
 
-    def drawn_family(self, rng: np.random.Generator) -> RoadFamily:
+    def draw_family(self, rng: np.random.Generator) -> RoadFamily:
         """Draw a family."""
         families = self.families
         return families[rng.choice(len(families), p=[share for _, share in families])][0]

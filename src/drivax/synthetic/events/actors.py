@@ -16,7 +16,7 @@ from drivax.synthetic.traffic.roles import Motion, Scripted
 CAR_M = (4.6, 1.85, 1.55)
 
 
-def changed_speed(
+def speed_change(
     first_mps: float, last_mps: float, rate_mps2: float, times_s: Float64[np.ndarray, " k"]
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
     """Distance and speed of a change between constant speeds that starts at time 0 (distances before are negative)."""
@@ -36,7 +36,7 @@ def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
     return speed_mps / gain_mps2 + (distance_m - ramp) / speed_mps
 
 
-def walked(
+def walk(
     distance_m: float,
     speed_mps: float,
     rates_mps2: tuple[float, float],
@@ -55,8 +55,8 @@ def walked(
     if distance_m < stopping + speed_mps**2 / (2 * gain):
         return None
     slows = travel_s(distance_m - stopping, speed_mps, gain)
-    gone, up = changed_speed(0.0, speed_mps, gain, np.minimum(times_s, slows))
-    more, down = changed_speed(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
+    gone, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
+    more, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
     return gone + more, np.where(times_s < slows, up, down)
 
 
@@ -77,10 +77,10 @@ def along_track(
     """Actor at stations and lateral offsets of ego's path, headed along its motion."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
-    return moving(xy, heading, kind, size_m, valid)
+    return scripted_motion(xy, heading, kind, size_m, valid)
 
 
-def moving(
+def scripted_motion(
     xy: Float64[np.ndarray, "time 2"],
     heading: Float64[np.ndarray, " time"],
     kind: AgentKind,
@@ -113,13 +113,13 @@ def along_curve(
     return Scripted(kind, size_m, xy, np.interp(distance_m, arc, curve.heading), speed, valid)
 
 
-def slowed(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
+def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
     """Vehicle of the traffic that brakes from a step to a halt on its path."""
     xy, heading = motion.xy[row], np.unwrap(motion.heading[row])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     times = DT_S * (np.arange(len(xy)) - step)
     speed = float(motion.speed[row, step])
-    gone, slower = changed_speed(speed, 0.0, braking_mps2, times)
+    gone, slower = speed_change(speed, 0.0, braking_mps2, times)
     at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
     moved = np.stack([np.interp(at, arc[grows], xy[grows, k]) for k in (0, 1)], axis=-1)

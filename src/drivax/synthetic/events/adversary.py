@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float64
 
 from drivax.geometry.boxes import overlap, time_to_overlap
 from drivax.scenario.schema import CURRENT_STEP, DT_S, AgentKind
-from drivax.synthetic.events.ego_view import Scene
-from drivax.synthetic.events.kinds import Staged
+from drivax.synthetic.events.ego_view import EgoView
+from drivax.synthetic.events.kinds import StagedEvent
 from drivax.synthetic.roads.curves import STEP_M
 from drivax.synthetic.traffic.roles import Motion, Scripted
 
@@ -66,30 +66,30 @@ def boxes(actor: Scripted) -> Float64[np.ndarray, "time 6"]:
     return np.column_stack([actor.xy, np.cos(actor.heading), np.sin(actor.heading), size])
 
 
-def first_blocked(scene: Scene, threat: Scripted, step: int) -> Float64[np.ndarray, " time"]:
+def first_blocked(view: EgoView, adversary: Scripted, step: int) -> Float64[np.ndarray, " time"]:
     """First station ahead at which ego would touch the actor, for each step from ``step`` on, m (infinite: none)."""
-    track, last = scene.track, scene.last_step
-    box = boxes(threat)[step : last + 1]
+    track, last = view.track, view.last_step
+    box = boxes(adversary)[step : last + 1]
     begin = int(track.at[step] / STEP_M)
     station = STEP_M * np.arange(begin, len(track.xy), 1)
     xy, heading = track.xy[begin:], track.heading[begin:]
-    size = scene.ego_size_m
+    size = view.ego_size_m
     ego = np.column_stack(
         [xy, np.cos(heading), np.sin(heading), np.broadcast_to(size[:2], xy.shape)],
     )
-    reach = (math.hypot(size[0], size[1]) + math.hypot(*threat.size_m[:2])) / 2
+    reach = (math.hypot(size[0], size[1]) + math.hypot(*adversary.size_m[:2])) / 2
     gap = (box[:, None, 0] - xy[:, 0]) ** 2 + (box[:, None, 1] - xy[:, 1]) ** 2
-    time, place = np.nonzero((gap < reach**2) & threat.valid[step : last + 1, None])
+    time, place = np.nonzero((gap < reach**2) & adversary.valid[step : last + 1, None])
     hit = overlap(ego[place], box[time])
     result = np.full(len(box), math.inf)
     np.minimum.at(result, time[hit], station[place[hit]])
     return result
 
 
-def severity(scene: Scene, threat: Scripted, step: int) -> float:
+def severity(view: EgoView, adversary: Scripted, step: int) -> float:
     """Constant deceleration from a step on with which ego just avoids the actor, m/s2."""
-    room = first_blocked(scene, threat, step) - scene.track.at[step]
-    return required_by_samples(float(scene.motion.speed[0, step]), room)
+    room = first_blocked(view, adversary, step) - view.track.at[step]
+    return required_by_samples(float(view.motion.speed[0, step]), room)
 
 
 def required_by_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) -> float:
@@ -105,39 +105,39 @@ def required_by_samples(speed_mps: float, room_m: Float64[np.ndarray, " step"]) 
     return required_deceleration(speed_mps, np.maximum(room, 0.0), time)
 
 
-def least_ttc(scene: Scene, threat: Scripted, hold_from: int, since: int) -> float:
-    """Least time to collision, from step ``since`` on, of an ego at constant speed from ``hold_from`` on, s (at most 5)."""
-    track, steps = scene.track, np.arange(max(since, hold_from), scene.last_step + 1)
-    speed = float(scene.motion.speed[0, hold_from])
+def least_ttc(view: EgoView, adversary: Scripted, hold_from: int, since: int) -> float:
+    """Least time to collision from ``since`` on, of an ego at constant speed from ``hold_from`` on, s (at most 5)."""
+    track, steps = view.track, np.arange(max(since, hold_from), view.last_step + 1)
+    speed = float(view.motion.speed[0, hold_from])
     xy, heading = track.pose(track.at[hold_from] + speed * DT_S * (steps - hold_from))
-    time = _times_to_collision(scene, (xy, heading, speed), boxes(threat)[steps], threat.speed[steps])
-    return float(np.min(np.where(threat.valid[steps], time, 5.0), initial=5.0))
+    time = _times_to_collision(view, (xy, heading, speed), boxes(adversary)[steps], adversary.speed[steps])
+    return float(np.min(np.where(adversary.valid[steps], time, 5.0), initial=5.0))
 
 
-def threatens(scene: Scene, motion: Motion, staged: Staged) -> bool:
+def endangers_ego(view: EgoView, motion: Motion, staged: StagedEvent) -> bool:
     """Whether the simulated actor comes close to collision with an ego that keeps its speed from the event's start.
 
     Rejects events that other agents disturbed, or for which ego became slower before.
 
     Args:
-        scene: The scenario without the event: ego's path.
+        view: The scenario without the event: ego's path.
         motion: The simulated motion with the event.
         staged: The event.
     """
     begin, actor = staged.first_step, staged.actors[0]
-    (station,), (left,) = scene.track.projected(motion.xy[:1, begin])
-    steps = np.arange(begin, scene.last_step + 1)
+    (station,), (left,) = view.track.project(motion.xy[:1, begin])
+    steps = np.arange(begin, view.last_step + 1)
     speed = float(motion.speed[0, begin])
-    xy, heading = scene.track.pose(station + speed * DT_S * (steps - begin), left)
-    acts = slice(begin, scene.last_step + 1)
+    xy, heading = view.track.pose(station + speed * DT_S * (steps - begin), left)
+    acts = slice(begin, view.last_step + 1)
     turned, size = motion.heading[actor, acts], np.broadcast_to(motion.size_m[actor, :2], xy.shape)
     other = np.column_stack([motion.xy[actor, acts], np.cos(turned), np.sin(turned), size])
-    time = _times_to_collision(scene, (xy, heading, speed), other, motion.speed[actor, acts])
+    time = _times_to_collision(view, (xy, heading, speed), other, motion.speed[actor, acts])
     return bool(np.any(motion.valid[actor, acts] & (time < SURELY_S)))
 
 
 def _times_to_collision(
-    scene: Scene,
+    view: EgoView,
     ego: tuple[Float64[np.ndarray, "time 2"], Float64[np.ndarray, " time"], float],
     other: Float64[np.ndarray, "time 6"],
     speed: Float64[np.ndarray, " time"],
@@ -145,29 +145,29 @@ def _times_to_collision(
     """Time to collision of ego (positions, headings, speed) with a box ahead, s (at most 5)."""
     xy, heading, own = ego
     toward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    box = np.column_stack([xy, toward, np.broadcast_to(scene.ego_size_m[:2] - _SMALLER_M, xy.shape)])
+    box = np.column_stack([xy, toward, np.broadcast_to(view.ego_size_m[:2] - _SMALLER_M, xy.shape)])
     time = time_to_overlap(box, own * toward, other, speed[:, None] * other[:, 2:4], 5.0)
     time = np.where(overlap(box, other), 0.0, time)
     # Braking does not avoid actors from behind.
-    ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -scene.ego_size_m[0] / 2
+    ahead = np.sum((other[:, :2] - xy) * toward, axis=-1) > -view.ego_size_m[0] / 2
     return np.where(ahead, time, 5.0)
 
 
-def comes_close(scene: Scene, threat: Scripted, step: int) -> bool:
+def comes_close(view: EgoView, adversary: Scripted, step: int) -> bool:
     """Whether an ego at constant speed comes close to collision: from the event's first step, and from the current one.
 
     Where ego's speed changes in between (a turn, a queue) only the first counts.
     """
-    current, speed = scene.first_step + CURRENT_STEP, scene.motion.speed[0]
-    if least_ttc(scene, threat, step, step) >= NEAR_S:
+    current, speed = view.first_step + CURRENT_STEP, view.motion.speed[0]
+    if least_ttc(view, adversary, step, step) >= NEAR_S:
         return False
     steady = abs(speed[step] - speed[current]) < _STEADY * speed[current]
-    return not steady or least_ttc(scene, threat, current, step) < NEAR_S
+    return not steady or least_ttc(view, adversary, current, step) < NEAR_S
 
 
-def in_its_lane(scene: Scene, extra: Scripted, until: int) -> tuple[int, ...]:
+def vehicles_in_lane(view: EgoView, extra: Scripted, until: int) -> tuple[int, ...]:
     """Rows of vehicles in the lane of a new actor, near it and with its heading, up to a step."""
-    motion, steps = scene.motion, np.arange(until + 1)
+    motion, steps = view.motion, np.arange(until + 1)
     rows = np.arange(1, motion.vehicles)
     gap = np.sum((motion.xy[rows, : until + 1] - extra.xy[steps]) ** 2, axis=-1)
     same = np.cos(motion.heading[rows, : until + 1] - extra.heading[steps]) > 0.7
@@ -175,9 +175,9 @@ def in_its_lane(scene: Scene, extra: Scripted, until: int) -> tuple[int, ...]:
     return tuple(rows[met.any(axis=1)].tolist())
 
 
-def in_its_cross_way(scene: Scene, extra: Scripted) -> tuple[int, ...]:
+def vehicles_that_cross(view: EgoView, extra: Scripted) -> tuple[int, ...]:
     """Rows of vehicles that would collide with an actor that crosses their path."""
-    motion, last = scene.motion, scene.last_step
+    motion, last = view.motion, view.last_step
     rows, moves = np.arange(1, motion.vehicles), np.flatnonzero(extra.valid & (np.abs(extra.speed) > 0.3))
     moves = moves[moves <= last]
     gap = np.sum((motion.xy[rows][:, moves] - extra.xy[moves]) ** 2, axis=-1)
@@ -192,20 +192,22 @@ def in_its_cross_way(scene: Scene, extra: Scripted) -> tuple[int, ...]:
     return tuple(np.unique(rows[row[hit]]).tolist())
 
 
-def with_room(scene: Scene, extra: Scripted, until: int, removed: tuple[int, ...] = ()) -> Scripted | None:
+def enter_when_clear(
+    view: EgoView, extra: Scripted, until: int, removed: tuple[int, ...] = ()
+) -> Scripted | None:
     """Let a new actor appear when it has no collision ahead; None where it has, or where ego would see it appear.
 
     Other agents see it and keep behind it: only agents ahead of it and pedestrians count.
 
     Args:
-        scene: The scenario without the actor.
+        view: The scenario without the actor.
         extra: The actor.
         until: The step at which ego may meet it.
         removed: Rows of vehicles that are left out.
     """
-    motion, last = scene.motion, until + 1
-    along, beside = _APART_M if extra.kind == AgentKind.VEHICLE else _APART_ON_FOOT_M
-    box = boxes(extra)[None, :last] + np.array([0, 0, 0, 0, 2 * along, 2 * beside])
+    motion, last = view.motion, until + 1
+    along, across = _APART_M if extra.kind == AgentKind.VEHICLE else _APART_ON_FOOT_M
+    box = boxes(extra)[None, :last] + np.array([0, 0, 0, 0, 2 * along, 2 * across])
     users = slice(1, None)
     size = np.broadcast_to(motion.size_m[users, None, :2], motion.xy[users].shape)[:, :last]
     turned = motion.heading[users, :last]
@@ -226,14 +228,14 @@ def with_room(scene: Scene, extra: Scripted, until: int, removed: tuple[int, ...
         appears = max(appears, int(meets.max()) + 5)
     if appears >= last or not extra.valid[appears]:
         return None
-    seen = appears > scene.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _VIEW_M
+    seen = appears > view.first_step and np.hypot(*(extra.xy[appears] - motion.xy[0, appears])) < _VIEW_M
     now = box[0, appears], other[:, appears], valid[:, appears], motion.speed[users, appears]
-    if seen or not _appears_apart(*now):
+    if seen or not _is_clear(*now):
         return None
     return replace(extra, valid=extra.valid & (np.arange(len(extra.valid)) >= appears))
 
 
-def _appears_apart(
+def _is_clear(
     box: Float64[np.ndarray, " 6"],
     other: Float64[np.ndarray, "user 6"],
     valid: Bool[np.ndarray, " user"],

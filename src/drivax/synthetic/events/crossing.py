@@ -11,9 +11,14 @@ from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, along_curve
-from drivax.synthetic.events.adversary import comes_close, first_blocked, in_its_lane, required_by_samples
-from drivax.synthetic.events.destinations import Aim
-from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, Scene
+from drivax.synthetic.events.adversary import (
+    comes_close,
+    first_blocked,
+    required_by_samples,
+    vehicles_in_lane,
+)
+from drivax.synthetic.events.destinations import Destination
+from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
 from drivax.synthetic.roads.curves import Curve, joined
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
@@ -31,7 +36,7 @@ _TURN_RAD, _ALONG = math.radians(45.0), 0.7
 
 
 @dataclass(frozen=True)
-class _Way:
+class _ActorPath:
     """Path of an actor: a curve, and the distance along it at which the junction begins."""
 
     curve: Curve
@@ -39,14 +44,17 @@ class _Way:
     limit_mps: float
 
     @classmethod
-    def through(cls, scene: Scene, way: int, rng: np.random.Generator) -> _Way:
+    def through(cls, view: EgoView, connector: int, rng: np.random.Generator) -> _ActorPath:
         """Draw a path through a connector."""
-        lanes = scene.roles.network.lanes
-        before, after = _chain(lanes, way, -1, _FROM_M, rng), _chain(lanes, way, 1, _BEYOND_M, rng)
+        lanes = view.roles.network.lanes
+        before, after = (
+            _chain(lanes, connector, -1, _FROM_M, rng),
+            _chain(lanes, connector, 1, _BEYOND_M, rng),
+        )
         ahead = [lanes[i].curve for i in reversed(before)]
         line = sum(float(curve.arc_m[-1]) for curve in ahead)
-        curve = joined(*ahead, lanes[way].curve, *(lanes[i].curve for i in after))
-        limit = lanes[before[0]].limit_mps if before else lanes[way].limit_mps
+        curve = joined(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
+        limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
         return cls(curve, line, limit)
 
     @cached_property
@@ -75,13 +83,13 @@ class _Way:
 
 
 def _chain(
-    lanes: tuple[Lane, ...], first: int, way: int, length_m: float, rng: np.random.Generator
+    lanes: tuple[Lane, ...], first: int, direction: int, length_m: float, rng: np.random.Generator
 ) -> list[int]:
     """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
     total, at = 0.0, first
     while total < length_m:
-        links = lanes[at].successors if way > 0 else lanes[at].predecessors
+        links = lanes[at].successors if direction > 0 else lanes[at].predecessors
         if not links:
             break
         at = int(rng.choice(links))
@@ -115,50 +123,50 @@ class CrossTraffic:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: stop lines of connectors that actors may cross."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: stop lines of connectors that actors may cross."""
         if network.signals is None and not self.turning:
             return ()
         return tuple(
-            Aim(index, (0.0, 0.0), self.arrival_s)
+            Destination(index, (0.0, 0.0), self.arrival_s)
             for index, lane in enumerate(network.lanes)
-            if lane.connector and lane.predecessors and self._crossing(network, index)
+            if lane.connector and lane.predecessors and self._conflicting(network, index)
         )
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        ways = self._ways(scene)
+        connectors = self._crossing_connectors(view)
         share = float(rng.uniform(*self.speed_share))
-        if not ways:
+        if not connectors:
             return None
-        lane = int(rng.choice(ways))
-        way = _Way.through(scene, lane, rng)
-        fastest = share * way.limit_mps
+        lane = int(rng.choice(connectors))
+        path = _ActorPath.through(view, lane, rng)
+        fastest = share * path.limit_mps
         # Steps before the entry at which the actor can no longer stop: the event begins.
         decides = max(3, round(float(rng.uniform(0.3, fastest / (2 * _BRAKING_MPS2))) / DT_S))
-        found = self._timed(scene, lane, way, (fastest, decides), severity_mps2)
-        if found is None:
+        scheduled = self._schedule(view, lane, path, (fastest, decides), severity_mps2)
+        if scheduled is None:
             return None
-        entry, threat, required = found
-        leaves = int(np.argmax(~np.isfinite(first_blocked(scene, threat, entry))[8:])) + 8 + entry
+        entry, adversary, required = scheduled
+        leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
         # A queue at its light would block the actor.
-        removed = in_its_lane(scene, threat, entry + 5)
+        removed = vehicles_in_lane(view, adversary, entry + 5)
         return Proposal(
-            Staging(extras=(threat,), removed=removed),
+            Staging(extras=(adversary,), removed=removed),
             required,
-            threat,
+            adversary,
             entry - decides,
-            min(max(leaves, entry + 10), scene.last_step),
+            min(max(leaves, entry + 10), view.last_step),
         )
 
-    def _ways(self, scene: Scene) -> list[int]:
+    def _crossing_connectors(self, view: EgoView) -> list[int]:
         """Connectors of actors that cross a connector on ego's path."""
-        network = scene.roles.network
-        return sorted({other for mine in scene.connectors for other in self._crossing(network, mine)})
+        network = view.roles.network
+        return sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
 
-    def _crossing(self, network: RoadNetwork, mine: int) -> list[int]:
+    def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
         """Connectors that cross a straight one and have to give way to it."""
         lane = network.lanes[mine]
         if not _straight_on(lane):
@@ -176,46 +184,46 @@ class CrossTraffic:
         lit = other.control == mine.control == Control.SIGNAL
         return lit and _straight_on(other) and abs(along) < _ALONG
 
-    def _timed(
-        self, scene: Scene, lane: int, way: _Way, pace: tuple[float, int], wanted: float
+    def _schedule(
+        self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
     ) -> tuple[int, Scripted, float] | None:
         """The entry step of the actor at which it requires about this deceleration, its motion, and its severity."""
-        (fastest, decides), steps, track = pace, np.arange(scene.steps), scene.track
-        first = scene.first_step + EARLIEST + decides
-        last = min(scene.first_step + LATEST + decides, scene.last_step - 15)
+        (fastest, decides), steps, track = pace, np.arange(view.steps), view.track
+        first = view.first_step + EARLIEST + decides
+        last = min(view.first_step + LATEST + decides, view.last_step - 15)
 
         def entering(entry: int) -> Scripted:
-            distance = way.distances(fastest, DT_S * (steps - entry))
-            return along_curve(way.curve, distance, AgentKind.VEHICLE, CAR_M)
+            distance = path.distances(fastest, DT_S * (steps - entry))
+            return along_curve(path.curve, distance, AgentKind.VEHICLE, CAR_M)
 
         if first > last:
             return None
         # The blocked stations are the same for all entry steps, shifted in time.
-        blocked = first_blocked(scene, entering(first), first - decides)
+        blocked = first_blocked(view, entering(first), first - decides)
         requires = np.zeros(last + 1)
         for entry in range(first, last + 1):
             begin = entry - decides + NOTICED
-            speed = float(scene.motion.speed[0, begin])
+            speed = float(view.motion.speed[0, begin])
             if speed > 4.0:
-                room = blocked[NOTICED:][: scene.last_step + 1 - begin] - track.at[begin]
+                room = blocked[NOTICED:][: view.last_step + 1 - begin] - track.at[begin]
                 requires[entry] = required_by_samples(speed, room)
         low, high = SEVERITY_MPS2
         # The step at which the actor blocks ego's path, for each entry step.
         enters = np.arange(last + 1) - decides + int(np.argmax(np.isfinite(blocked)))
-        in_time = enters < scene.first_step + FULL_SWING
+        in_time = enters < view.first_step + FULL_SWING
         fits = np.flatnonzero((requires > low) & (requires < high) & in_time)
-        for entry in fits[np.argsort(np.abs(requires[fits] - wanted), kind="stable")[:6]].tolist():
+        for entry in fits[np.argsort(np.abs(requires[fits] - requested), kind="stable")[:6]].tolist():
             # An ego that keeps its speed may pass before the actor arrives.
-            threat = entering(entry)
-            if comes_close(scene, threat, entry - decides) and self._fits_lights(scene, lane, entry):
-                return entry, threat, float(requires[entry])
+            adversary = entering(entry)
+            if comes_close(view, adversary, entry - decides) and self._fits_lights(view, lane, entry):
+                return entry, adversary, float(requires[entry])
         return None
 
-    def _fits_lights(self, scene: Scene, lane: int, entry: int) -> bool:
+    def _fits_lights(self, view: EgoView, lane: int, entry: int) -> bool:
         """Whether the light has been red for 1.2 s (red-light runner), or not red (turning vehicle)."""
-        network = scene.roles.network
+        network = view.roles.network
         if network.signals is None:
             return self.turning
-        colour, _ = network.signals.colours(scene.times_s, len(network.lanes))
+        colour, _ = network.signals.colours(view.times_s, len(network.lanes))
         seen = colour[entry - 12 : entry + 1, lane]
         return bool(np.all(seen != Colour.RED)) if self.turning else bool(np.all(seen == Colour.RED))

@@ -28,7 +28,7 @@ _FROM_END_M = 2.0
 
 
 @dataclass(frozen=True)
-class Aim:
+class Destination:
     """A place that ego should pass.
 
     Attributes:
@@ -46,7 +46,7 @@ class Aim:
 
 
 @dataclass(frozen=True)
-class AimedWay:
+class DestinationRoute:
     """A route past a destination, with the destination's ``alone`` and ``followed``.
 
     Attributes:
@@ -62,41 +62,51 @@ class AimedWay:
     followed: bool
 
 
-def open_road(network: RoadNetwork, least_mps: float = 0.0, beside: bool = False) -> tuple[Aim, ...]:
+def open_road(
+    network: RoadNetwork, lowest_limit_mps: float = 0.0, has_neighbour: bool = False
+) -> tuple[Destination, ...]:
     """Places on ordinary lanes away from their ends.
 
     Args:
         network: The roads.
-        least_mps: Lowest speed limit of the lanes.
-        beside: Whether a lane must have a neighbour.
+        lowest_limit_mps: Lowest speed limit of the lanes.
+        has_neighbour: Whether a lane must have a neighbour.
     """
     return tuple(
-        Aim(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
+        Destination(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
         for index, lane in enumerate(network.lanes)
         if not (lane.connector or lane.ends or lane.exit_only or lane.kind == RoadKind.LANE_BIKE)
         and lane.length_m > _BEFORE_M + _AFTER_M
-        and lane.limit_mps >= least_mps
-        and (not beside or max(lane.left, lane.right) >= 0)
+        and lane.limit_mps >= lowest_limit_mps
+        and (not has_neighbour or max(lane.left, lane.right) >= 0)
     )
 
 
-def drawn_aimed_way(network: RoadNetwork, aims: Sequence[Aim], rng: np.random.Generator) -> AimedWay | None:
+def draw_route(
+    network: RoadNetwork, destinations: Sequence[Destination], rng: np.random.Generator
+) -> DestinationRoute | None:
     """Draw a route past one of several destinations; None where none can be reached."""
-    for place in rng.permutation(len(aims)).tolist():
-        way = aimed_way(network, aims[place], rng)
-        if way is not None:
-            return way
+    for place in rng.permutation(len(destinations)).tolist():
+        route = route_past(network, destinations[place], rng)
+        if route is not None:
+            return route
     return None
 
 
-def aimed_way(network: RoadNetwork, aim: Aim, rng: np.random.Generator) -> AimedWay | None:
+def route_past(
+    network: RoadNetwork, destination: Destination, rng: np.random.Generator
+) -> DestinationRoute | None:
     """Draw a route past a destination to the end of the map; None where a light or a sign before it delays ego."""
-    time, lane, at = float(rng.uniform(*aim.when_s)), aim.lane, float(rng.uniform(*aim.along_m))
+    time, lane, at = (
+        float(rng.uniform(*destination.when_s)),
+        destination.lane,
+        float(rng.uniform(*destination.along_m)),
+    )
     lanes = [lane]
     while at < time * _pace(network, lane):
         time -= at / _pace(network, lane)
         before = _before(network, lanes)
-        if not before or (lane != aim.lane and network.lanes[lane].control != Control.NONE):
+        if not before or (lane != destination.lane and network.lanes[lane].control != Control.NONE):
             return None
         lane = int(rng.choice(before))
         lanes.insert(0, lane)
@@ -111,30 +121,30 @@ def aimed_way(network: RoadNetwork, aim: Aim, rng: np.random.Generator) -> Aimed
         room += network.lanes[lanes[0]].length_m
     place = len(lanes) - 1
     while network.lanes[lanes[-1]].successors:
-        ways = onward(network, lanes)
-        if not ways:
+        following = onward(network, lanes)
+        if not following:
             return None
-        lanes.append(int(rng.choice(ways)))
-    return AimedWay(start, tuple(lanes), place, aim.alone, aim.followed)
+        lanes.append(int(rng.choice(following)))
+    return DestinationRoute(start, tuple(lanes), place, destination.alone, destination.followed)
 
 
-def rearranged(
-    others: Placement, way: AimedWay, ego: tuple[int, float], rng: np.random.Generator
+def rearrange(
+    others: Placement, route: DestinationRoute, ego: tuple[int, float], rng: np.random.Generator
 ) -> Placement:
     """Adapt the placement of other vehicles to a destination: empty lanes ahead of ego, a follower behind it.
 
     Args:
         others: Placement of other vehicles.
-        way: Route of ego.
+        route: Route of ego.
         ego: Lane on which ego begins, and distance along it.
         rng: Source of randomness.
     """
     places = list(zip(others.lane, others.along_m, strict=True))
-    if way.alone:
-        first = way.lanes.index(ego[0])
-        ahead = way.lanes[first + 1 : way.place + 2]
+    if route.alone:
+        first = route.lanes.index(ego[0])
+        ahead = route.lanes[first + 1 : route.place + 2]
         places = [p for p in places if p[0] not in ahead and not (p[0] == ego[0] and p[1] > ego[1])]
-    if way.followed:
+    if route.followed:
         behind = (ego[0], ego[1] - float(rng.uniform(*_FOLLOWS_M)))
         near = [p for p in places if p[0] == ego[0] and behind[1] - _APART_M < p[1] < ego[1]]
         places += [behind] if behind[1] > _FROM_BEGIN_M and not near else []

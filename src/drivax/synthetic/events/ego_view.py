@@ -60,7 +60,7 @@ class Track:
         xy, heading = self.pose(np.array([station]))
         return xy[0], float(heading[0])
 
-    def projected(
+    def project(
         self, xy: Float64[np.ndarray, "n 2"]
     ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
         """Stations and lateral offsets (left positive) of points."""
@@ -96,7 +96,7 @@ def ego_track(motion: Motion) -> Track:
 
 
 @dataclass(frozen=True)
-class Scene:
+class EgoView:
     """The scenario without the event.
 
     Attributes:
@@ -133,7 +133,7 @@ class Scene:
         """Ego's length, width, height."""
         return self.motion.size_m[0]
 
-    def drawn_step(self, rng: np.random.Generator) -> int | None:
+    def draw_step(self, rng: np.random.Generator) -> int | None:
         """Draw a step at which an event may begin and ego is not slow; None without one."""
         steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)
         steps = steps[self.motion.speed[0, steps] > _SLOWEST_MPS]
@@ -175,7 +175,7 @@ class Scene:
         result = []
         for lane in self.roles.network.lanes:
             if lane.ends or lane.exit_only:
-                (station,), (aside,) = self.track.projected(lane.curve.xy[-1:])
+                (station,), (aside,) = self.track.project(lane.curve.xy[-1:])
                 if 2.0 < abs(aside) < 5.5 and station > 0:
                     result.append((float(station), 1 if aside > 0 else -1))
         return result
@@ -219,17 +219,17 @@ class Scene:
         passed = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
         return any(lanes[lane].connector for lane in passed if lane >= 0)
 
-    def on_way(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
+    def on_path(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
         """Stations of all vehicles at a step, and whether they drive on ego's path (False for ego itself)."""
         count = self.motion.vehicles
-        station, aside = self.track.projected(self.motion.xy[:count, step])
+        station, aside = self.track.project(self.motion.xy[:count, step])
         _, heading = self.track.pose(station)
         same = np.cos(self.motion.heading[:count, step] - heading) > 0.8
         on = self.motion.valid[:count, step] & (np.abs(aside) < 1.0) & same
         on[0] = False
         return station, on
 
-    def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> Scene:
+    def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
         """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
         drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
         law = replace(

@@ -8,8 +8,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.events.destinations import Aim
-from drivax.synthetic.events.ego_view import Scene
+from drivax.synthetic.events.destinations import Destination
+from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
@@ -36,7 +36,7 @@ class EventKind(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class Staged:
+class StagedEvent:
     """An event to simulate.
 
     Attributes:
@@ -61,20 +61,20 @@ class Proposal:
 
     Attributes:
         severity_mps2: Intended severity.
-        threat: Undisturbed motion of the actor at all steps.
+        adversary: Undisturbed motion of the actor at all steps.
         vehicle: Row of the actor if it is a vehicle of the traffic; else it is the first of the extras.
         others: Rows of further actors.
-        scene: The scenario with the actor, where ego reacts to it before the event.
+        view: The scenario with the actor, where ego reacts to it before the event.
     """
 
     staging: Staging
     severity_mps2: float
-    threat: Scripted
+    adversary: Scripted
     first_step: int
     last_step: int
     vehicle: int | None = None
     others: tuple[int, ...] = ()
-    scene: Scene | None = None
+    view: EgoView | None = None
 
 
 @runtime_checkable
@@ -90,15 +90,15 @@ class EventScript(Protocol):
         """Whether a network has what the event needs."""
         ...
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """Propose an event of about this severity, or None where this draw fails."""
         ...
 
 
 @runtime_checkable
-class AimedScript(EventScript, Protocol):
+class DestinationScript(EventScript, Protocol):
     """Script that needs ego at certain places; all others may happen on any open road."""
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """Places of which ego should pass one."""
         ...

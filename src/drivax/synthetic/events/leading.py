@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, slowed
+from drivax.synthetic.events.actors import CAR_M, along_track, brake_to_halt, speed_change
 from drivax.synthetic.events.adversary import severity
-from drivax.synthetic.events.destinations import Aim, open_road
-from drivax.synthetic.events.ego_view import NOTICED, Scene
+from drivax.synthetic.events.destinations import Destination, open_road
+from drivax.synthetic.events.ego_view import NOTICED, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
@@ -27,7 +27,7 @@ _FOLLOWER_M = 60.0
 _BEFORE = 5
 
 
-def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
+def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
     """Deceleration that a leader braking to a halt requires of ego from the same moment on.
 
     Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
@@ -39,11 +39,11 @@ def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_m
     return braking_mps2 + max(speed_mps - leader_mps, 0.0) ** 2 / (2 * gap_m)
 
 
-def drawn_braking(
+def draw_braking(
     speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
     """Draw the leader's deceleration and the severity, uniform over what hard braking can require; None: too little."""
-    low, high = (leader_requires(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
+    low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
     if high <= low + 0.05:
         return None
@@ -75,21 +75,21 @@ class LeadBrakes:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: behind somebody who brakes on a slow street nobody has to brake."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: fast roads only."""
         places = open_road(network, _LEAST_MPS)
         return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
-        step, headway = scene.drawn_step(rng), float(rng.uniform(*self.headway_s))
+        step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
             return None
-        motion, own = scene.motion, float(scene.track.at[step])
-        station, on = scene.on_way(step)
+        motion, own = view.motion, float(view.track.at[step])
+        station, on = view.on_path(step)
         speed = float(motion.speed[0, step])
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
@@ -103,16 +103,16 @@ class LeadBrakes:
         gap = np.where(on & (station > own), station - own - (length + length[0]) / 2, np.inf)
         leader = int(np.argmin(gap))
         if gap[leader] > self.within_s * speed:
-            return _put_ahead(scene, step, headway, rng, Staging(tailgates=tailgates), followers)
+            return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
-        drawn = drawn_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = scene.last_step if drawn is None else step + _stands_until(speed, drawn[1])
-        if drawn is None or last > scene.last_step:
+        drawn = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        last = view.last_step if drawn is None else step + _stands_until(speed, drawn[1])
+        if drawn is None or last > view.last_step:
             return None
         staging = Staging(overrides=(Override(leader, step, last, -drawn[0]),), tailgates=tailgates)
-        threat = slowed(motion, leader, step, drawn[0])
-        required = severity(scene, threat, step + NOTICED)
-        return Proposal(staging, required, threat, step, last, leader, followers)
+        adversary = brake_to_halt(motion, leader, step, drawn[0])
+        required = severity(view, adversary, step + NOTICED)
+        return Proposal(staging, required, adversary, step, last, leader, followers)
 
 
 @dataclass(frozen=True)
@@ -128,18 +128,18 @@ class StalledVehicle:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: behind somebody who brakes on a slow street nobody has to brake."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: fast roads only."""
         return open_road(network, _LEAST_MPS)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
-        step, headway = scene.drawn_step(rng), float(rng.uniform(*self.headway_s))
+        step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         if step is None:
             return None
-        return _put_ahead(scene, step, headway, rng, None, ())
+        return _propose_leader(view, step, headway, rng, None, ())
 
 
 def _stands_until(speed_mps: float, severity_mps2: float) -> int:
@@ -147,8 +147,8 @@ def _stands_until(speed_mps: float, severity_mps2: float) -> int:
     return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
 
 
-def _put_ahead(
-    scene: Scene,
+def _propose_leader(
+    view: EgoView,
     step: int,
     headway_s: float,
     rng: np.random.Generator,
@@ -158,33 +158,33 @@ def _put_ahead(
     """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
 
     Args:
-        scene: The scenario without it.
+        view: The scenario without it.
         step: First step of braking.
         headway_s: Time gap to an ego in free traffic.
         rng: Source of randomness.
         drives_on: Further staging of a car that drives on later; None: it stays.
         others: Further actors.
     """
-    track, lead = scene.track, float(scene.motion.speed[0, step])
-    lengths = (float(scene.ego_size_m[0]) + CAR_M[0]) / 2
+    track, lead = view.track, float(view.motion.speed[0, step])
+    lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
     cruising = track.at + headway_s * lead + lengths
-    if scene.meets_junction(float(cruising[scene.first_step]), float(cruising[step])):
+    if view.meets_junction(float(cruising[view.first_step]), float(cruising[step])):
         return None
-    appears = scene.first_step - _BEFORE
-    after = scene.behind(cruising - CAR_M[0] / 2, appears)
+    appears = view.first_step - _BEFORE
+    after = view.behind(cruising - CAR_M[0] / 2, appears)
     speed, gap = float(after.motion.speed[0, step]), float(cruising[step] - after.track.at[step]) - lengths
-    drawn = drawn_braking(speed, gap, lead, rng)
+    drawn = draw_braking(speed, gap, lead, rng)
     if drawn is None:
         return None
-    times = DT_S * (np.arange(scene.steps) - step)
-    gone, _ = changed_speed(lead, 0.0, drawn[0], times)
-    last = scene.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
-    onward, _ = changed_speed(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    times = DT_S * (np.arange(view.steps) - step)
+    gone, _ = speed_change(lead, 0.0, drawn[0], times)
+    last = view.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
+    onward, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
     station = np.where(times < 0, cruising, cruising[step] + gone + onward)
-    if last > scene.last_step or scene.meets_junction(float(cruising[step]), float(station[scene.last_step])):
+    if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
-    valid, left = np.arange(scene.steps) >= appears, np.zeros(scene.steps)
-    threat = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
-    staging = replace(drives_on or Staging(), extras=(threat,))
-    required = severity(after, threat, step + NOTICED)
-    return Proposal(staging, required, threat, step, last, None, others, after)
+    valid, left = np.arange(view.steps) >= appears, np.zeros(view.steps)
+    adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+    staging = replace(drives_on or Staging(), extras=(adversary,))
+    required = severity(after, adversary, step + NOTICED)
+    return Proposal(staging, required, adversary, step, last, None, others, after)

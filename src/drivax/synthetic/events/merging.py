@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, smooth_step
-from drivax.synthetic.events.destinations import Aim, open_road
-from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, Scene
+from drivax.synthetic.events.actors import CAR_M, along_track, smooth_step, speed_change
+from drivax.synthetic.events.destinations import Destination, open_road
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import EventKind, Proposal
 from drivax.synthetic.roads.curves import STEP_M
 from drivax.synthetic.roads.network import RoadNetwork
@@ -63,13 +63,13 @@ class CutIn:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: for a late merge the ends of lanes, on the adjacent lanes."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: for a late merge the ends of lanes, on the adjacent lanes."""
         lanes = network.lanes
         if not self.late_merge:
-            return open_road(network, beside=True)
+            return open_road(network, has_neighbour=True)
         places = []
         for lane in lanes:
             for neighbour in (lane.left, lane.right) if lane.ends or lane.exit_only else ():
@@ -77,19 +77,19 @@ class CutIn:
                     curve = lanes[neighbour].curve
                     nearest = int(np.argmin(np.hypot(*(curve.xy - lane.curve.xy[-1]).T)))
                     at = float(curve.arc_m[nearest])
-                    places.append(Aim(neighbour, (at, at), self.end_after_s))
+                    places.append(Destination(neighbour, (at, at), self.end_after_s))
         return tuple(places)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        step, side = scene.drawn_step(rng), int(rng.choice([-1, 1]))
+        step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         if self.late_merge:
-            step, side = self._before_an_end(scene, rng)
+            step, side = self._before_an_end(view, rng)
         shares = rng.uniform(*self.speed_share), rng.uniform(*self.slower_share)
         braking, lasts = float(rng.uniform(*self.braking_mps2)), float(rng.uniform(*self.lasts_s))
         if step is None:
             return None
-        speed = float(scene.motion.speed[0, step])
+        speed = float(view.motion.speed[0, step])
         before, after = (float(share) * speed for share in shares)
         after = min(after, before)
         slowed = max(after, before - braking * NOTICED_S)
@@ -100,48 +100,48 @@ class CutIn:
         gap += NOTICED_S * (speed - (before + slowed) / 2)
         if not 0.5 <= gap <= 40.0:
             return None
-        start = float(scene.track.at[step]) + gap + (scene.ego_size_m[0] + CAR_M[0]) / 2
-        times = DT_S * (np.arange(scene.steps) - step)
-        gone, _ = changed_speed(before, after, braking, times)
+        start = float(view.track.at[step]) + gap + (view.ego_size_m[0] + CAR_M[0]) / 2
+        times = DT_S * (np.arange(view.steps) - step)
+        gone, _ = speed_change(before, after, braking, times)
         station = start + gone
         finish = float(np.interp(lasts, times, station))
-        adjacent = self._beside(scene, station, start, finish, side)
-        if adjacent is None or scene.meets_junction(start, float(station[scene.last_step])):
+        adjacent = self._adjacent_lane(view, station, start, finish, side)
+        if adjacent is None or view.meets_junction(start, float(station[view.last_step])):
             return None
         aside, valid = adjacent
         left = side * aside * (1.0 - smooth_step(times, lasts))
-        threat = along_track(scene.track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
-        if not threat.valid[scene.first_step : step + 1].all():
+        adversary = along_track(view.track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+        if not adversary.valid[view.first_step : step + 1].all():
             return None
         # The event ends when the actor has its new speed in the new lane.
         last = step + round(max(lasts, (before - after) / braking) / DT_S)
-        last = min(last, scene.last_step)
-        return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, max(last, step + 1))
+        last = min(last, view.last_step)
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, max(last, step + 1))
 
-    def _before_an_end(self, scene: Scene, rng: np.random.Generator) -> tuple[int | None, int]:
+    def _before_an_end(self, view: EgoView, rng: np.random.Generator) -> tuple[int | None, int]:
         """Draw a step at which ego is shortly before the end of an adjacent lane, and the side of that lane."""
-        ends = scene.lane_ends
+        ends = view.lane_ends
         if not ends:
             return None, 1
         station, side = ends[int(rng.integers(len(ends)))]
-        speed = scene.motion.speed[0]
-        steps = np.arange(scene.first_step + EARLIEST, scene.first_step + LATEST + 1)
+        speed = view.motion.speed[0]
+        steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST + 1)
         # The merge and its gap take about three seconds, and it ends within the last metres of the lane.
-        left = station - scene.track.at[steps] - 3.0 * speed[steps]
+        left = station - view.track.at[steps] - 3.0 * speed[steps]
         fits = steps[(left > 0.0) & (left < self.before_end_m) & (speed[steps] > 4.0)]
         return (int(rng.choice(fits)) if len(fits) else None), side
 
-    def _beside(
-        self, scene: Scene, station: np.ndarray, start: float, finish: float, side: int
+    def _adjacent_lane(
+        self, view: EgoView, station: np.ndarray, start: float, finish: float, side: int
     ) -> tuple[float, Bool[np.ndarray, " time"]] | None:
-        """Lateral offset of the actor's lane, and the steps at which that lane exists next to ego's; None without one."""
+        """Lateral offset of the actor's lane, and the steps at which it exists next to ego's; None without one."""
         low = max(0.0, float(station.min()))
         places = np.arange(finish, low - _EVERY_M, -_EVERY_M).clip(min=0.0)
         lane = -1
         reach = finish
-        lanes = scene.roles.network.lanes
+        lanes = view.roles.network.lanes
         for place in places.tolist():
-            neighbour = scene.neighbour(place, side)
+            neighbour = view.neighbour(place, side)
             if neighbour < 0:
                 break
             reach = place
@@ -151,11 +151,11 @@ class CutIn:
         if self.late_merge:
             if not (lanes[lane].ends or lanes[lane].exit_only):
                 return None
-            end, _ = scene.track.projected(lanes[lane].curve.xy[-1:])
+            end, _ = view.track.project(lanes[lane].curve.xy[-1:])
             if not finish <= float(end[0]) <= finish + self.before_end_m:
                 return None
-        here = scene.track.place(start)[0]
-        apart = float(np.min(np.hypot(*(lanes[scene.neighbour(start, side)].curve.xy - here).T)))
+        here = view.track.place(start)[0]
+        apart = float(np.min(np.hypot(*(lanes[view.neighbour(start, side)].curve.xy - here).T)))
         aside = max(apart, STEP_M)
         if not 2.3 < aside < 5.0:
             return None
