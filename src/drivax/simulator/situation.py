@@ -22,7 +22,7 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
     project_on_route,
 )
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import (
     STOPPED_MPS,
@@ -132,12 +132,12 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     return Surroundings(frame, lanes, project_on_route(bank, context.index, me[:2], context.route_m, ahead_m))
 
 
-def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Float[Array, ""]:
+def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Height of the ground under the driven agent, m."""
     return frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
 
 
-def _moved(context: AgentContext) -> Float[Array, ""]:
+def _moved(context: AgentContext) -> Scalar:
     """Distance that the driven agent moved in the last step, m."""
     return norm(context.history[-1, :2] - context.history[-2, :2])
 
@@ -145,7 +145,7 @@ def _moved(context: AgentContext) -> Float[Array, ""]:
 def _touch(
     context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
     reads: frozenset[str],
-) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
+) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
     """Return contact codes, whether a new contact is at fault, its type, and time to collision.
 
     Values that ``reads`` does not need are zero; without any of them codes stay unchanged.
@@ -208,8 +208,8 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
 
 
 def _off_the_road(
-    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""], lanes: LaneHits
-) -> tuple[Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: LaneHits
+) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
     """How far a box's worst corner is off the road (m), whether it left the map, or only the road."""
     beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
     left_map = left_the_map(bank, index, me[:2])
@@ -220,7 +220,7 @@ def _speed(frame: Frame) -> Float[Array, " S"]:
     return norm(frame.velocity)
 
 
-def _rates(history: Float[Array, "16 4"]) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _rates(history: Float[Array, "16 4"]) -> tuple[Scalar, Scalar, Scalar]:
     """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
@@ -23,7 +23,7 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
     project_on_route,
 )
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.traffic.log import alone, frame_of, logged_history
@@ -44,9 +44,9 @@ class Start(Protocol):
     """Motion of the driven agent before the first step of an episode."""
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
         """Return the motions of the 16 steps up to ``step``, and the arc length along the route at ``step``.
 
         ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
@@ -59,9 +59,9 @@ class LogStart:
     """Start as logged."""
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Any = None, key: Any = None,
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
         """Return the logged motion; needs no key."""
         return logged_history(bank, index, step, slot), bank.log_progress[index, step]
 
@@ -94,9 +94,9 @@ class NoisyStart:
             raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
+    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
         """Return the first acceptable of ``tries`` draws.
 
         Raises:
@@ -123,7 +123,7 @@ class NoisyStart:
         along_m = project_on_route(bank, index, history[-1, :2], near_m).along_m
         return history, jnp.where(good.any(), jnp.maximum(along_m, near_m), logged_m)
 
-    def draw(self, key: Array, speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def draw(self, key: Array, speed: Scalar) -> tuple[Scalar, Scalar]:
         """Draw an acceleration (m/s2) and a curvature (1/m) for a speed."""
         keys = jax.random.split(key, 4)
         strong = jax.random.bernoulli(keys[0], self.strong)
@@ -136,11 +136,7 @@ class NoisyStart:
         return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
 
     def _driven(
-        self,
-        history: Float[Array, "16 4"],
-        count: Int[Array, ""],
-        acceleration: Float[Array, ""],
-        curvature: Float[Array, ""],
+        self, history: Float[Array, "16 4"], count: Integer, acceleration: Scalar, curvature: Scalar
     ) -> Float[Array, "16 4"]:
         """Return a history after ``count`` steps of one action."""
 
@@ -153,9 +149,9 @@ class NoisyStart:
 
 def _acceptable(
     bank: ScenarioBank,
-    index: Int[Array, ""],
-    step: Int[Array, ""],
-    slot: Int[Array, ""],
+    index: Integer,
+    step: Integer,
+    slot: Integer,
     agents: Float[Array, "A 8"],
     history: Float[Array, "16 4"],
 ) -> Bool[Array, ""]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.planners.pdm.forecast import Forecast, fault_times, until_overlap
 from drivax.planners.planner import Planner
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import overlaps
@@ -48,17 +48,13 @@ class BrakeConfig:
     slow_mps: float = 0.2
 
 
-def is_emergency(
-    fault_s: Float[Array, ""], speed: Float[Array, ""], config: BrakeConfig = BrakeConfig()
-) -> Bool[Array, ""]:
+def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
     """Whether to brake; ``fault_s`` is the time to an at-fault collision (infinite for none), ``speed`` in m/s."""
     # Times are multiples of a step in float32.
     return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
 
 
-def braking(
-    speed: Float[Array, ""], acceleration: Float[Array, ""], config: BrakeConfig = BrakeConfig()
-) -> Float[Array, ""]:
+def braking(speed: Scalar, acceleration: Scalar, config: BrakeConfig = BrakeConfig()) -> Scalar:
     """Acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped."""
     (p, d), (slow_p, slow_d) = config.gains, config.slow_gains
     unclipped = jnp.where(

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, time_to_overlap
 from drivax.geometry.vectors import norm
 from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.scenario_bank import Integer, Vector
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import classify_contacts
@@ -38,7 +39,7 @@ class Forecast:
 
     @classmethod
     def of(
-        cls, frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
+        cls, frame: Frame, slot: Integer, ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
         most: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
         """Select the agents that come nearest to a path within five seconds.
@@ -72,7 +73,7 @@ class Forecast:
         return jnp.stack([*moved, *same], axis=-1)
 
 
-def boxes_of(motion: Float[Array, "*T 4"], size: Float[Array, " 2"]) -> Float[Array, "*T 6"]:
+def boxes_of(motion: Float[Array, "*T 4"], size: Vector) -> Float[Array, "*T 6"]:
     """Boxes of one size at motions (x, y, heading, speed)."""
     heading = motion[..., MOTION_HEADING]
     length, width = (jnp.broadcast_to(part, heading.shape) for part in size)
@@ -81,7 +82,7 @@ def boxes_of(motion: Float[Array, "*T 4"], size: Float[Array, " 2"]) -> Float[Ar
 
 
 def until_overlap(
-    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, horizon_s: float
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float
 ) -> Float[Array, "T K"]:
     """Time from each step of a motion until ego overlaps each agent at constant velocities, s.
 
@@ -95,7 +96,7 @@ def until_overlap(
 
 
 def fault_times(
-    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
     unlawful: Bool[Array, " T"],
 ) -> Float[Array, " K"]:  # fmt: skip
     """Time of the first at-fault collision with each agent, s; infinite for none.

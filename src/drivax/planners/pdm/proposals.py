@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, SIN, gap, overlap
 from drivax.geometry.vectors import norm
@@ -14,7 +14,7 @@ from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.tracking import Reference
 from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
@@ -47,12 +47,12 @@ class Lines:
 
     points: Float[Array, "P M 7"]
     route: Float[Array, "R 7"]
-    left_m: Float[Array, ""]
-    limit: Float[Array, ""]
+    left_m: Scalar
+    limit: Scalar
 
     @classmethod
     def along_route(
-        cls, bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""],
+        cls, bank: ScenarioBank, index: Integer, along_m: Scalar,
         offsets_m: tuple[float, ...], me: Float[Array, " 6"],
     ) -> Lines:  # fmt: skip
         """Build lines at lateral offsets from the route, straight ahead of ego where there is no route.
@@ -101,7 +101,7 @@ class Lines:
         flat = xy.reshape(-1, 2)
         return project(self.route, there, offsets, flat, jnp.ones_like(flat))[0].reshape(xy.shape[:-1])
 
-    def pieces(self, width: Float[Array, ""]) -> Float[Array, "P C 6"]:
+    def pieces(self, width: Scalar) -> Float[Array, "P C 6"]:
         """Corridors of a width along the lines, as boxes."""
         first, last = self.points[:, :-1:_PIECE_M], self.points[:, _PIECE_M::_PIECE_M]
         count = min(first.shape[1], last.shape[1])
@@ -171,8 +171,8 @@ class Proposals:
 
 
 def unroll_idm(
-    lines: Lines, others: Forecast, size: Float[Array, " 2"], speed: Float[Array, ""],
-    desired: Float[Array, " F"], stop_m: Float[Array, ""], driver: tuple[IdmParameters, int, int],
+    lines: Lines, others: Forecast, size: Vector, speed: Scalar,
+    desired: Float[Array, " F"], stop_m: Scalar, driver: tuple[IdmParameters, int, int],
 ) -> Proposals:  # fmt: skip
     """Simulate IDM along every line by Euler steps of 0.1 s.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import LENGTH, corners
 from drivax.geometry.vectors import norm, wrap
@@ -24,7 +24,7 @@ from drivax.metrics.comfort import (
 )
 from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind, Flag
 from drivax.simulator.contact import REAR_AXLE
@@ -95,11 +95,7 @@ class ProposalMetrics:
 
 
 def ground_at(
-    bank: ScenarioBank,
-    index: Int[Array, ""],
-    box: Float[Array, " 6"],
-    z: Float[Array, ""],
-    on_route: Bool[Array, ""],
+    bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
 ) -> Ground:
     """Return the position of a box relative to lanes and road.
 
@@ -119,7 +115,7 @@ def ground_at(
 
 
 def ground_along(
-    bank: ScenarioBank, index: Int[Array, ""], motion: Float[Array, "N T 4"], size: Float[Array, " 2"],
+    bank: ScenarioBank, index: Integer, motion: Float[Array, "N T 4"], size: Vector,
     z: Float[Array, "N T"], on_route: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
     """Return :func:`ground_at` along N motions from one pose; each step uses the next look-up.
@@ -150,8 +146,8 @@ def ground_along(
 
 
 def evaluate_proposal(
-    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""], size: Float[Array, " 2"],
-    others: Forecast, ground: Ground, progress_m: Float[Array, ""], config: ScoringConfig,
+    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar, size: Vector,
+    others: Forecast, ground: Ground, progress_m: Scalar, config: ScoringConfig,
 ) -> ProposalMetrics:  # fmt: skip
     """Evaluate one proposal.
 
@@ -198,9 +194,7 @@ def scores(metrics: ProposalMetrics, config: ScoringConfig) -> Float[Array, " N"
     return gates * mean
 
 
-def _direction(
-    motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig
-) -> Float[Array, ""]:
+def _direction(motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig) -> Scalar:
     """Gate of wrong-way driving: 1, 1/2 or 0 by the longest continuous distance astray."""
     steps = norm(jnp.diff(motion[:, :2], axis=0)) * astray[1:]
     whole = jnp.cumsum(steps)
@@ -212,7 +206,7 @@ def _direction(
 
 
 def _foreseen(
-    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
     config: ScoringConfig,
 ) -> Bool[Array, ""]:  # fmt: skip
     """Whether some step has a short time to collision with an agent that is not behind ego.
@@ -234,7 +228,7 @@ def _foreseen(
 
 
 def is_comfortable(
-    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""]
+    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar
 ) -> Bool[Array, ""]:
     """Whether a motion keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``.
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 from drivax.simulator.dynamics import bicycle
@@ -82,9 +83,7 @@ class Reference:
     curvature: Float[Array, "*batch T"]
 
 
-def acceleration_to(
-    speed: Float[Array, ""], desired: Float[Array, ""], config: TrackingConfig
-) -> Float[Array, ""]:
+def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> Scalar:
     """Acceleration that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a``, m/s2.
 
     Args:
@@ -100,9 +99,9 @@ def steering_rate(
     error: tuple[Array, Array, Array],
     speeds: Float[Array, " N"],
     curvatures: Float[Array, " N"],
-    wheelbase: Float[Array, ""],
+    wheelbase: Scalar,
     config: TrackingConfig,
-) -> Float[Array, ""]:
+) -> Scalar:
     """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
 
     x is (lateral error e, heading error h, steering angle d), and per step
@@ -128,9 +127,7 @@ def steering_rate(
     return -(q_e * be * e + q_h * bh * h + q_d * bd * d) / gain
 
 
-def moved(
-    car: Car, acceleration: Array, rate: Array, wheelbase: Float[Array, ""], config: TrackingConfig
-) -> Car:
+def moved(car: Car, acceleration: Array, rate: Array, wheelbase: Scalar, config: TrackingConfig) -> Car:
     """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error."""
     share = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
     acceleration = car.acceleration + share[0] * (acceleration - car.acceleration)
@@ -140,7 +137,7 @@ def moved(
     return Car(motion, acceleration, steering)
 
 
-def track(car: Car, reference: Reference, wheelbase: Float[Array, ""], config: TrackingConfig) -> Car:
+def track(car: Car, reference: Reference, wheelbase: Scalar, config: TrackingConfig) -> Car:
     """Return the car at every step of a reference, the present one included."""
     last = reference.speed.shape[0] - 1
     ahead = np.minimum(np.arange(last)[:, None] + np.arange(config.horizon), last)
