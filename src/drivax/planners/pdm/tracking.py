@@ -1,8 +1,7 @@
-"""A car that tracks a trajectory: two one-step linear-quadratic regulators and a bicycle with lags.
+"""Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
-Source: nuPlan's planner simulation (its LQR tracker and kinematic bicycle), which PDM-Closed drives its proposals with.
-The car itself moves by ``simulator.dynamics.bicycle``, as every driven agent does, so that the first step of what is
-tracked in thought is what happens.
+Source: nuPlan's planner simulation (LQR tracker and kinematic bicycle), which PDM-Closed uses for its proposals. The
+car moves by ``simulator.dynamics.bicycle``, so the first step of a tracked proposal equals the simulator's.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """The tracker and the car; the defaults are nuPlan's.
+    """Tracker and vehicle model; defaults as in nuPlan.
 
     Attributes:
-        horizon: Steps over which the commands are held, and how far ahead errors are looked at.
-        speed_weight, acceleration_weight: Prices of a squared speed error and acceleration.
-        lateral_weight, heading_weight, steering_weight, rate_weight: Prices of a squared lateral error (m),
+        horizon: Steps for which commands are held and after which errors are measured.
+        speed_weight, acceleration_weight: Costs of squared speed error and acceleration.
+        lateral_weight, heading_weight, steering_weight, rate_weight: Costs of squared lateral error (m),
             heading error (rad), steering angle (rad) and steering rate (rad/s).
-        stopping_mps, stopping_gain: Below this speed a car that is to stand is stopped by this gain, 1/s, instead.
+        stopping_mps, stopping_gain: Below this speed a stopping car uses this gain, 1/s, instead.
         acceleration_lag_s, steering_lag_s: Time constants of the actuators.
         most_steering: Largest steering angle, rad.
-        wheelbase: As a share of the length (nuPlan's vehicle: 3.089 m of 5.176 m).
+        wheelbase: Relative to the length (nuPlan's vehicle: 3.089 m of 5.176 m).
     """
 
     horizon: int = 10
@@ -70,12 +69,12 @@ class Car:
 
 @record
 class Reference:
-    """What is tracked, at steps of 0.1 s from now on.
+    """Reference trajectory, at steps of 0.1 s from now on.
 
     Attributes:
         pose: x, y, cosine and sine of the heading.
         speed: m/s.
-        curvature: Of the path there, 1/m.
+        curvature: Of the path, 1/m.
     """
 
     pose: Float[Array, "*batch T 4"]
@@ -132,7 +131,7 @@ def steering_rate(
 def moved(
     car: Car, acceleration: Array, rate: Array, wheelbase: Float[Array, ""], config: TrackingConfig
 ) -> Car:
-    """The car one step after a command: each actuator goes ``dt / (dt + lag)`` of the way to what is asked for."""
+    """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error."""
     share = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
     acceleration = car.acceleration + share[0] * (acceleration - car.acceleration)
     steering = car.steering + share[1] * rate * DT_S
@@ -141,8 +140,8 @@ def moved(
     return Car(motion, acceleration, steering)
 
 
-def tracked(car: Car, reference: Reference, wheelbase: Float[Array, ""], config: TrackingConfig) -> Car:
-    """The car at every step of a reference, the present one included, as it tracks it."""
+def track(car: Car, reference: Reference, wheelbase: Float[Array, ""], config: TrackingConfig) -> Car:
+    """Return the car at every step of a reference, the present one included."""
     last = reference.speed.shape[0] - 1
     ahead = np.minimum(np.arange(last)[:, None] + np.arange(config.horizon), last)
     to_have = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]

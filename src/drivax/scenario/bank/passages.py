@@ -48,7 +48,7 @@ def lane_passage(
 ) -> Passage:  # fmt: skip
     """Return the passage of a step; ``z`` is the height of the ground, ``before`` the previous strand or -1."""
     lane, squared, side = aligned_lanes(bank, index, xy, heading, z)
-    codes = bank.lane_codes[index]
+    codes = bank.lane_strands[index]
     strand = jnp.where(lane >= 0, codes[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
     best = first_smallest(squared)
     own = jnp.where((strand == before) & (strand >= 0), squared, _FAR)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt, UInt32
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import RoadLayer, SizeColumn
-from drivax.scenario.bank.strands import corridor_lanes, lane_codes
+from drivax.scenario.bank.strands import corridor_lanes, lane_strands
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
     EDGE_KINDS,
@@ -157,7 +157,7 @@ class ScenarioBank:
         light_line: Stop lines, :class:`LightRow`.
         edges: Road-edge segments (drivable side on the left) sorted by grid cell, :class:`EdgeRow`.
         lanes: Car-lane segments sorted by grid cell, :class:`LaneRow`.
-        lane_codes: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
+        lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
@@ -183,7 +183,7 @@ class ScenarioBank:
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
     lanes: Float[Array, "N 8 C"]
-    lane_codes: Float[Array, "N G 6"]
+    lane_strands: Float[Array, "N G 6"]
     grid_edge: Int[Array, "N cells1"]
     grid_lane: Int[Array, "N cells1"]
     grid_side: Int[Array, "N cells"]
@@ -430,7 +430,7 @@ def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.nda
     return {
         "edges": edges,
         "lanes": lanes,
-        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, : sizes.graphs],
+        "lane_strands": np.stack([lane_strands(scenario) for scenario in scenarios])[:, : sizes.graphs],
         "grid_edge": _column(scenarios, "grid_edge").astype(np.int16),
         "grid_lane": (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16),
         "grid_side": _column(scenarios, "grid_side"),
