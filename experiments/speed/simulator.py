@@ -139,11 +139,11 @@ def step_compiled(bank: ScenarioBank, task: Task, traffic: str) -> float:
     simulator, batch = Simulator(task, make_traffic(traffic)), 64
 
     def one(bank: ScenarioBank, state: Any, action: Any, over: Any, fresh: Any) -> Any:
-        after, transition = simulator.step_or_begin(bank, state, action, over, fresh)
+        after, transition = simulator.step_or_reset(bank, state, action, over, fresh)
         return transition, simulator.observe(bank, after.context)
 
     def step(bank: ScenarioBank, states: Any, actions: Any, over: Any, index: Any) -> Any:
-        fresh = map_where(over, partial(simulator.beginning, bank), index)
+        fresh = map_where(over, partial(simulator.new_episode, bank), index)
         return jax.vmap(one, in_axes=(None, 0, 0, 0, 0))(bank, states, actions, over, fresh)
 
     states = jax.eval_shape(jax.vmap(simulator.reset, in_axes=(None, 0)), bank, jnp.zeros(batch, jnp.int32))

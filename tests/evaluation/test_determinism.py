@@ -90,8 +90,8 @@ def test_automatic_resets_change_no_episode(world):
     def or_begin(bank, states, over, following):
         def one(state, over, row):
             taken = action(state.context)
-            after, transition = simulator.step_or_begin(
-                bank, state, taken, over, simulator.beginning(bank, row, LATE)
+            after, transition = simulator.step_or_reset(
+                bank, state, taken, over, simulator.new_episode(bank, row, LATE)
             )
             return after, transition.terminated | transition.truncated, episode_metrics(bank, after)
 

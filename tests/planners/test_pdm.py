@@ -16,7 +16,7 @@ from drivax.evaluation.runner import evaluate
 from drivax.planners.pdm.brake import BrakeConfig, EmergencyBrake, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.planner import PUBLISHED_DRIVER, PdmConfig, PdmPlanner
-from drivax.planners.pdm.proposals import LINE_BEND, LINE_PLACE, Lines, unrolled
+from drivax.planners.pdm.proposals import LINE_BEND, LINE_PLACE, Lines, unroll_idm
 from drivax.planners.pdm.scoring import ScoringConfig
 from drivax.planners.simple import ConstantVelocity
 from drivax.scenario.bank.scenario_bank import ScenarioBank
@@ -40,8 +40,8 @@ DT, THOUGHT = 0.1, []
 class Watched(PdmPlanner):
     """PDM that tells what it thought of its proposals."""
 
-    def weigh(self, carry, bank, situation):
-        THOUGHT.append(PdmPlanner.weigh(self, carry, bank, situation))
+    def score_proposals(self, carry, bank, situation):
+        THOUGHT.append(PdmPlanner.score_proposals(self, carry, bank, situation))
         return THOUGHT[-1]
 
 
@@ -164,7 +164,7 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
         first = lines.points[0, 0, 0]
         moved = replace(others, box=others.box.at[:, 0].add(first))
         wanted, driver = jnp.asarray(fractions, jnp.float32), (PUBLISHED_DRIVER, 40, 2)
-        return unrolled(lines, moved, me[4:], jnp.asarray(8.0), wanted, stop, driver)
+        return unroll_idm(lines, moved, me[4:], jnp.asarray(8.0), wanted, stop, driver)
 
     found = quick(proposals, bank, others, jnp.asarray(stop, jnp.float32))
     braked = False
@@ -181,10 +181,10 @@ def test_idm_is_unrolled_as_in_double_precision(stop):
 
 
 def test_on_a_free_road_the_fastest_proposal_in_the_middle_wins():
-    action, after, weighed = decide(straight_road([car(0, 0, 0, 9)]))
-    assert weighed.cars.motion.shape == (15, 41, 4)
-    assert int(np.argmax(weighed.score)) == 4 and weighed.score[4] == pytest.approx(1.0)
-    assert (weighed.judgement.road[:5] == 1.0).all() and (weighed.judgement.direction == 1.0).all()
+    action, after, scored = decide(straight_road([car(0, 0, 0, 9)]))
+    assert scored.cars.motion.shape == (15, 41, 4)
+    assert int(np.argmax(scored.score)) == 4 and scored.score[4] == pytest.approx(1.0)
+    assert (scored.metrics.road[:5] == 1.0).all() and (scored.metrics.direction == 1.0).all()
     # IDM is at 13.4 m/s (1 - v^10 ...) after a second: 9 + 1.5 (1 - small); the regulator asks 10/11 of it, the lag
     # passes on a third.
     assert 0.3 < action[0] * 6.0 < 0.5 and action[1] == pytest.approx(0.0, abs=1e-4)
@@ -192,9 +192,9 @@ def test_on_a_free_road_the_fastest_proposal_in_the_middle_wins():
 
 
 def test_pdm_follows_a_slower_leader_without_a_collision():
-    action, _, weighed = decide(straight_road([car(0, 0, 0, 10), car(18, 0, 0, 5)]))
-    best = int(np.argmax(weighed.score))
-    assert action[0] < -0.05 and weighed.judgement.collision[best] == 1.0
+    action, _, scored = decide(straight_road([car(0, 0, 0, 10), car(18, 0, 0, 5)]))
+    best = int(np.argmax(scored.score))
+    assert action[0] < -0.05 and scored.metrics.collision[best] == 1.0
 
 
 def test_pdm_stops_for_red_and_not_for_green():
@@ -207,16 +207,16 @@ def test_pdm_stops_for_red_and_not_for_green():
 def test_pdm_passes_obstacles_that_reach_slightly_into_the_lane():
     """A box that reaches 0.45 m into the middle line's corridor leaves room a metre to the left."""
     box = partial(car, length=1.0, width=1.0, kind=AgentKind.OTHER)
-    action, _, weighed = decide(straight_road([car(0, 0, 0, 10), box(30, -1.05, 0, 0)]))
-    best = int(np.argmax(weighed.score))
+    action, _, scored = decide(straight_road([car(0, 0, 0, 10), box(30, -1.05, 0, 0)]))
+    best = int(np.argmax(scored.score))
     assert best // 5 == 2 and action[1] > 0.0
 
 
 def test_emergency_brake_applies_when_no_proposal_is_safe():
     """1.2 m before a car that stands, at 4 m/s: IDM brakes with 3 m/s2 and the car lags."""
-    action, after, weighed = decide(straight_road([car(0, 0, 0, 4), car(6.0, 0, 0, 0)]))
-    best = int(np.argmax(weighed.score))
-    assert weighed.judgement.fault_s[best] <= 2.0
+    action, after, scored = decide(straight_road([car(0, 0, 0, 4), car(6.0, 0, 0, 0)]))
+    best = int(np.argmax(scored.score))
+    assert scored.metrics.fault_s[best] <= 2.0
     assert action[0] * 6.0 == pytest.approx(-4.05) and action[1] == 0.0
     assert after.acceleration == pytest.approx(-4.05)
     # Faster cars are not braked by it: at 8 m/s the same distance is left to IDM.
@@ -242,10 +242,10 @@ def test_pdm_does_not_read_the_future():
 
 def test_pdm_is_invariant_to_rotation_shift_and_padding_values():
     recording = straight_road([car(0, 0, 0, 10), car(24, 0.5, 0, 6), PERSON(40, -4, np.pi / 2, 1.0)])
-    action, _, weighed = decide(recording)
+    action, _, scored = decide(recording)
     turned, _, other = decide(moved(recording, 0.7, 1000.0, -500.0))
     assert turned == pytest.approx(action, abs=5e-3)
-    np.testing.assert_allclose(other.score, weighed.score, atol=0.01)
+    np.testing.assert_allclose(other.score, scored.score, atol=0.01)
     filled = considering(scattered(bank_of(recording)))
     np.testing.assert_allclose(filled[0], action, atol=1e-6)
 

@@ -11,13 +11,13 @@ from scipy.signal import savgol_filter
 from drivax.planners.pdm.forecast import Forecast, fault_times, until_overlap
 from drivax.planners.pdm.scoring import (
     Ground,
-    Judgement,
+    ProposalMetrics,
     ScoringConfig,
     _direction,
+    evaluate_proposal,
+    ground_along,
     ground_at,
-    grounds,
     is_comfortable,
-    judged,
     scores,
 )
 from drivax.scenario.schema import AgentKind
@@ -45,11 +45,11 @@ def others(*rows):
 
 
 @pytest.fixture(scope="module")
-def judge():
+def evaluate():
     def one(motion, others, several):
         ground = Ground(several, jnp.zeros(41, bool), jnp.zeros(41, bool))
         still = jnp.zeros(41), jnp.zeros(())
-        return judged(motion, *still, SIZE, others, ground, motion[-1, 0], CONFIG)
+        return evaluate_proposal(motion, *still, SIZE, others, ground, motion[-1, 0], CONFIG)
 
     run = jax.jit(one)
     return lambda motion, others, several=False: jax.device_get(
@@ -57,42 +57,42 @@ def judge():
     )
 
 
-def test_a_collision_ahead_is_ego_s_fault_when_it_begins(judge):
+def test_a_collision_ahead_is_ego_s_fault_when_it_begins(evaluate):
     """10 m/s, a car that stands 20 m ahead: 15.2 m between bumpers, overlap first at 1.6 s."""
-    found = judge(straight(10.0), others((20, 0, 0, 0, AgentKind.VEHICLE)))
+    found = evaluate(straight(10.0), others((20, 0, 0, 0, AgentKind.VEHICLE)))
     assert found.collision == 0.0 and found.fault_s == pytest.approx(1.6)
-    beside = judge(straight(10.0), others((20, 2.1, 0, 0, AgentKind.VEHICLE)))
+    beside = evaluate(straight(10.0), others((20, 2.1, 0, 0, AgentKind.VEHICLE)))
     assert beside.collision == 1.0 and np.isinf(beside.fault_s)
 
 
-def test_hitting_objects_costs_half_and_people_or_vehicles_all(judge):
+def test_hitting_objects_costs_half_and_people_or_vehicles_all(evaluate):
     for kind, gate in (
         (AgentKind.PEDESTRIAN, 0.0), (AgentKind.CYCLIST, 0.0), (AgentKind.OTHER, 0.5), (AgentKind.STATIC, 0.5)
     ):  # fmt: skip
-        assert judge(straight(10.0), others((20, 0, 0, 0, kind))).collision == gate
+        assert evaluate(straight(10.0), others((20, 0, 0, 0, kind))).collision == gate
     both = others((20, 0, 0, 0, AgentKind.STATIC), (30, 0, 0, 0, AgentKind.VEHICLE))
-    assert judge(straight(10.0), both).collision == 0.0
+    assert evaluate(straight(10.0), both).collision == 0.0
 
 
-def test_ego_hit_from_behind_or_standing_is_not_at_fault(judge):
+def test_ego_hit_from_behind_or_standing_is_not_at_fault(evaluate):
     rear = others((-12, 0, 0, 10, AgentKind.VEHICLE))
-    assert judge(straight(5.0), rear).collision == 1.0
+    assert evaluate(straight(5.0), rear).collision == 1.0
     front = others((12, 0, np.pi, 10, AgentKind.VEHICLE))
-    assert judge(straight(0.0), front).collision == 1.0
+    assert evaluate(straight(0.0), front).collision == 1.0
     # Hit in the side: only somebody who is in several lanes is at fault; that contact decides, whatever comes later.
     side = others((2, -12, np.pi / 2, 8, AgentKind.VEHICLE))
-    assert judge(straight(1.0), side).collision == 1.0
-    assert judge(straight(1.0), side, several=True).collision == 0.0
+    assert evaluate(straight(1.0), side).collision == 1.0
+    assert evaluate(straight(1.0), side, several=True).collision == 0.0
 
 
-def test_a_collision_is_foreseen_for_nine_tenths_of_a_second(judge):
+def test_a_collision_is_foreseen_for_nine_tenths_of_a_second(evaluate):
     """5 m/s for 4 s is 20 m; bumpers are 2.4 m from centres; in 0.9 s ego would come 4.5 m further."""
     for gap, kept in ((20 + 4.4, 0.0), (20 + 4.6, 1.0)):
-        found = judge(straight(5.0), others((gap + 4.8, 0, 0, 0, AgentKind.VEHICLE)))
+        found = evaluate(straight(5.0), others((gap + 4.8, 0, 0, 0, AgentKind.VEHICLE)))
         assert (found.ttc, found.collision) == (kept, 1.0)
     # Nothing is foreseen while standing, and nobody who comes from behind counts.
-    assert judge(straight(0.0), others((9, 0, np.pi, 2, AgentKind.VEHICLE))).ttc == 1.0
-    assert judge(straight(5.0), others((-9, 0, 0, 6, AgentKind.VEHICLE))).ttc == 1.0
+    assert evaluate(straight(0.0), others((9, 0, np.pi, 2, AgentKind.VEHICLE))).ttc == 1.0
+    assert evaluate(straight(5.0), others((-9, 0, 0, 6, AgentKind.VEHICLE))).ttc == 1.0
 
 
 def test_wrong_way_driving_costs_half_or_all():
@@ -144,14 +144,14 @@ def test_scores_equal_hand_computation():
         "collision": [1.0, 1.0, 0.0], "road": [1.0, 1.0, 1.0], "direction": [1.0, 0.5, 1.0],
         "progress_m": [8.0, 20.0, 40.0], "ttc": [1.0, 0.0, 1.0], "comfort": [0.0, 1.0, 1.0],
     }  # fmt: skip
-    judgement = Judgement(
+    metrics = ProposalMetrics(
         **{name: jnp.asarray(part) for name, part in parts.items()}, fault_s=jnp.full(3, jnp.inf)
     )
     expected = [(5 * 0.8 + 5 + 0) / 12, 0.5 * (5 * 1.0 + 0 + 2) / 12, 0.0]
-    assert np.asarray(scores(judgement, CONFIG)) == pytest.approx(expected)
+    assert np.asarray(scores(metrics, CONFIG)) == pytest.approx(expected)
     # Where nobody gets anywhere, all that are allowed have made the most of it.
     parts["progress_m"] = [0.05, 0.0, 9.0]
-    still = Judgement(
+    still = ProposalMetrics(
         **{name: jnp.asarray(part) for name, part in parts.items()}, fault_s=jnp.full(3, jnp.inf)
     )
     assert np.asarray(scores(still, CONFIG)) == pytest.approx([10 / 12, 0.5 * 7 / 12, 0.0])
@@ -178,7 +178,7 @@ def test_ground_is_looked_up_ahead_of_each_step():
     drift = np.stack([10 * T, -0.5 * T, 0 * T, np.full(41, 10.0)], 1)
     motion = jnp.asarray(np.stack([np.asarray(straight(10.0)), drift]), jnp.float32)
     z, there = jnp.zeros((2, 41)), jnp.ones((2, 41), bool)
-    found = quick(lambda b, m: grounds(b, jnp.asarray(0), m, SIZE, z, there, 5), bank, motion)
+    found = quick(lambda b, m: ground_along(b, jnp.asarray(0), m, SIZE, z, there, 5), bank, motion)
     # 1.15 m aside is the limit, after 2.3 s; the look-up at 2.5 s stands for 2.1 s to 2.5 s.
     assert not found.off[0].any() and found.off[1].tolist() == [False] * 21 + [True] * 20
 

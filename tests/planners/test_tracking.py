@@ -16,7 +16,7 @@ from drivax.planners.pdm.tracking import (
     acceleration_to,
     moved,
     steering_rate,
-    tracked,
+    track,
 )
 from drivax.simulator.dynamics import bicycle
 from quick import quick
@@ -141,7 +141,7 @@ def drives():
     begin = np.array([[0.0, 1.0, 0.0, 10.0], [0.0, 0.0, 0.0, 5.0], [0.0, 0.0, 0.0, 6.0]])
 
     def all_of(begin, *parts):
-        one = lambda m, r: tracked(Car(m, jnp.zeros(()), jnp.zeros(())), r, jnp.asarray(WHEELBASE), CONFIG)  # noqa: E731
+        one = lambda m, r: track(Car(m, jnp.zeros(()), jnp.zeros(())), r, jnp.asarray(WHEELBASE), CONFIG)  # noqa: E731
         return jax.vmap(one)(begin, Reference(*parts))
 
     cars = quick(all_of, *(jnp.asarray(part, jnp.float32) for part in (begin, pose, speed, bend)))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivax.scenario.bank.strands import NOWHERE_M, lane_codes
+from drivax.scenario.bank.strands import NOWHERE_M, lane_strands
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.schema import CAPACITIES
 
@@ -21,7 +21,7 @@ def codes(*features, path=None):
     tracks = make_tracks([driving() if path is None else path])
     scenario = assemble(make_recording(features, tracks), SMALL)
     assert not scenario.overflow
-    table, ids = lane_codes(scenario), scenario.lane_id
+    table, ids = lane_strands(scenario), scenario.lane_id
     used = scenario.lane_length > 0
     assert (table[~used] == [-1, -1, -1, -1, NOWHERE_M, NOWHERE_M]).all()
     named = {}

@@ -66,7 +66,7 @@ def test_a_step_costs_at_most_in_proportion_to_agents(bank, plain):
 @pytest.mark.slow
 def test_operation_count_detects_pairwise_agent_work(bank):
     class Pairs(Simulator):
-        def observe(self, bank, context, cast=None):
+        def observe(self, bank, context, driven=None):
             xy = bank.agents[context.index, context.step, :, :2]
             return {"apart": jnp.sum((xy[:, None] - xy) ** 2)}
 

@@ -111,8 +111,8 @@ def _step_all(
 ) -> tuple[SimState, dict[str, Array], tuple[Array, Array, Array]]:  # fmt: skip
     """Step a batch; where an episode ``begins``, the scenario of ``rows`` starts instead with reward 0."""
     begins = jnp.asarray(begins)
-    fresh = map_where(begins, partial(simulator.beginning, bank), jnp.asarray(rows))
-    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0))
+    fresh = map_where(begins, partial(simulator.new_episode, bank), jnp.asarray(rows))
+    step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0))
     states, transition = step(bank, states, jnp.asarray(actions), begins, fresh)
     reward = jnp.where(begins, 0.0, transition.reward)
     seen = jax.vmap(partial(_observe, simulator, bank))(states)

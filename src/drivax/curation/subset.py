@@ -56,7 +56,7 @@ def subset_of_table(table: ScoreTable, indices: Sequence[int], subset: ScenarioS
     Args:
         table: Scores of the whole set.
         indices: Scenarios of the whole set, in the order of the subset.
-        subset: The subset, as :func:`~drivax.datasets.export.subset.write_part` writes it.
+        subset: The subset, as :func:`~drivax.datasets.export.writer.write_part` writes it.
     """
     chosen = list(indices)
     source = subset.manifest["source"]["part_of"]

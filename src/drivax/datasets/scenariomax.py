@@ -1,6 +1,6 @@
 """Reader of ScenarioMax's tf.Examples in TFRecord files, the ones that V-Max reads.
 
-They have WOMD's layout (``womd_example``) with differences: the ego is row 0 and ids are renumbered from 0, padding
+They have WOMD's layout (``womd.tf_example``) with differences: the ego is row 0 and ids are renumbered from 0, padding
 looks like tracks, there are no times, speeds or courses, limits come with the map's points in mph, lights keep their
 slot and are UNKNOWN where nothing was known, and ten paths of the ego are included. Where the data came from (WOMD,
 nuPlan, nuScenes, ...) is not in the file.

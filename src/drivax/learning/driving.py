@@ -22,7 +22,7 @@ from drivax.scenario.schema import CURRENT_STEP, STEPS
 from drivax.simulator.simulator import Simulator
 from drivax.simulator.sparse import map_where
 from drivax.simulator.starts import LogStart
-from drivax.simulator.types import AgentContext, Beginning, Frame, SimState
+from drivax.simulator.types import AgentContext, EpisodeStart, Frame, SimState
 from drivax.tasks.actions import Discrete
 from drivax.tasks.task import Task
 
@@ -116,7 +116,7 @@ class Driving:
         count = now.over.shape[0]
         index, step, keys = _draw(data, key, count, self.earliest_start, self.latest_start)
         fresh = map_where(now.over, partial(self._beginning, data), index, step, keys)
-        step_all = jax.vmap(self.simulator.step_or_begin, (None, 0, 0, 0, 0, 0))
+        step_all = jax.vmap(self.simulator.step_or_reset, (None, 0, 0, 0, 0, 0))
         state, made = step_all(data, now.state, action, now.over, fresh, cache)
         over = made.terminated | made.truncated
         outcome = Outcome(
@@ -128,8 +128,8 @@ class Driving:
         )
         return Environments(state, over, self.observe_all(data, state.context)), outcome
 
-    def _beginning(self, data: ScenarioBank, index: Array, step: Array, key: Array) -> Beginning:
-        return self.simulator.beginning(data, index, step, 0, key)
+    def _beginning(self, data: ScenarioBank, index: Array, step: Array, key: Array) -> EpisodeStart:
+        return self.simulator.new_episode(data, index, step, 0, key)
 
     def demonstrations(
         self, data: ScenarioBank, key: Array, count: int

@@ -1,7 +1,7 @@
-"""Planners that are one function of the user's, in JAX or in plain Python.
+"""Planners defined by one user function, in JAX or in plain Python.
 
-A function takes the situation and the observation of one scenario and gives an action of the task's action space. What
-remembers something from step to step, or draws random numbers, is a class (``planners.planner.Planner``).
+A function maps the situation and observation of one scenario to an action of the task's action space. A planner with
+memory or random numbers is a class (``planners.planner.Planner``).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from drivax.simulator.types import SimState, Situation
 
 Drive = Callable[[Situation, Any], Any]
 
-#: Who gathers what functions raise, the last one first.
+#: Active collectors of errors; the last one receives them.
 _listeners: list[dict[tuple[int, int], str]] = []
 
 
 @record
 class FunctionPlanner(Memoryless):
-    """Drives by a function; :func:`jax_planner` and :func:`python_planner` make one.
+    """Drive by a function; created by :func:`jax_planner` and :func:`python_planner`.
 
     Attributes:
         function: ``(situation, observation) -> action``.
-        in_python: Whether it is called outside the compiled program, with numpy arrays.
+        in_python: Whether to call it outside the compiled program, with numpy arrays.
     """
 
     function: Drive = static()
@@ -44,7 +44,7 @@ class FunctionPlanner(Memoryless):
 
     @property
     def name(self) -> str:
-        """The function's name."""
+        """Name of the function."""
         return str(getattr(self.function, "__name__", type(self.function).__name__))
 
     def act(
@@ -56,10 +56,10 @@ class FunctionPlanner(Memoryless):
         observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
-        """What the function gives; not a number where it raised an error."""
+        """Return the function's action; NaN where it raised an error."""
         if not self.in_python:
             return jnp.asarray(self.function(situation, observation), jnp.float32), carry
-        # How traffic keeps its books is no concern of a driver.
+        # The traffic state is internal.
         seen = replace(situation, context=replace(situation.context, traffic=()))
         identity, size = bank.identity[state.context.index], state.context.action.shape
 
@@ -72,30 +72,27 @@ class FunctionPlanner(Memoryless):
 
 
 def jax_planner(function: Drive) -> FunctionPlanner:
-    """The planner that a JAX function makes; it becomes part of the compiled program (``jnp.where`` instead of ``if``).
+    """Create a planner from a JAX function ``(situation, observation) -> action``.
 
-    Args:
-        function: ``(situation, observation) -> action``.
+    It becomes part of the compiled program: use ``jnp.where`` instead of ``if``.
     """
     return FunctionPlanner(function)
 
 
 def python_planner(function: Drive) -> FunctionPlanner:
-    """The planner that a Python function makes; it is called scenario by scenario, step by step, with numpy arrays.
+    """Create a planner from a Python function ``(situation, observation) -> action``.
 
-    An error that it raises is an episode that failed (``evaluation.runner``). It must not call JAX, which waits for it.
-
-    Args:
-        function: ``(situation, observation) -> action``.
+    It is called scenario by scenario and step by step with numpy arrays. An error that it raises fails the episode
+    (``evaluation.runner``). It must not call JAX, which waits for it.
     """
     return FunctionPlanner(function, in_python=True)
 
 
 @contextmanager
 def raised() -> Iterator[dict[tuple[int, int], str]]:
-    """Gathers what Python functions raise while they drive, by the scenario's identity and the step of the log.
+    """Collect errors of Python functions, by the scenario's identity and the step of the log.
 
-    Outside of it, errors end the program that drives.
+    Outside of this context errors end the program.
     """
     _listeners.append({})
     try:
@@ -105,7 +102,7 @@ def raised() -> Iterator[dict[tuple[int, int], str]]:
 
 
 def _answers(function: Drive, identity: Any, seen: tuple[Any, ...], size: tuple[int, ...]) -> Any:
-    """The function's action for each scenario of a batch of any shape."""
+    """Return the function's action for each scenario of a batch of any shape."""
     actions, steps = np.full((*identity.shape, *size), np.nan, np.float32), seen[0].context.step
     for at in np.ndindex(identity.shape):
         try:
@@ -121,7 +118,7 @@ def _answers(function: Drive, identity: Any, seen: tuple[Any, ...], size: tuple[
 
 
 def _message(error: Exception) -> str:
-    """One line: what it is, and in which line of the function."""
+    """Format an error with its line in the user's function."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     theirs = [place for place in traceback.extract_tb(error.__traceback__) if place.filename != __file__]
     return f"{text} ({Path(theirs[0].filename).name}:{theirs[0].lineno})" if theirs else text

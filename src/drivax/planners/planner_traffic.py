@@ -1,4 +1,4 @@
-"""Traffic in which a planner drives some of the others: a trained policy against which another one is evaluated."""
+"""Traffic in which a planner drives some agents: a trained policy against which another one is evaluated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import HISTORY, AgentContext, Frame, SimState, Traffic
 from drivax.tasks.task import Task
 
-#: Who travels less than this in the rest of the log is left where it is, m.
+#: Vehicles that travel less than this in the rest of the log are not driven, m.
 _TRAVELS_M = 2.0
 
 
@@ -40,12 +40,12 @@ class TrafficPolicy(TrafficData):
 
 
 @record
-class Driven:
+class PlannerTrafficState:
     """State of the K agents that the planner drives.
 
     Attributes:
-        begin: Step at which the episode began; until then all agents moved as logged.
-        contexts: A context each; slots beyond the moving agents are empty.
+        begin: First step of the episode; until then all agents moved as logged.
+        contexts: One context per agent; slots beyond the moving agents are empty.
         base: State of the traffic around them.
     """
 
@@ -56,17 +56,17 @@ class Driven:
 
 @dataclass(frozen=True)
 class PlannerTraffic:
-    """The vehicles nearest to ego are driven by the planner of :func:`with_driver`, all others move by ``base``.
+    """Traffic whose vehicles nearest to ego are driven by the planner of :func:`with_driver`, others by ``base``.
 
-    Driven are vehicles that the log has when the episode begins and that travel more than 2 m in the rest of it. They
-    see all agents, drive by the task's dynamics to the end of the episode, and have no route, as
-    agents other than ego have none: a policy that is to drive them well is trained to follow lanes.
+    It drives vehicles that the log has when the episode starts and that travel more than 2 m in the rest of it. They
+    see all agents, follow the task's dynamics to the end of the episode, and have no route: train such a policy to
+    follow lanes.
 
     Attributes:
-        task: What the planner was made for: its observation and its action space.
-        count: How many vehicles are driven, at most.
-        base: Traffic of the others.
-        seed: Of what a planner draws, which depends on nothing else but scenario, step and agent.
+        task: Observation and action space of the planner.
+        count: Largest number of driven vehicles.
+        base: Traffic model of all other agents.
+        seed: Seed of the planner's draws, which otherwise depend on scenario, step and agent only.
     """
 
     task: Task = field(default_factory=Task)
@@ -76,15 +76,15 @@ class PlannerTraffic:
 
     @property
     def name(self) -> str:
-        """As printed in tables: ``driven``, or ``driven+idm``."""
+        """``driven``, or ``driven+idm``."""
         return "driven" if self.base.name == "log" else f"driven+{self.base.name}"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """The bank with what ``base`` needs."""
+        """Return the bank with the data of ``base``."""
         return prepare_bank(self.base, bank)
 
-    def start(self, bank: ScenarioBank, index: Any, step: Any) -> Driven:
-        """All agents where the log has them at ``step``.
+    def start(self, bank: ScenarioBank, index: Any, step: Any) -> PlannerTrafficState:
+        """Return the logged traffic state at ``step``.
 
         Raises:
             UsageError: The bank has no driver.
@@ -92,10 +92,10 @@ class PlannerTraffic:
         data_of(bank, TrafficPolicy, "use planners.planner_traffic.with_driver")
         simulator, slots = Simulator(self.task), self._slots(bank, index, step)
         contexts = jax.vmap(lambda slot: simulator.context(bank, index, step, slot))(slots)
-        return Driven(jnp.asarray(step, jnp.int32), contexts, self.base.start(bank, index, step))
+        return PlannerTrafficState(jnp.asarray(step, jnp.int32), contexts, self.base.start(bank, index, step))
 
-    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Driven:
-        """One step of 0.1 s: every agent looks at the present frame, then all move."""
+    def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> PlannerTrafficState:
+        """Advance all agents by one step of 0.1 s from the present frame."""
         now = context.traffic
 
         def frames(back: int) -> Frame:
@@ -122,10 +122,10 @@ class PlannerTraffic:
             return replace(situation.context, step=agent.step + 1, history=history, action=action)
 
         base = self.base.advance(bank, replace(context, traffic=now.base), frame)
-        return Driven(now.begin, jax.vmap(drive)(now.contexts), base)
+        return PlannerTrafficState(now.begin, jax.vmap(drive)(now.contexts), base)
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Rows of ``base``, with those of the driven vehicles since the episode began."""
+        """Return the rows of ``base`` with the driven vehicles at their simulated poses."""
         now = context.traffic
         rows = self.base.agents(bank, replace(context, traffic=now.base), back)
         x, y, heading, speed = jnp.moveaxis(now.contexts.history[:, HISTORY - 1 - back], -1, 0)
@@ -135,7 +135,7 @@ class PlannerTraffic:
         return rows.at[slot].set(jnp.stack(parts, axis=-1), mode="drop")
 
     def _slots(self, bank: ScenarioBank, index: Any, step: Any) -> Int[Array, " K"]:
-        """Slots of the vehicles that are driven, the nearest to ego first, padded with empty slots."""
+        """Slots of the driven vehicles, nearest to ego first, padded with empty slots."""
         rows = bank.agents[index]
         here = rows[step]
         moved = ((rows[..., AgentColumn.XY] - here[:, AgentColumn.XY]) ** 2).sum(axis=-1)
@@ -155,10 +155,10 @@ class PlannerTraffic:
 
 
 def with_driver(bank: ScenarioBank, driver: Planner) -> ScenarioBank:
-    """The bank with a planner that drives others than ego in :class:`PlannerTraffic`.
+    """Return the bank with the planner that drives agents in :class:`PlannerTraffic`.
 
     Raises:
-        UsageError: The planner carries something from step to step, or replays the log.
+        UsageError: The planner has memory, or replays the log.
     """
     if not isinstance(driver, Memoryless) or driver.replays:
         raise UsageError(

@@ -22,7 +22,7 @@ from drivax.simulator.together import is_driven
 from drivax.simulator.traffic.log import LogTraffic, alone, frame_of
 from drivax.simulator.types import (
     AgentContext,
-    Beginning,
+    EpisodeStart,
     Frame,
     SimState,
     Situation,
@@ -34,10 +34,10 @@ from drivax.simulator.types import (
 
 @dataclass(frozen=True)
 class Simulator:
-    """A task in a kind of traffic, with a kind of start. Holds configuration only; the rest is argument or result.
+    """Simulate a task with a traffic model and a start; holds configuration only.
 
-    Functions are unbatched; ``jax.vmap(simulator.step, in_axes=(None, 0, 0))`` steps a batch. ``step`` never resets;
-    :meth:`step_or_begin` is for collectors.
+    Functions are unbatched: ``jax.vmap(simulator.step, in_axes=(None, 0, 0))`` steps a batch. ``step`` never resets;
+    :meth:`step_or_reset` is for collectors.
     """
 
     task: Task
@@ -47,15 +47,15 @@ class Simulator:
     def reset(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> SimState:
-        """The state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws a start other than the log's."""
+        """Return the state of agent ``slot`` at ``step`` of scenario ``index``; ``key`` draws a noisy start."""
         context = self.context(bank, index, step, slot, key)
-        return self._begin(bank, context, alone(context))
+        return self._initial_state(bank, context, alone(context))
 
-    def _begin(self, bank: ScenarioBank, context: AgentContext, cast: AgentContext) -> SimState:
-        """The state in which an episode begins at a context."""
-        now = self.frame(bank, context, cast, 0)
-        # Overlaps at the start are ignored until they part, as if all agents had just appeared; so no fault is
-        # evaluated, for which alone a frame before this one would be needed.
+    def _initial_state(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext) -> SimState:
+        """Return the first state of an episode."""
+        now = self.frame(bank, context, driven, 0)
+        # Overlaps at the start are ignored until they separate, as if all agents had just appeared. No fault is
+        # classified, so no previous frame is needed.
         contacts = jnp.full(now.valid.shape, int(Contact.ABSENT), jnp.int8)
         lights = remember_lights(bank, context)
         situation, contacts, lights = measure(bank, context, now, now, contacts, lights, self.task.reads)
@@ -65,7 +65,7 @@ class Simulator:
     def context(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
     ) -> AgentContext:
-        """Return what an episode or a sample starts from; logged unless ``start`` says otherwise."""
+        """Return the context at a step: logged, or drawn by ``start``."""
         index, step, slot = (jnp.asarray(value, jnp.int32) for value in (index, step, slot))
         history, route_m = LogStart().begin(bank, index, step, slot)
         context = AgentContext(
@@ -85,62 +85,62 @@ class Simulator:
         action = self.task.first_action(history, bank.length_m(index, slot))
         return replace(context, history=history, route_m=route_m, action=action)
 
-    def beginning(
+    def new_episode(
         self, bank: ScenarioBank, index: Any, step: Any = CURRENT_STEP, slot: Any = 0, key: Any = None
-    ) -> Beginning:
-        """The :meth:`context` of an episode that begins, and what its motion so far implies about stop lines."""
+    ) -> EpisodeStart:
+        """Return the :meth:`context` of a new episode and its stop-line memory."""
         context = self.context(bank, index, step, slot, key)
-        return Beginning(context, remember_lights(bank, context))
+        return EpisodeStart(context, remember_lights(bank, context))
 
-    def frame(self, bank: ScenarioBank, context: AgentContext, cast: AgentContext, back: int) -> Frame:
-        """All agents ``back`` steps ago, the driven agents of ``cast [K]`` in their place."""
+    def frame(self, bank: ScenarioBank, context: AgentContext, driven: AgentContext, back: int) -> Frame:
+        """Return all agents ``back`` steps ago, with the driven agents ``driven [K]`` at their simulated poses."""
         return frame_of(
-            bank, context.index, context.step, self.traffic.agents(bank, context, back), cast, back
+            bank, context.index, context.step, self.traffic.agents(bank, context, back), driven, back
         )
 
     def now(self, bank: ScenarioBank, context: AgentContext) -> Frame:
-        """All agents now, around one driven agent."""
+        """Return all agents now, around one driven agent."""
         return self.frame(bank, context, alone(context), 0)
 
     def step(
         self, bank: ScenarioBank, state: SimState, action: Float[Array, " D"]
     ) -> tuple[SimState, Transition]:
-        """Drives one step of 0.1 s with an action of the task's action space."""
+        """Drive one step of 0.1 s with an action of the task's action space."""
         return self._drive(bank, state, action, None)
 
     def replay(
         self, bank: ScenarioBank, state: SimState, motion: Float[Array, " 4"], action: Float[Array, " D"]
     ) -> tuple[SimState, Transition]:
-        """Puts the agent at ``motion`` one step later, without dynamics (the exact expert); ``action`` is recorded."""
+        """Move the agent to ``motion`` without dynamics (exact expert); ``action`` is only recorded."""
         return self._drive(bank, state, action, motion)
 
     def reset_together(
         self, bank: ScenarioBank, index: Any, slots: Int[Array, " K"], step: Any = CURRENT_STEP
     ) -> SimState:
-        """The stack of the states of several agents of one scenario (``simulator.together.slots_of`` chooses them).
+        """Return the stacked states of K agents of one scenario (``simulator.together.slots_of`` selects slots).
 
-        They begin as logged: a noisy start knows of one driven agent only.
+        All start as logged: a noisy start supports a single driven agent.
         """
         contexts = jax.vmap(lambda slot: self.context(bank, index, step, slot))(slots)
-        return jax.vmap(lambda context: self._begin(bank, context, contexts))(contexts)
+        return jax.vmap(lambda context: self._initial_state(bank, context, contexts))(contexts)
 
     def step_together(
         self, bank: ScenarioBank, states: SimState, actions: Float[Array, "K D"], over: Any = None
     ) -> tuple[SimState, Transition]:
-        """Drives K agents of one scenario at once; they see each other, and traffic sees them.
+        """Drive K agents of one scenario; they see each other, and traffic sees them.
 
         Args:
             bank: The scenarios.
-            states: The stack of their states. One whose slot is beyond the moving agents fills up the stack: it is on
-                no road, and is never rewarded nor over; its facts mean nothing.
-            actions: An action each.
-            over: ``[K]`` whose episode has ended at an earlier step: they drive on by their actions, and are neither
-                rewarded nor evaluated any more. None by default, which is right for tasks that drive to the end.
+            states: Stacked states. Slots beyond the moving agents are padding: never rewarded or terminated, with
+                undefined facts.
+            actions: One action per agent.
+            over: ``[K]`` mask of agents whose episode has ended: they drive on without reward and metrics. None means
+                no agent.
         """
         first = jax.tree.map(lambda leaf: leaf[0], states.context)
         seen = self.frame(bank, first, states.context, 0)
         traffic = self.traffic.advance(bank, first, seen)
-        moved = jax.vmap(lambda s, a: self._drive_on(bank, s.context, a, None, traffic))(states, actions)
+        moved = jax.vmap(lambda s, a: self._move_agent(bank, s.context, a, None, traffic))(states, actions)
         after, done = jax.vmap(lambda s, m, a: self._settle(bank, s, m, moved, seen, a))(
             states, moved, actions
         )
@@ -153,55 +153,48 @@ class Simulator:
         return after, replace(done, after=after, reward=reward, reward_terms=terms, **ends)
 
     def observe_together(self, bank: ScenarioBank, states: SimState) -> Mapping[str, Any]:
-        """The observation of each of K agents of one scenario, stacked."""
+        """Return the stacked observations of K agents of one scenario."""
         return jax.vmap(lambda context: self.observe(bank, context, states.context))(states.context)
 
-    def situation(self, bank: ScenarioBank, state: SimState, cast: AgentContext | None = None) -> Situation:
-        """The state's facts with the surroundings that they were measured in; for planners.
-
-        Args:
-            bank: The scenarios.
-            state: The state.
-            cast: Contexts of all driven agents of the scenario, stacked; the agent alone by default.
-        """
-        cast = alone(state.context) if cast is None else cast
-        around = surroundings(bank, state.context, self.frame(bank, state.context, cast, 0))
+    def situation(self, bank: ScenarioBank, state: SimState, driven: AgentContext | None = None) -> Situation:
+        """Return the facts and surroundings of a state, for planners; ``driven`` defaults to the agent alone."""
+        driven = alone(state.context) if driven is None else driven
+        around = surroundings(bank, state.context, self.frame(bank, state.context, driven, 0))
         return Situation(state.context, state.facts, around)
 
     def observe(
-        self, bank: ScenarioBank, context: AgentContext, cast: AgentContext | None = None
+        self, bank: ScenarioBank, context: AgentContext, driven: AgentContext | None = None
     ) -> Mapping[str, Any]:
-        """The task's observation of a context, live or replayed."""
-        cast = alone(context) if cast is None else cast
+        """Return the task's observation of a context, live or from a replay buffer."""
+        driven = alone(context) if driven is None else driven
 
         def frames(back: int) -> Frame:
-            return self.frame(bank, context, cast, back)
+            return self.frame(bank, context, driven, back)
 
         return self.task.observe(bank, context, frames, frames(0))
 
-    def step_or_begin(
+    def step_or_reset(
         self,
         bank: ScenarioBank,
         state: SimState,
         action: Float[Array, " D"],
         over: Bool[Array, ""],
-        fresh: Beginning,
+        fresh: EpisodeStart,
         seen: Frame | None = None,
     ) -> tuple[SimState, Transition]:
-        """A step, or where the episode is ``over`` the beginning of another one instead.
+        """Step, or start a new episode where the current one is ``over``.
 
-        For collectors: an episode that ends costs one call that only resets, whose transition means nothing and is to
-        be masked; in exchange nothing is measured or observed twice, and every state that a policy sees, final ones
-        included, is seen once.
+        For collectors: the end of an episode costs one call that only resets, with a meaningless transition to mask. In
+        exchange nothing is measured or observed twice, and a policy sees every state, final ones included, once.
 
         Args:
             bank: The scenarios.
             state: The state.
-            action: What the agent does if its episode goes on.
-            over: Whether it is over.
-            fresh: The :meth:`beginning` that it has then; looked at only where ``over``, so that a batch needs to
-                compute it there only (:func:`simulator.sparse.map_where`).
-            seen: ``now(bank, state.context)``, from who has it at hand, so that it is not computed again.
+            action: Action of the agent where its episode continues.
+            over: Whether the episode has ended.
+            fresh: The :meth:`new_episode`; read only where ``over``, so a batch may compute it only there
+                (:func:`simulator.sparse.map_where`).
+            seen: ``now(bank, state.context)``, if already computed.
         """
         seen = self.now(bank, state.context) if seen is None else seen
         moved = self._move(bank, state.context, seen, action, None)
@@ -231,14 +224,14 @@ class Simulator:
     def _move(
         self, bank: ScenarioBank, context: AgentContext, seen: Frame, action: Array, motion: Array | None
     ) -> AgentContext:
-        """All agents move one step on from a frame; nothing is measured yet."""
+        """Move all agents one step without measuring."""
         traffic = self.traffic.advance(bank, context, seen)
-        return self._drive_on(bank, context, action, motion, traffic)
+        return self._move_agent(bank, context, action, motion, traffic)
 
-    def _drive_on(
+    def _move_agent(
         self, bank: ScenarioBank, context: AgentContext, action: Array, motion: Array | None, traffic: Any
     ) -> AgentContext:
-        """The agent moves one step, in traffic that has moved."""
+        """Move the driven agent one step, given traffic that has already moved."""
         if motion is None:
             action = self.task.actuated(context.history[-1], action, context.action)
             motion = self.task.motion(context.history[-1], action, bank.length_m(context.index, context.slot))
@@ -255,12 +248,12 @@ class Simulator:
         bank: ScenarioBank,
         before: SimState,
         moved: AgentContext,
-        cast: AgentContext,
+        driven: AgentContext,
         seen: Frame,
         action: Array,
     ) -> tuple[SimState, Transition]:
-        """Measures an agent after all agents have moved on from a frame, and turns the step into a transition."""
-        now = self.frame(bank, moved, cast, 0)
+        """Measure an agent after all agents have moved, and build the transition."""
+        now = self.frame(bank, moved, driven, 0)
         situation, contacts, lights = measure(
             bank, moved, now, seen, before.contacts, before.lights, self.task.reads, before.facts.strand
         )

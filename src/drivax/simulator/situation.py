@@ -1,4 +1,4 @@
-"""Measure once: from a context and the frame to the facts that metrics, rewards and planners share."""
+"""Measure the facts that metrics, rewards and planners share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
     project_on_route,
 )
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.scenario.schema import DT_S, Flag
 from drivax.simulator.contact import (
     STOPPED_MPS,
@@ -50,10 +50,10 @@ from drivax.simulator.types import (
 
 #: Lights of the route count while the agent is within this distance of it, m.
 _ON_ROUTE_M = 2.0
-#: Facts that need to know who touches the agent, and those that need to know whose fault it is.
+#: Facts that need fault classification, and those that need contacts.
 _FAULTS = frozenset({"at_fault", "collision_type", "ttc_s"})
 _CONTACTS = _FAULTS | {"collision", "ignored", "gap_m"}
-#: Facts that need to know from which lane to which the agent passes.
+#: Facts that need lane passages.
 _PASSAGES = frozenset({"strand", "lane_changed", "merged"})
 
 
@@ -63,10 +63,9 @@ def measure(
 ) -> tuple[Situation, Int[Array, " S"], LightMemory]:  # fmt: skip
     """Measure the driven agent.
 
-    ``context`` has the ``route_m`` and ``z`` of the step before, ``contacts`` and ``lights`` too,
-    ``frame`` and ``previous`` are all agents now and one step ago, and ``strand`` is the fact of that name of the step
-    before (None where an episode starts). Facts that ``reads`` does not name are None, and what only they need is not
-    computed.
+    ``context``, ``contacts`` and ``lights`` are those of the step before (its ``route_m`` and ``z``), ``frame`` and
+    ``previous`` are all agents now and one step ago, ``strand`` is the previous fact of that name (None at the start of
+    an episode). Facts that ``reads`` does not name are None and not computed.
 
     Returns:
         The situation (with present ``route_m`` and ``z``), new contact codes, new light memory.
@@ -116,7 +115,7 @@ def measure(
 
 
 def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
-    """The same facts, without where the agent came from if its episode is ``over``."""
+    """Reset the ``strand`` fact where the episode is ``over``."""
 
     def forget(path: tuple[Any, ...], fact: Array) -> Array:
         return jnp.where(over, jnp.int16(-1), fact) if path[0].name == "strand" else fact
@@ -125,7 +124,7 @@ def forget_strand(facts: Facts, over: Bool[Array, ""]) -> Facts:
 
 
 def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Surroundings:
-    """All agents now, the lanes around the driven agent, and where it is on its route."""
+    """Return all agents, the lanes around the driven agent, and its position on its route."""
     me = frame.box[context.slot]
     ground = _ground(bank, context, frame)
     lanes = around_lanes(bank, context.index, me[:2], me[2:4], corners(me), ground)
@@ -133,23 +132,23 @@ def surroundings(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Sur
     return Surroundings(frame, lanes, project_on_route(bank, context.index, me[:2], context.route_m, ahead_m))
 
 
-def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Float[Array, ""]:
+def _ground(bank: ScenarioBank, context: AgentContext, frame: Frame) -> Scalar:
     """Height of the ground under the driven agent, m."""
     return frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
 
 
-def _moved(context: AgentContext) -> Float[Array, ""]:
-    """How far the driven agent has come in the last step, m."""
+def _moved(context: AgentContext) -> Scalar:
+    """Distance that the driven agent moved in the last step, m."""
     return norm(context.history[-1, :2] - context.history[-2, :2])
 
 
 def _touch(
     context: AgentContext, frame: Frame, previous: Frame, contacts: Int[Array, " S"], unlawful: Bool[Array, ""],
     reads: frozenset[str],
-) -> tuple[Int[Array, " S"], Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:  # fmt: skip
-    """New contact codes, whether a contact that starts now is the agent's fault, its type, and time to collision.
+) -> tuple[Int[Array, " S"], Bool[Array, ""], Integer, Scalar]:  # fmt: skip
+    """Return contact codes, whether a new contact is at fault, its type, and time to collision.
 
-    What ``reads`` does not ask for is zero, and codes stay as they are where it asks for nothing here.
+    Values that ``reads`` does not need are zero; without any of them codes stay unchanged.
     """
     fault, kind, ttc = jnp.zeros(contacts.shape, bool), jnp.zeros((), jnp.int8), jnp.zeros(())
     if not reads & _CONTACTS:
@@ -174,7 +173,7 @@ def _requested(
     reads: frozenset[str],
     strand: Any,
 ) -> dict[str, Array]:
-    """The facts that are measured on request; what ``reads`` does not ask for is zero."""
+    """Return the facts measured on request; those outside ``reads`` are zero."""
     none, no = jnp.int16(-1), jnp.zeros((), bool)
     zero = jnp.zeros(())
     facts: dict[str, Array] = {
@@ -188,7 +187,7 @@ def _requested(
     if reads & _PASSAGES:
         ground, me = _ground(bank, context, frame), frame.box[context.slot]
         if strand is None:
-            # An agent that is changing lanes as the episode begins has come from where it was 1.5 s ago.
+            # An agent that changes lanes at the start comes from its pose 1.5 s ago.
             x, y, psi = context.history[0, : MOTION_HEADING + 1]
             heading = jnp.stack([jnp.cos(psi), jnp.sin(psi)])
             strand = lane_passage(bank, context.index, jnp.stack([x, y]), heading, ground, -1).strand
@@ -209,8 +208,8 @@ def _kept(facts: Facts, reads: frozenset[str]) -> Facts:
 
 
 def _off_the_road(
-    bank: ScenarioBank, index: Int[Array, ""], me: Float[Array, " 6"], ground: Float[Array, ""], lanes: LaneHits
-) -> tuple[Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, me: Float[Array, " 6"], ground: Scalar, lanes: LaneHits
+) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:  # fmt: skip
     """How far a box's worst corner is off the road (m), whether it left the map, or only the road."""
     beyond = offroad_distance(bank, index, me[:2], corners(me), lanes.points_near, ground).max()
     left_map = left_the_map(bank, index, me[:2])
@@ -221,7 +220,7 @@ def _speed(frame: Frame) -> Float[Array, " S"]:
     return norm(frame.velocity)
 
 
-def _rates(history: Float[Array, "16 4"]) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _rates(history: Float[Array, "16 4"]) -> tuple[Scalar, Scalar, Scalar]:
     """Causal acceleration, jerk and lateral acceleration over the last 0.5 s."""
     speed, heading = history[:, 3], history[:, 2]
     acceleration = (speed[-1] - speed[-6]) / (5 * DT_S)

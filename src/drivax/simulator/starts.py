@@ -1,7 +1,6 @@
-"""How an episode begins: as logged, or after a moment of wrong driving.
+"""Starts of episodes: as logged, or after a second of perturbed driving.
 
-Any step of the log can be the first one (``Simulator.reset(..., step=...)``); what a start adds is the motion that led
-there.
+Any step of the log can be the first one (``Simulator.reset(..., step=...)``); a start provides the motion before it.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.errors import UsageError
 from drivax.geometry.boxes import corners
@@ -24,13 +23,13 @@ from drivax.scenario.bank.queries import (
     offroad_distance,
     project_on_route,
 )
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank
 from drivax.simulator.contact import overlaps
 from drivax.simulator.dynamics import bicycle
 from drivax.simulator.traffic.log import alone, frame_of, logged_history
 from drivax.simulator.types import HISTORY, MOTION_SPEED, AgentContext
 
-#: What 1 means for acceleration (m/s2) and curvature (1/m) in the published description, which is in action units.
+#: Acceleration (m/s2) and curvature (1/m) of an action of 1 in the published description.
 _ACCELERATION, _CURVATURE = 6.0, 0.3
 #: Share of the acceleration when strong; mild is anything from 0 to the upper end.
 _STRONG_ACCELERATION = (0.54, 0.6)
@@ -42,13 +41,13 @@ _BOUND, _BOUND_MPS = (0.4, 0.03), 40.0 / 3.6
 
 @runtime_checkable
 class Start(Protocol):
-    """How the driven agent came to the first step of an episode."""
+    """Motion of the driven agent before the first step of an episode."""
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
-        """Motions of the last 16 steps up to ``step``, and the arc length along the route at ``step``.
+    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
+        """Return the motions of the 16 steps up to ``step``, and the arc length along the route at ``step``.
 
         ``agents`` are the rows of all moving agents at ``step``, from the traffic model.
         """
@@ -57,30 +56,29 @@ class Start(Protocol):
 
 @dataclass(frozen=True)
 class LogStart:
-    """As logged."""
+    """Start as logged."""
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Any = None, key: Any = None,
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
-        """The log's own, whatever the others do; needs no key."""
+    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
+        """Return the logged motion; needs no key."""
         return logged_history(bank, index, step, slot), bank.log_progress[index, step]
 
 
 @dataclass(frozen=True)
 class NoisyStart:
-    """The last second before the start was driven with one wrong action; how does the planner recover?
+    """Start after one second of driving with one perturbed action (V-Max, ``noisy_init``).
 
-    Three quarters of the draws are strong (acceleration 3.24 to 3.6 m/s2, nearly the sharpest curvature), the others
-    mild (anything from nothing to that), to the left or right with equal odds. The sharpest curvature is 0.12 1/m at
-    a standstill and 0.009 1/m from 40 km/h on. A draw that ends in a collision, off the road or off the map is drawn
-    again; when all tries do, the episode begins as logged. As published (V-Max, ``noisy_init``), except that nothing
-    but the start differs from other episodes: the steps before it count for no metric.
+    Three quarters of the draws are strong (acceleration 3.24 to 3.6 m/s2, nearly the largest curvature), the others
+    mild (uniform up to that), left or right with equal odds. The largest curvature is 0.12 1/m at a standstill and
+    0.009 1/m from 40 km/h on. A draw that ends in a collision, off the road or off the map is rejected; if all tries
+    fail, the episode starts as logged. Unlike the publication, the steps before the start count for no metric.
 
     Attributes:
-        steps: How many steps are driven so; fewer where the log does not reach back as far.
+        steps: Perturbed steps; fewer where the log starts later.
         strong: Share of strong draws.
-        scale: What accelerations and curvatures are multiplied by.
+        scale: Factor on accelerations and curvatures.
         tries: Draws per start.
     """
 
@@ -96,17 +94,17 @@ class NoisyStart:
             raise UsageError(f"{self} cannot be drawn", cure="strong in [0, 1], scale >= 0, tries >= 1")
 
     def begin(
-        self, bank: ScenarioBank, index: Int[Array, ""], step: Int[Array, ""], slot: Int[Array, ""],
+        self, bank: ScenarioBank, index: Integer, step: Integer, slot: Integer,
         agents: Float[Array, "A 8"], key: Any,
-    ) -> tuple[Float[Array, "16 4"], Float[Array, ""]]:  # fmt: skip
-        """The first acceptable draw of ``tries``.
+    ) -> tuple[Float[Array, "16 4"], Scalar]:  # fmt: skip
+        """Return the first acceptable of ``tries`` draws.
 
         Raises:
             UsageError: Without a key.
         """
         if key is None:
             raise UsageError("a noisy start needs a random key", cure="reset(bank, index, step, slot, key)")
-        # Only steps at which the log has the agent can be driven again.
+        # Only steps at which the log has the agent can be replaced.
         back = jnp.arange(1, self.steps + 1)
         known = (bank.agents[index, jnp.maximum(step - back, 0), slot, AgentColumn.VALID] > 0) & (
             back <= step
@@ -125,8 +123,8 @@ class NoisyStart:
         along_m = project_on_route(bank, index, history[-1, :2], near_m).along_m
         return history, jnp.where(good.any(), jnp.maximum(along_m, near_m), logged_m)
 
-    def draw(self, key: Array, speed: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """An acceleration (m/s2) and a curvature (1/m) for a car of this speed."""
+    def draw(self, key: Array, speed: Scalar) -> tuple[Scalar, Scalar]:
+        """Draw an acceleration (m/s2) and a curvature (1/m) for a speed."""
         keys = jax.random.split(key, 4)
         strong = jax.random.bernoulli(keys[0], self.strong)
         side = jnp.where(jax.random.bernoulli(keys[1]), 1.0, -1.0)
@@ -138,13 +136,9 @@ class NoisyStart:
         return self.scale * _ACCELERATION * share, self.scale * _CURVATURE * bound * turn
 
     def _driven(
-        self,
-        history: Float[Array, "16 4"],
-        count: Int[Array, ""],
-        acceleration: Float[Array, ""],
-        curvature: Float[Array, ""],
+        self, history: Float[Array, "16 4"], count: Integer, acceleration: Scalar, curvature: Scalar
     ) -> Float[Array, "16 4"]:
-        """A history, ``count`` steps of one action later."""
+        """Return a history after ``count`` steps of one action."""
 
         def advance(history: Array, place: Array) -> tuple[Array, None]:
             later = jnp.concatenate([history[1:], bicycle(history[-1], acceleration, curvature)[None]])
@@ -155,9 +149,9 @@ class NoisyStart:
 
 def _acceptable(
     bank: ScenarioBank,
-    index: Int[Array, ""],
-    step: Int[Array, ""],
-    slot: Int[Array, ""],
+    index: Integer,
+    step: Integer,
+    slot: Integer,
     agents: Float[Array, "A 8"],
     history: Float[Array, "16 4"],
 ) -> Bool[Array, ""]:

@@ -1,4 +1,4 @@
-"""Several agents of one scenario that are driven together: which, and how a stack of them is filled up."""
+"""Several driven agents in one scenario: selection of slots and padding."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from drivax.simulator.types import SimState
 def slots_of(
     bank: ScenarioBank, index: Any, mask: Bool[Array, " A"], count: int, step: Any = CURRENT_STEP
 ) -> Int[Array, " K"]:
-    """Slots of the agents of a mask that the log has at ``step``, filled up with A, an empty slot.
+    """Return K slots of the agents of a mask that the log has at ``step``, padded with A (an empty slot).
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
-        mask: Which moving agents are to be driven.
-        count: K, the size of the stack; further agents of the mask are left to traffic.
-        step: Step at which they begin.
+        mask: Moving agents to drive.
+        count: K; further agents of the mask are left to traffic.
+        step: First step.
     """
     there = mask & (bank.agents[index, step, :, AgentColumn.VALID] > 0)
     return jnp.nonzero(there, size=count, fill_value=mask.shape[0])[0].astype(jnp.int32)
 
 
 def is_driven(bank: ScenarioBank, states: SimState) -> Bool[Array, " K"]:
-    """Which states of a stack belong to an agent; the others fill it up."""
+    """Mask of the states that belong to an agent; the others are padding."""
     return states.context.slot < bank.agents.shape[2]

@@ -12,24 +12,24 @@ from drivax.scenario.bank.queries import LaneHits, RouteHit
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record
 
-#: Rows of recent motion that a context carries: the 15-sample comfort window needs one more speed than accelerations.
+#: Steps of recent motion in a context: the 15 accelerations of the comfort window need 16 speeds.
 HISTORY = 16
 MOTION_X, MOTION_Y, MOTION_HEADING, MOTION_SPEED = range(4)
 
 
 @record
 class AgentContext:
-    """All that an observation depends on in addition to the bank; what a replay buffer stores.
+    """Everything an observation depends on besides the bank; stored in replay buffers.
 
     Attributes:
         index: Row of the bank.
         step: Time step t in the log.
-        slot: Agent slot that is driven (0: ego).
+        slot: Slot of the driven agent (0: ego).
         history: x, y, heading, speed of the driven agent over the last 16 steps; the last row is now.
-        action: The last action as it was carried out, within bounds and actuator rates; D numbers (2 by default).
+        action: Last executed action, within bounds and actuator rates; D numbers (2 by default).
         route_m: Arc length along the route to the goal, m; never decreases.
         z: Height of the box centre, m; follows the nearest lane.
-        traffic: State of the traffic model; an empty tuple where the others replay the log.
+        traffic: State of the traffic model; an empty tuple for log replay.
     """
 
     index: Int[Array, "*batch"]
@@ -44,15 +44,15 @@ class AgentContext:
 
 @record
 class Frame:
-    """All agents at one step: in each of the S slots a moving or a parked agent, or none; and the L lights.
+    """All agents and lights at one step: S slots with a moving agent, a parked agent or none, and L lights.
 
     Attributes:
         box: x, y, cos, sin, length, width.
         velocity: m/s.
         z: Height of the box centre, m.
-        valid: Whether the agent is there.
+        valid: Whether the slot has an agent.
         kind: ``scenario.schema.AgentKind``.
-        lights: ``scenario.schema.LightState``; negative where nothing was seen.
+        lights: ``scenario.schema.LightState``; negative where unobserved.
     """
 
     box: Float[Array, "*batch S 6"]
@@ -65,17 +65,15 @@ class Frame:
 
 @record
 class Facts:
-    """What was measured at one pose, as scalars; kept in the state. Units in names; definitions in the semantics.
+    """Scalar measurements at one pose, kept in the state. Units in names; definitions in the semantics.
 
-    ``ttc_defined`` is false while standing; ``limit_mps`` is -1 where no limit is known; ``routed`` says whether the
-    agent has a route of its own (ego, on lanes), without which progress and ``off_route`` mean nothing; ``logged``
-    whether the log has the agent at this step; ``ignored`` counts overlaps that do not count. A fact that the task does
-    not ask for (``Task.reads``) is neither measured nor carried: it is None.
+    ``ttc_defined`` is false at a standstill; ``limit_mps`` is -1 if unknown; ``routed``: the agent has a route (ego, on
+    lanes), without which progress and ``off_route`` are undefined; ``logged``: the log has the agent at this step;
+    ``ignored`` counts ignored overlaps. Facts outside ``Task.reads`` are None and not computed.
 
-    The last five are measured for who names them only (``ON_REQUEST``): ``gap_m`` to the nearest other, at most 50 m;
-    ``lag_m``, how far ahead the log has the agent, along the agent's heading (negative: behind);
-    ``strand`` of lanes that the agent is on (``scenario.bank.passages``), and whether it changed lanes or merged
-    just now.
+    The last five are measured only on request (``ON_REQUEST``): ``gap_m`` to the nearest agent, at most 50 m; ``lag_m``
+    behind the log along the agent's heading (negative: ahead of it); the lane ``strand`` of the agent
+    (``scenario.bank.passages``), and whether it changed lanes or merged in this step.
     """
 
     collision: Bool[Array, "*batch"]
@@ -110,7 +108,7 @@ class Facts:
     merged: Any = None
 
 
-#: Facts that few look at, measured only where they are asked for by name.
+#: Facts measured only if requested by name.
 ON_REQUEST = frozenset({"gap_m", "lag_m", "strand", "lane_changed", "merged"})
 #: Names of all other facts.
 FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
@@ -118,7 +116,7 @@ FACTS = frozenset(field.name for field in fields(cast(Any, Facts))) - ON_REQUEST
 
 @record
 class Surroundings:
-    """What was found around a pose; arrays, never carried from step to step."""
+    """Frame, lanes and route position around a pose; never carried between steps."""
 
     frame: Frame
     lanes: LaneHits
@@ -127,7 +125,7 @@ class Surroundings:
 
 @record
 class Situation:
-    """A context, measured."""
+    """A context with its measurements."""
 
     context: AgentContext
     facts: Facts
@@ -136,12 +134,12 @@ class Situation:
 
 @record
 class LightMemory:
-    """What is remembered about stop lines.
+    """Memory of stop lines.
 
     Attributes:
         pause: Steps since the agent last stood before the line; saturates.
-        crossed: Steps since it crossed the line off its route, until evaluation: positive where the light was red,
-            negative where not, 0 for none.
+        crossed: Steps since the agent crossed the line off its route, until evaluation: positive at red, negative
+            otherwise, 0 for none.
     """
 
     pause: Int[Array, "*batch L"]
@@ -149,8 +147,8 @@ class LightMemory:
 
 
 @record
-class Beginning:
-    """How an episode begins: its context, and the memory of stop lines that led there."""
+class EpisodeStart:
+    """First context of an episode and its stop-line memory."""
 
     context: AgentContext
     lights: LightMemory
@@ -162,11 +160,11 @@ class SimState:
 
     Attributes:
         context: What observations depend on.
-        facts: The last measurement.
+        facts: Latest measurement.
         contacts: Code per slot (``simulator.contact.Contact``).
-        lights: What is remembered about each stop line.
+        lights: Memory of each stop line.
         episode: Accumulators of the task's metrics since ``start``.
-        start: Step at which the episode began.
+        start: First step of the episode.
     """
 
     context: AgentContext
@@ -179,11 +177,11 @@ class SimState:
 
 @record
 class Transition:
-    """One step. ``after`` is the state that the step led to, never a reset state.
+    """One step; ``after`` is the resulting state, never a reset state.
 
     Attributes:
-        before, after: States on both sides.
-        action: What was asked for, in the action space.
+        before, after: States before and after the step.
+        action: Requested action, in the action space.
         reward: Weighted sum of the reward terms.
         reward_terms: Each weighted term by name.
         terminated: The episode ended for good: bootstrap zero.
@@ -201,76 +199,76 @@ class Transition:
 
 @runtime_checkable
 class Traffic(Protocol):
-    """How agents that are not driven moves; ``name`` is what tables call it.
+    """Motion of the agents that are not driven.
 
-    A model that needs something precomputed also has ``prepare(bank) -> bank``, which evaluation calls.
+    A model that needs precomputed data also has ``prepare(bank) -> bank``, which evaluation calls.
     """
 
     @property
     def name(self) -> str:
-        """As printed in tables."""
+        """Name in tables."""
         ...
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Any:
-        """Traffic state at a step of the log."""
+        """Return the traffic state at a step of the log."""
         ...
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Any:
-        """Traffic state one step later, given the present frame."""
+        """Return the traffic state one step later, given the present frame."""
         ...
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Rows of ``bank.agents`` for the moving slots ``back`` steps ago."""
+        """Return the rows of ``bank.agents`` for the moving slots ``back`` steps ago."""
         ...
 
 
 @runtime_checkable
 class Task(Protocol):
-    """What makes it a learning problem; satisfied by ``tasks.Task``, which the simulator never imports."""
+    """Action space, observation, reward and episode end; implemented by ``tasks.Task``."""
 
     @property
     def reads(self) -> frozenset[str]:
-        """Names of the facts that anything here looks at; no others are measured."""
+        """Names of the facts to measure."""
         ...
 
     def motion(
         self, motion: Float[Array, " 4"], action: Float[Array, " D"], length: Any
     ) -> Float[Array, " 4"]:
-        """Next motion of the driven agent for an action of the task's action space."""
+        """Return the next motion of the driven agent."""
         ...
 
     def actuated(
         self, motion: Float[Array, " 4"], action: Float[Array, " D"], last: Float[Array, " D"]
     ) -> Float[Array, " D"]:
-        """What is carried out when ``action`` is asked for and ``last`` was carried out a step ago."""
+        """Return the executed action for a requested ``action``, given the ``last`` executed one."""
         ...
 
     def first_action(self, history: Float[Array, "16 4"], length: Any) -> Float[Array, " D"]:
-        """What counts as the last action when an episode begins; its size is that of every action."""
+        """Return the previous action at the start of an episode; its size is that of every action."""
         ...
 
     def observe(
         self, bank: ScenarioBank, context: AgentContext, agents: Any, frame: Frame
     ) -> Mapping[str, Any]:
-        """Observation of a context."""
+        """Return the observation of a context."""
         ...
 
     def reward(self, before: Facts, now: Facts, around: Surroundings) -> dict[str, Float[Array, ""]]:
-        """Weighted reward terms by name."""
+        """Return the weighted reward terms by name."""
         ...
 
     def ended(
         self, bank: ScenarioBank, context: AgentContext, facts: Facts
     ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Whether the episode is terminated, and whether it is truncated."""
+        """Return whether the episode is terminated, and whether it is truncated."""
         ...
 
     def episode_start(self) -> Any:
-        """Empty metric accumulators."""
+        """Return empty metric accumulators."""
         ...
 
     def episode_add(
         self, episode: Any, situation: Situation, start: Int[Array, ""], final: Bool[Array, ""]
     ) -> Any:
-        """Accumulators after the step that led to ``situation``, in an episode that began at step ``start``."""
+        """Return the accumulators after a step to ``situation``, in an episode that started at step ``start``."""
         ...

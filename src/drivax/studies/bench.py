@@ -241,7 +241,7 @@ def _run(
 ) -> tuple[Any, Array]:
     """Steps a batch; what was earned and is seen, so that nothing is optimised away, and how many were steps."""
     key, batch = keys[0], carry[1].shape[0]
-    step = jax.vmap(simulator.step_or_begin, in_axes=(None, 0, 0, 0, 0, 0))
+    step = jax.vmap(simulator.step_or_reset, in_axes=(None, 0, 0, 0, 0, 0))
 
     def judged(states: SimState) -> Array:
         values = jax.vmap(episode_metrics, in_axes=(None, 0))(bank, states)
@@ -249,7 +249,7 @@ def _run(
 
     def one(carry: _Carry, index: Int[Array, " B"]) -> tuple[_Carry, Array]:
         states, over, total, (action, _, seen) = carry
-        fresh = map_where(over, partial(simulator.beginning, bank), index)
+        fresh = map_where(over, partial(simulator.new_episode, bank), index)
         states, transition = step(bank, states, action, over, fresh, seen)
         done = transition.terminated | transition.truncated
         # As in training: metrics are computed when some episode of the batch ends.

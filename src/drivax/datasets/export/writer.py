@@ -36,7 +36,7 @@ class Export:
         filters: Conditions that all must hold (``scenario.select.selection``).
         ids: File of scenario ids, one a line, or ``dataset<TAB>id``; None for all.
         limit: Write only the first of the selected scenarios; None: all.
-        paths: Form of ``path_samples`` in tf.Examples, a name in ``export_tfexample.PATHS``.
+        paths: Form of ``path_samples`` in tf.Examples, a name in ``export.tfexample.PATHS``.
         shard_size: Scenarios per TFRecord shard.
         overwrite: Replace an earlier export of the same kind; other folders are never replaced.
     """

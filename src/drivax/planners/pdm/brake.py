@@ -1,7 +1,7 @@
-"""The emergency brake of PDM-Closed, for any planner: stop if ego is about to hit another agent by its own fault.
+"""Emergency brake of PDM-Closed, for any planner: stop if ego is about to cause a collision.
 
 Source: Dauner, Hallgarten, Geiger and Chitta, "Parting with Misconceptions about Learning-based Vehicle Motion
-Planning" (CoRL 2023) and the numbers of its published implementation.
+Planning" (CoRL 2023) and its published implementation.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from jaxtyping import Array, Bool, Float
 from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.planners.pdm.forecast import Forecast, fault_times, until_overlap
 from drivax.planners.planner import Planner
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Scalar, ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import overlaps
 from drivax.simulator.types import MOTION_SPEED, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical
 
-#: Others that are looked at: the nearest to the way, within this radius, m.
+#: Number of agents considered, those nearest to the path within this radius, m.
 _OTHERS, _RADIUS_M = 24, 50.0
 
 
 @dataclass(frozen=True)
 class BrakeConfig:
-    """When to brake, and how hard; the defaults are the published ones.
+    """When to brake, and how hard; defaults as published.
 
     Attributes:
-        within_s: A collision that is at most this far away asks for the brake.
-        up_to_mps: Faster cars are not braked: what is ahead of them is the planner's to solve.
+        within_s: Largest time to an at-fault collision that triggers the brake.
+        up_to_mps: Largest speed at which the brake triggers.
         least_mps2, most_mps2: Bounds of the acceleration (nuPlan's comfort limits).
         gains, slow_gains: On the speed (1/s) and on the acceleration; the second pair below ``slow_mps``.
-        slow_mps: Where the gains change.
+        slow_mps: Speed at which the gains change.
     """
 
     within_s: float = 2.0
@@ -48,30 +48,14 @@ class BrakeConfig:
     slow_mps: float = 0.2
 
 
-def is_emergency(
-    fault_s: Float[Array, ""], speed: Float[Array, ""], config: BrakeConfig = BrakeConfig()
-) -> Bool[Array, ""]:
-    """Whether to brake.
-
-    Args:
-        fault_s: Time until ego would hit another agent by its own fault, infinite where it does not.
-        speed: Of ego, m/s.
-        config: When to brake.
-    """
+def is_emergency(fault_s: Scalar, speed: Scalar, config: BrakeConfig = BrakeConfig()) -> Bool[Array, ""]:
+    """Whether to brake; ``fault_s`` is the time to an at-fault collision (infinite for none), ``speed`` in m/s."""
     # Times are multiples of a step in float32.
     return (fault_s <= config.within_s + DT_S / 10) & (speed <= config.up_to_mps)
 
 
-def braking(
-    speed: Float[Array, ""], acceleration: Float[Array, ""], config: BrakeConfig = BrakeConfig()
-) -> Float[Array, ""]:
-    """Acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped.
-
-    Args:
-        speed: m/s.
-        acceleration: The present one, m/s2.
-        config: Gains and bounds.
-    """
+def braking(speed: Scalar, acceleration: Scalar, config: BrakeConfig = BrakeConfig()) -> Scalar:
+    """Acceleration that stops a car, m/s2: ``-k_p v - k_d a``, clipped."""
     (p, d), (slow_p, slow_d) = config.gains, config.slow_gains
     unclipped = jnp.where(
         speed > config.slow_mps, -p * speed - d * acceleration, -slow_p * speed - slow_d * acceleration
@@ -81,12 +65,12 @@ def braking(
 
 @record
 class EmergencyBrake:
-    """Another planner, braked when its action, kept up, would make ego hit another agent by its own fault.
+    """Wrap a planner: brake if its action, held constant, leads to an at-fault collision.
 
-    The others keep their velocities; what ego touches already does not count.
+    Other agents keep their velocities; agents that already touch ego are ignored.
 
     Attributes:
-        planner: The driver.
+        planner: The wrapped planner.
         actions: Its action space.
         config: When to brake.
     """
@@ -98,11 +82,11 @@ class EmergencyBrake:
 
     @property
     def name(self) -> str:
-        """That of the planner, and ``+brake``."""
+        """Name of the planner plus ``+brake``."""
         return f"{self.planner.name}+brake"
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Any:
-        """What the planner carries."""
+        """Return the carry of the wrapped planner."""
         return self.planner.init(bank, state, key)
 
     def act(
@@ -114,7 +98,7 @@ class EmergencyBrake:
         observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Any]:
-        """The planner's action, or the brake straight ahead."""
+        """Return the planner's action, or brake straight ahead."""
         action, carry = self.planner.act(carry, bank, state, situation, observation, key)
         context, around = situation.context, situation.surroundings
         motion, me = context.history[-1], around.frame.box[context.slot]

@@ -1,4 +1,4 @@
-"""All agents at constant velocity: where others will be, when ego would meet them, and whose fault that would be."""
+"""Constant-velocity forecast: future boxes, times to overlap with ego, and at-fault collisions."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from jaxtyping import Array, Bool, Float, Int
 from drivax.geometry.boxes import COS, LENGTH, SIN, WIDTH, X, Y, time_to_overlap
 from drivax.geometry.vectors import norm
 from drivax.scenario.bank.queries import LEVEL_M
+from drivax.scenario.bank.scenario_bank import Integer, Vector
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 from drivax.simulator.contact import classify_contacts
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, MOTION_X, MOTION_Y, Frame
 
-#: Looks into the next five seconds at who comes near.
+#: Samples of the next five seconds.
 _LOOKS, _LOOK_S = 11, 0.5
-#: Who is a metre further away now counts as this much further from the way, m.
+#: Weight of the present distance relative to the distance from the path.
 _FURTHER = 0.02
 
 
 @record
 class Forecast:
-    """Others from now on, at the velocity and the heading that they have.
+    """Agents that keep their velocity and heading.
 
     Attributes:
         box: Their boxes now.
         velocity: m/s.
         kind: ``scenario.schema.AgentKind``.
-        valid: Whether the agent is there.
+        valid: Mask of present agents.
     """
 
     box: Float[Array, "K 6"]
@@ -38,18 +39,18 @@ class Forecast:
 
     @classmethod
     def of(
-        cls, frame: Frame, slot: Int[Array, ""], ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
+        cls, frame: Frame, slot: Integer, ignored: Bool[Array, " S"], way: Float[Array, "M 2"],
         most: int, radius_m: float,
     ) -> Forecast:  # fmt: skip
-        """Those that come nearest to a way within five seconds.
+        """Select the agents that come nearest to a path within five seconds.
 
         Args:
             frame: All agents now.
             slot: Ego.
-            ignored: Who does not count.
-            way: Points that ego may come to.
-            most: How many are looked at.
-            radius_m: Who is further away from ego now does not count.
+            ignored: Mask of ignored agents.
+            way: Points of ego's path.
+            most: Largest number of agents.
+            radius_m: Largest present distance from ego.
         """
         away = norm(frame.box[:, :2] - frame.box[slot, :2])
         counts = frame.valid & ~ignored & (jnp.arange(away.shape[0]) != slot) & (away <= radius_m)
@@ -65,15 +66,15 @@ class Forecast:
         return cls(frame.box[rows], frame.velocity[rows], frame.kind[rows], counts[rows])
 
     def at(self, times_s: Float[Array, " T"]) -> Float[Array, "T K 6"]:
-        """Their boxes at each time."""
+        """Boxes at each time."""
         times = times_s[:, None]
         moved = (self.box[:, X] + times * self.velocity[:, 0], self.box[:, Y] + times * self.velocity[:, 1])
         same = (jnp.broadcast_to(self.box[:, part], moved[0].shape) for part in (COS, SIN, LENGTH, WIDTH))
         return jnp.stack([*moved, *same], axis=-1)
 
 
-def boxes_of(motion: Float[Array, "*T 4"], size: Float[Array, " 2"]) -> Float[Array, "*T 6"]:
-    """Boxes of one size where motions (x, y, heading, speed) have them."""
+def boxes_of(motion: Float[Array, "*T 4"], size: Vector) -> Float[Array, "*T 6"]:
+    """Boxes of one size at motions (x, y, heading, speed)."""
     heading = motion[..., MOTION_HEADING]
     length, width = (jnp.broadcast_to(part, heading.shape) for part in size)
     parts = (motion[..., MOTION_X], motion[..., MOTION_Y], jnp.cos(heading), jnp.sin(heading), length, width)
@@ -81,9 +82,9 @@ def boxes_of(motion: Float[Array, "*T 4"], size: Float[Array, " 2"]) -> Float[Ar
 
 
 def until_overlap(
-    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, horizon_s: float
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, horizon_s: float
 ) -> Float[Array, "T K"]:
-    """At every step of a drive: seconds until ego overlaps each of the others if both then keep their velocities.
+    """Time from each step of a motion until ego overlaps each agent at constant velocities, s.
 
     0 where they overlap at that step, ``horizon_s`` where they do not within the horizon.
     """
@@ -95,19 +96,19 @@ def until_overlap(
 
 
 def fault_times(
-    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
     unlawful: Bool[Array, " T"],
 ) -> Float[Array, " K"]:  # fmt: skip
-    """When each of the others is hit by ego's fault, s; infinite for those that are not.
+    """Time of the first at-fault collision with each agent, s; infinite for none.
 
     Fault is decided at the first overlap, by the rule of the metric (``simulator.contact.classify_contacts``).
 
     Args:
-        motion: The drive.
+        motion: Motion of ego.
         size: Length and width of ego.
-        others: The others.
-        soon_s: What :func:`until_overlap` says of them.
-        unlawful: At every step, whether ego is in several lanes or off the road.
+        others: Forecast of the other agents.
+        soon_s: Their :func:`until_overlap`.
+        unlawful: Mask of steps at which ego is in several lanes or off the road.
     """
     steps = jnp.arange(motion.shape[0])
     first = jnp.min(jnp.where(soon_s <= 0.0, steps[:, None].astype(jnp.float32), jnp.inf), axis=0)

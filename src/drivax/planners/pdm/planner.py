@@ -1,8 +1,7 @@
-"""PDM-Closed: simulates 15 proposals along the route, scores them as nuPlan does, and drives the best one.
+"""PDM-Closed: simulate 15 proposals along the route, score them as nuPlan does, and drive the best one.
 
 Source: Dauner, Hallgarten, Geiger and Chitta, "Parting with Misconceptions about Learning-based Vehicle Motion
-Planning" (CoRL 2023), and the numbers of its published implementation; where this one departs from it is written in
-``docs/guide/planners.md``.
+Planning" (CoRL 2023), and its published implementation; ``docs/guide/planners.md`` lists the differences.
 """
 
 from __future__ import annotations
@@ -19,9 +18,15 @@ from drivax.geometry.boxes import LENGTH, WIDTH
 from drivax.geometry.vectors import wrap
 from drivax.planners.pdm.brake import BrakeConfig, braking, is_emergency
 from drivax.planners.pdm.forecast import Forecast
-from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unrolled
-from drivax.planners.pdm.scoring import Judgement, ScoringConfig, grounds, judged, scores
-from drivax.planners.pdm.tracking import Car, TrackingConfig, tracked
+from drivax.planners.pdm.proposals import LINE_PLACE, LINE_Z, Lines, unroll_idm
+from drivax.planners.pdm.scoring import (
+    ProposalMetrics,
+    ScoringConfig,
+    evaluate_proposal,
+    ground_along,
+    scores,
+)
+from drivax.planners.pdm.tracking import Car, TrackingConfig, track
 from drivax.scenario.bank.scenario_bank import ScenarioBank
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import DT_S
@@ -31,7 +36,7 @@ from drivax.simulator.idm import IdmParameters
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED, SimState, Situation
 from drivax.tasks.actions import ActionSpace, Physical
 
-#: Steps over which acceleration and yaw rate are measured when an episode begins; those of a standstill, m.
+#: Steps over which initial acceleration and curvature are measured, and the distance below which ego stands, m.
 _PAST, _STILL_M = 5, 0.5
 #: IDM of the proposals.
 PUBLISHED_DRIVER = IdmParameters(
@@ -48,20 +53,20 @@ _SPARSE = 5
 
 @dataclass(frozen=True)
 class PdmConfig:
-    """PDM-Closed; the defaults are the published ones.
+    """Settings of PDM-Closed; defaults as published.
 
     Attributes:
-        fractions: Speeds of the proposals, as shares of the limit.
-        offsets_m: Their lateral offsets from the route, positive to the left.
-        fallback_mps: Limit where none is known.
-        driver: The IDM of the proposals.
-        steps: How far they are unrolled, steps of 0.1 s.
-        leader_every: Steps after which a proposal looks for its leader again.
-        radius_m: Others further away are not looked at.
-        agents: How many others are looked at: of those within the radius the ones that come nearest to the route. The
-            publication looks at the nearest 50 vehicles, 25 pedestrians, 10 cyclists and 50 other things.
-        tracking: How proposals are driven.
-        scoring: How they are evaluated.
+        fractions: Target speeds of the proposals, relative to the speed limit.
+        offsets_m: Lateral offsets from the route, positive to the left.
+        fallback_mps: Speed limit where unknown.
+        driver: IDM parameters of the proposals.
+        steps: Horizon of the proposals, steps of 0.1 s.
+        leader_every: Steps between updates of a proposal's leader.
+        radius_m: Largest distance of agents to consider.
+        agents: Number of agents to consider, those that come nearest to the route. The publication uses the nearest 50
+            vehicles, 25 pedestrians, 10 cyclists and 50 other objects.
+        tracking: Tracker and vehicle model.
+        scoring: Weights and limits of the score.
         brake: The emergency brake.
     """
 
@@ -89,12 +94,12 @@ class PdmConfig:
 
 @record
 class Memory:
-    """What PDM carries from step to step.
+    """Carry of PDM.
 
     Attributes:
-        touched: Who has overlapped ego since the episode began; ignored from then on.
-        acceleration: What the last step asked for, m/s2.
-        steering: Angle of the front wheels, rad.
+        touched: Agents that have overlapped ego since the episode started; ignored.
+        acceleration: Last requested acceleration, m/s2.
+        steering: Steering angle, rad.
     """
 
     touched: Bool[Array, " S"]
@@ -103,25 +108,25 @@ class Memory:
 
 
 @record
-class Weighed:
-    """The proposals of a step: drivers of one line after each other, lines in order.
+class ScoredProposals:
+    """Simulated and scored proposals of a step: speeds of one line after each other, lines in order.
 
     Attributes:
-        cars: As they would be driven, step by step.
-        judgement: How each is evaluated.
+        cars: Simulated motion, step by step.
+        metrics: Metrics of each proposal.
         score: In [0, 1].
     """
 
     cars: Car
-    judgement: Judgement
+    metrics: ProposalMetrics
     score: Float[Array, " N"]
 
 
 @record
 class PdmPlanner:
-    """A rule-based driver: the best of 15 proposals, or the emergency brake; uses the situation's truth.
+    """Drive the best of 15 proposals, or brake; reads the true situation.
 
-    Others are expected to keep their velocities; of the log's future it knows nothing.
+    Other agents are predicted at constant velocity; the planner does not read the log's future.
     """
 
     actions: ActionSpace = static(default=Physical())
@@ -130,7 +135,7 @@ class PdmPlanner:
     replays: bool = static(default=False)
 
     def init(self, bank: ScenarioBank, state: SimState, key: Array) -> Memory:
-        """No agent touched yet; acceleration and steering as the motion of the last half second has them."""
+        """Return a carry without touched agents; acceleration and steering from the last half second."""
         context = state.context
         before, now = context.history[-1 - _PAST], context.history[-1]
         moved_m = (before[MOTION_SPEED] + now[MOTION_SPEED]) / 2 * _PAST * DT_S
@@ -153,23 +158,23 @@ class PdmPlanner:
         observation: Any,
         key: Array,
     ) -> tuple[Float[Array, " D"], Memory]:
-        """The first step of the best proposal, or the brake."""
+        """Return the first action of the best proposal, or brake."""
         context = situation.context
         motion, length = context.history[-1], situation.surroundings.frame.box[context.slot, LENGTH]
         carry = self._touching(carry, situation)
-        weighed = self.weigh(carry, bank, situation)
-        best = jnp.argmax(weighed.score)
+        scored = self.score_proposals(carry, bank, situation)
+        best = jnp.argmax(scored.score)
         speed, brake = motion[MOTION_SPEED], self.config.brake
-        brakes = is_emergency(weighed.judgement.fault_s[best], speed, brake)
+        brakes = is_emergency(scored.metrics.fault_s[best], speed, brake)
         stop = braking(speed, carry.acceleration, brake)
-        acceleration = jnp.where(brakes, stop, weighed.cars.acceleration[best, 1])
-        steering = jnp.where(brakes, 0.0, weighed.cars.steering[best, 1])
+        acceleration = jnp.where(brakes, stop, scored.cars.acceleration[best, 1])
+        steering = jnp.where(brakes, 0.0, scored.cars.steering[best, 1])
         curvature = jnp.tan(steering) / self._wheelbase(length)
         action = self.actions.action(motion, acceleration, curvature, length)
         return action, Memory(carry.touched, acceleration, steering)
 
-    def weigh(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> Weighed:
-        """All proposals, driven and evaluated."""
+    def score_proposals(self, carry: Memory, bank: ScenarioBank, situation: Situation) -> ScoredProposals:
+        """Simulate and score all proposals."""
         config, context, around = self.config, situation.context, situation.surroundings
         frame, motion = around.frame, context.history[-1]
         me = frame.box[context.slot]
@@ -183,25 +188,27 @@ class PdmPlanner:
         desired = jnp.where(lines.left_m > 0.0, limit, 0.0) * jnp.asarray(config.fractions)
         stop_m = stop_line_m(bank, context, frame)
         driver = (config.driver, config.steps, config.leader_every)
-        proposals = unrolled(lines, others, size, speed, desired, stop_m, driver)
+        proposals = unroll_idm(lines, others, size, speed, desired, stop_m, driver)
         reference = jax.lax.optimization_barrier(proposals.reference(lines))
         wheelbase = self._wheelbase(size[0])
         car = Car(motion, carry.acceleration, carry.steering)
-        cars = jax.vmap(lambda path: tracked(car, path, wheelbase, config.tracking))(reference)
+        cars = jax.vmap(lambda path: track(car, path, wheelbase, config.tracking))(reference)
         cars = jax.lax.optimization_barrier(cars)
         rows = lines.at(proposals.way).reshape(*reference.pose.shape[:2], -1)
         ground_z = frame.z[context.slot] - bank.height_m(context.index, context.slot) / 2
         z, on_route = ground_z + rows[..., LINE_Z], rows[..., LINE_PLACE] <= lines.left_m
         every = config.scoring.ground_every
-        ground = grounds(bank, context.index, cars.motion, size, z, on_route, every)
+        ground = ground_along(bank, context.index, cars.motion, size, z, on_route, every)
         ends = lines.places(cars.motion[:, -1, :2]) - lines.places(motion[:2])
         yaw_rate = speed * jnp.tan(carry.steering) / wheelbase
 
-        def judge(motion: Array, acceleration: Array, ground: Any, progress_m: Array) -> Judgement:
-            return judged(motion, acceleration, yaw_rate, size, others, ground, progress_m, config.scoring)
+        def evaluate(motion: Array, acceleration: Array, ground: Any, progress_m: Array) -> ProposalMetrics:
+            return evaluate_proposal(
+                motion, acceleration, yaw_rate, size, others, ground, progress_m, config.scoring
+            )
 
-        judgement = jax.vmap(judge)(cars.motion, cars.acceleration, ground, ends)
-        return Weighed(cars, judgement, scores(judgement, config.scoring))
+        metrics = jax.vmap(evaluate)(cars.motion, cars.acceleration, ground, ends)
+        return ScoredProposals(cars, metrics, scores(metrics, config.scoring))
 
     def _touching(self, carry: Memory, situation: Situation) -> Memory:
         frame, slot = situation.surroundings.frame, situation.context.slot

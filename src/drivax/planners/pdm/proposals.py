@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import COS, SIN, gap, overlap
 from drivax.geometry.vectors import norm
@@ -14,7 +14,7 @@ from drivax.planners.pdm.forecast import Forecast
 from drivax.planners.pdm.tracking import Reference
 from drivax.scenario.bank.columns import RouteColumn
 from drivax.scenario.bank.queries import route_ahead
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
@@ -47,23 +47,22 @@ class Lines:
 
     points: Float[Array, "P M 7"]
     route: Float[Array, "R 7"]
-    left_m: Float[Array, ""]
-    limit: Float[Array, ""]
+    left_m: Scalar
+    limit: Scalar
 
     @classmethod
     def along_route(
-        cls, bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""],
+        cls, bank: ScenarioBank, index: Integer, along_m: Scalar,
         offsets_m: tuple[float, ...], me: Float[Array, " 6"],
     ) -> Lines:  # fmt: skip
-        """Lines at lateral offsets from the route.
+        """Build lines at lateral offsets from the route, straight ahead of ego where there is no route.
 
-        Parallel lines share their normals, so all of them begin abreast of ego. Where there is no route they lead
-        straight ahead of it.
+        Parallel lines share their normals, so all of them start abreast of ego.
 
         Args:
             bank: The scenarios.
             index: Row of the bank.
-            along_m: Where ego is along its route.
+            along_m: Arc length of ego along its route.
             offsets_m: Lateral offsets, positive to the left.
             me: Ego's box.
         """
@@ -89,21 +88,21 @@ class Lines:
         return cls(points, base[::_EVERY], left_m, jnp.where(there, base[0, RouteColumn.LIMIT], 0.0))
 
     def at(self, way: Float[Array, "P *T"]) -> Float[Array, "P *T 7"]:
-        """Rows at ways along each line."""
+        """Interpolate rows at arc lengths of each line."""
         low = jnp.clip(way.astype(jnp.int32), 0, POINTS - 2)
         part = jnp.clip(way - low, 0.0, 1.0)[..., None]
         both = jax.vmap(lambda line, row: line[row])
         return both(self.points, low) * (1.0 - part) + both(self.points, low + 1) * part
 
     def places(self, xy: Float[Array, "*T 2"]) -> Float[Array, "*T"]:
-        """Places along the route, from ego on, of points next to it."""
+        """Arc lengths along the route, from ego on, of points next to it."""
         there = jnp.ones(self.route.shape[0], bool)
         offsets = jnp.arange(self.route.shape[0], dtype=jnp.float32) * _EVERY
         flat = xy.reshape(-1, 2)
         return project(self.route, there, offsets, flat, jnp.ones_like(flat))[0].reshape(xy.shape[:-1])
 
-    def pieces(self, width: Float[Array, ""]) -> Float[Array, "P C 6"]:
-        """The corridors of a width along the lines, as boxes."""
+    def pieces(self, width: Scalar) -> Float[Array, "P C 6"]:
+        """Corridors of a width along the lines, as boxes."""
         first, last = self.points[:, :-1:_PIECE_M], self.points[:, _PIECE_M::_PIECE_M]
         count = min(first.shape[1], last.shape[1])
         a, b = first[:, :count, : LINE_Y + 1], last[:, :count, : LINE_Y + 1]
@@ -120,7 +119,7 @@ class Lines:
 def _line(
     rows: Any, base: Float[Array, "M 7"], ways: Float[Array, " M"], offset: float
 ) -> Float[Array, "M 7"]:
-    """One line, at evenly spaced points along itself."""
+    """Return one line with evenly spaced points."""
 
     def shifted(row: Float[Array, "M 7"]) -> Float[Array, "M 2"]:
         normal = jnp.stack([-row[:, RouteColumn.SIN], row[:, RouteColumn.COS]], axis=-1)
@@ -153,10 +152,10 @@ def _line(
 
 @record
 class Proposals:
-    """Along P lines, F drivers each, at T steps from now on.
+    """Proposals along P lines with F target speeds, at T steps from now on.
 
     Attributes:
-        way: Along the line, m.
+        way: Arc length along the line, m.
         speed: m/s.
     """
 
@@ -164,29 +163,29 @@ class Proposals:
     speed: Float[Array, "P F T"]
 
     def reference(self, lines: Lines) -> Reference:
-        """The proposals one by one, drivers of the same line one behind the other."""
+        """Return the flattened proposals: target speeds of one line after each other."""
         rows = lines.at(self.way)
         flat = rows.reshape(-1, *rows.shape[2:])
         speed = self.speed.reshape(-1, self.speed.shape[-1])
         return Reference(flat[..., : LINE_SIN + 1], speed, flat[..., LINE_BEND])
 
 
-def unrolled(
-    lines: Lines, others: Forecast, size: Float[Array, " 2"], speed: Float[Array, ""],
-    desired: Float[Array, " F"], stop_m: Float[Array, ""], driver: tuple[IdmParameters, int, int],
+def unroll_idm(
+    lines: Lines, others: Forecast, size: Vector, speed: Scalar,
+    desired: Float[Array, " F"], stop_m: Scalar, driver: tuple[IdmParameters, int, int],
 ) -> Proposals:  # fmt: skip
-    """IDM along every line, Euler steps of 0.1 s.
+    """Simulate IDM along every line by Euler steps of 0.1 s.
 
-    Every few steps the leader is updated: of those whose box then reaches into the corridor as wide as ego and whose
-    centre is ahead, the one whose box is nearest to ego's. Its place is held until the next search.
+    The leader is updated every few steps: of the agents whose box reaches into the corridor of ego's width and whose
+    centre is ahead, the one nearest to ego's box. Its gap shrinks by ego's motion until the next search.
 
     Args:
         lines: The lines.
-        others: The others.
+        others: Forecast of the other agents.
         size: Length and width of ego.
         speed: Of ego, m/s.
-        desired: Speeds that the drivers want, m/s.
-        stop_m: From ego's front to the nearest stop line that asks to stop; infinite where there is none.
+        desired: Target speeds, m/s.
+        stop_m: Distance from ego's front to the nearest stop line that requires a stop; infinite for none.
         driver: Parameters, number of steps, and steps between searches.
     """
     parameters, steps, every = driver
@@ -231,5 +230,5 @@ def unrolled(
 
 
 def _on_corridor(pieces: Float[Array, "P C 6"], boxes: Float[Array, "U K 6"]) -> Bool[Array, "P U K"]:
-    """Whose box reaches into each corridor, at each time."""
+    """Mask of boxes that reach into each corridor, at each time."""
     return overlap(pieces[:, None, :, None], boxes[None, :, None]).any(axis=2)

@@ -1,6 +1,6 @@
-"""How PDM-Closed evaluates a proposal: gates that multiply a weighted mean of progress, time to collision and comfort.
+"""Scores of PDM-Closed: gates times a weighted mean of progress, time to collision and comfort.
 
-Source: Dauner et al. 2023 and the numbers of its published implementation, which follows nuPlan's closed-loop metrics.
+Source: Dauner et al. 2023 and its published implementation, which follows nuPlan's closed-loop metrics.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from drivax.geometry.boxes import LENGTH, corners
 from drivax.geometry.vectors import norm, wrap
@@ -24,29 +24,28 @@ from drivax.metrics.comfort import (
 )
 from drivax.planners.pdm.forecast import Forecast, boxes_of, fault_times, until_overlap
 from drivax.scenario.bank.queries import OFFROAD_TOLERANCE_M, around_lanes, is_mapped, offroad_distance
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S, AgentKind, Flag
 from drivax.simulator.contact import REAR_AXLE
 from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
 
-#: Who is seen more than 150 degrees from straight ahead of the rear axle is behind.
+#: Agents more than 150 degrees from straight ahead of the rear axle are behind.
 _BEHIND_COS = -(3.0**0.5) / 2.0
 
 
 @dataclass(frozen=True)
 class ScoringConfig:
-    """Weights and limits; the defaults are the published ones. Comfort has nuPlan's limits (``metrics.comfort``).
+    """Weights and limits; defaults as published. Comfort has nuPlan's limits (``metrics.comfort``).
 
     Attributes:
         progress, ttc, comfort: Weights of the mean.
-        static_collision: Gate of an at-fault collision with something that is neither vehicle, pedestrian nor cyclist.
-        ttc_s: How far ahead of each step a collision may be foreseen.
-        standing_mps: Below this speed nothing is foreseen.
-        astray_m: Distance off the route in one go up to which nothing, and up to which half is lost.
-        least_progress_m: Where the best proposal makes less progress, all that are allowed make the most.
-        ground_every: Steps between the poses at which lanes and edges are looked up. The publication looks them up at
-            every step; a car that is 5 m long is at most half a second further.
+        static_collision: Gate of an at-fault collision with an object other than a vehicle, pedestrian or cyclist.
+        ttc_s: Horizon of the time to collision at each step.
+        standing_mps: Speed below which time to collision is not evaluated.
+        astray_m: Continuous distances off the route's direction up to which the gate is 1, and up to which it is 0.5.
+        least_progress_m: If the best proposal makes less progress, all allowed proposals count as making the most.
+        ground_every: Steps between look-ups of lanes and edges; the publication looks them up at every step.
     """
 
     progress: float = 5.0
@@ -62,12 +61,12 @@ class ScoringConfig:
 
 @record
 class Ground:
-    """Where a drive lies, at each of its steps.
+    """Position relative to lanes and road at each step of a motion.
 
     Attributes:
         several: In more than one lane.
         off: Some corner is off the road.
-        astray: The centre is outside the lanes that go the route's way (nuPlan's oncoming traffic).
+        astray: The centre is outside the lanes in the route's direction (nuPlan's oncoming traffic).
     """
 
     several: Bool[Array, "*T"]
@@ -76,14 +75,14 @@ class Ground:
 
 
 @record
-class Judgement:
-    """Of a proposal.
+class ProposalMetrics:
+    """Metrics of a proposal.
 
     Attributes:
         collision, road, direction: Gates: 1 passed, 0 failed.
         progress_m: Along the route.
-        ttc, comfort: 1 kept, 0 not.
-        fault_s: When ego first hits another agent by its own fault, infinite where it does not.
+        ttc, comfort: 1 within limits, 0 not.
+        fault_s: Time of the first at-fault collision, infinite for none.
     """
 
     collision: Float[Array, "*batch"]
@@ -96,20 +95,16 @@ class Judgement:
 
 
 def ground_at(
-    bank: ScenarioBank,
-    index: Int[Array, ""],
-    box: Float[Array, " 6"],
-    z: Float[Array, ""],
-    on_route: Bool[Array, ""],
+    bank: ScenarioBank, index: Integer, box: Float[Array, " 6"], z: Scalar, on_route: Bool[Array, ""]
 ) -> Ground:
-    """Where a box lies.
+    """Return the position of a box relative to lanes and road.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         box: Ego at a hypothetical pose.
         z: Height of the ground there.
-        on_route: Whether the route still goes on there; where not, only driving against traffic is astray.
+        on_route: Whether the route continues there; beyond its end only wrong-way driving is astray.
     """
     points = corners(box)
     lanes = around_lanes(bank, index, box[:2], box[2:4], points, z)
@@ -119,19 +114,19 @@ def ground_at(
     return Ground(lanes.leaving_lane, (beyond > OFFROAD_TOLERANCE_M) & is_mapped(bank, index), astray)
 
 
-def grounds(
-    bank: ScenarioBank, index: Int[Array, ""], motion: Float[Array, "N T 4"], size: Float[Array, " 2"],
+def ground_along(
+    bank: ScenarioBank, index: Integer, motion: Float[Array, "N T 4"], size: Vector,
     z: Float[Array, "N T"], on_route: Bool[Array, "N T"], every: int,
 ) -> Ground:  # fmt: skip
-    """Where N drives from one pose lie; each step counts as the next one that is looked up.
+    """Return :func:`ground_at` along N motions from one pose; each step uses the next look-up.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
-        motion: The drives.
+        motion: The motions.
         size: Length and width of ego.
         z: Height of the ground at each step.
-        on_route: Whether the route goes on there.
+        on_route: Whether the route continues there.
         every: Steps between look-ups; divides T - 1.
     """
     box = boxes_of(motion, size)
@@ -150,20 +145,20 @@ def grounds(
     return jax.tree.map(spread, now, later)
 
 
-def judged(
-    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""], size: Float[Array, " 2"],
-    others: Forecast, ground: Ground, progress_m: Float[Array, ""], config: ScoringConfig,
-) -> Judgement:  # fmt: skip
-    """Evaluate one drive.
+def evaluate_proposal(
+    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar, size: Vector,
+    others: Forecast, ground: Ground, progress_m: Scalar, config: ScoringConfig,
+) -> ProposalMetrics:  # fmt: skip
+    """Evaluate one proposal.
 
     Args:
-        motion: The drive.
+        motion: Motion of ego.
         acceleration: At each step, m/s2.
         yaw_rate: Of ego now, rad/s.
         size: Length and width of ego.
-        others: The others.
-        ground: Where the drive lies.
-        progress_m: Way that it makes along the route.
+        others: Forecast of the other agents.
+        ground: Position relative to lanes and road at each step.
+        progress_m: Progress along the route.
         config: Limits.
     """
     unlawful = ground.several | ground.off
@@ -172,7 +167,7 @@ def judged(
     alive = (others.kind == AgentKind.VEHICLE) | (others.kind == AgentKind.PEDESTRIAN)
     alive |= others.kind == AgentKind.CYCLIST
     passed = jnp.where(jnp.isfinite(faults), jnp.where(alive, 0.0, config.static_collision), 1.0)
-    return Judgement(
+    return ProposalMetrics(
         collision=jnp.min(passed),
         road=1.0 - ground.off.any().astype(jnp.float32),
         direction=_direction(motion, ground.astray, config),
@@ -183,29 +178,27 @@ def judged(
     )
 
 
-def scores(judgement: Judgement, config: ScoringConfig) -> Float[Array, " N"]:
+def scores(metrics: ProposalMetrics, config: ScoringConfig) -> Float[Array, " N"]:
     """Scores of N proposals in [0, 1]: the product of the gates times the weighted mean.
 
-    Progress counts relative to the proposal that makes the most of it, gates included.
+    Progress is relative to the largest progress after gates.
     """
-    gates = judgement.collision * judgement.road * judgement.direction
-    gained = judgement.progress_m * gates
+    gates = metrics.collision * metrics.road * metrics.direction
+    gained = metrics.progress_m * gates
     most = jnp.max(gained)
     allowed = (gates > 0.0).astype(jnp.float32)
     progress = jnp.where(most > config.least_progress_m, gained / jnp.maximum(most, 1e-6), allowed)
     weights = config.progress, config.ttc, config.comfort
-    parts = progress, judgement.ttc, judgement.comfort
+    parts = progress, metrics.ttc, metrics.comfort
     mean = sum(weight * part for weight, part in zip(weights, parts, strict=True)) / sum(weights)
     return gates * mean
 
 
-def _direction(
-    motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig
-) -> Float[Array, ""]:
-    """1, 1/2 or 0 by the longest way astray in one go."""
+def _direction(motion: Float[Array, "T 4"], astray: Bool[Array, " T"], config: ScoringConfig) -> Scalar:
+    """Gate of wrong-way driving: 1, 1/2 or 0 by the longest continuous distance astray."""
     steps = norm(jnp.diff(motion[:, :2], axis=0)) * astray[1:]
     whole = jnp.cumsum(steps)
-    # What had been gone astray when ego last was not.
+    # Distance astray up to the last step that was not.
     before = jax.lax.cummax(jnp.where(astray[1:], 0.0, whole))
     longest = jnp.max(whole - before)
     fine, half = config.astray_m
@@ -213,13 +206,12 @@ def _direction(
 
 
 def _foreseen(
-    motion: Float[Array, "T 4"], size: Float[Array, " 2"], others: Forecast, soon_s: Float[Array, "T K"],
+    motion: Float[Array, "T 4"], size: Vector, others: Forecast, soon_s: Float[Array, "T K"],
     config: ScoringConfig,
 ) -> Bool[Array, ""]:  # fmt: skip
-    """Whether some step foresees a collision with another agent that is not behind ego at that step.
+    """Whether some step has a short time to collision with an agent that is not behind ego.
 
-    The first step that foresees one decides for each of the others. Sources do not say where intersections are, so
-    everywhere counts as one: those next to ego count too.
+    The first such step decides for each agent. Sources do not mark intersections, so agents next to ego always count.
     """
     steps = jnp.arange(motion.shape[0])
     sees = (soon_s <= config.ttc_s) & (motion[:, MOTION_SPEED] >= config.standing_mps)[:, None]
@@ -236,12 +228,12 @@ def _foreseen(
 
 
 def is_comfortable(
-    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Float[Array, ""]
+    motion: Float[Array, "T 4"], acceleration: Float[Array, " T"], yaw_rate: Scalar
 ) -> Bool[Array, ""]:
-    """Whether a drive keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``.
+    """Whether a motion keeps nuPlan's limits at every step, by the windows of ``metrics.comfort``.
 
     Args:
-        motion: The drive.
+        motion: Motion of ego.
         acceleration: At each step, m/s2.
         yaw_rate: Of ego now, rad/s.
     """

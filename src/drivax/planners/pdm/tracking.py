@@ -1,8 +1,7 @@
-"""A car that tracks a trajectory: two one-step linear-quadratic regulators and a bicycle with lags.
+"""Track a trajectory with two one-step linear-quadratic regulators and a bicycle model with actuator lags.
 
-Source: nuPlan's planner simulation (its LQR tracker and kinematic bicycle), which PDM-Closed drives its proposals with.
-The car itself moves by ``simulator.dynamics.bicycle``, as every driven agent does, so that the first step of what is
-tracked in thought is what happens.
+Source: nuPlan's planner simulation (LQR tracker and kinematic bicycle), which PDM-Closed uses for its proposals. The
+car moves by ``simulator.dynamics.bicycle``, so the first step of a tracked proposal equals the simulator's.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from drivax.geometry.vectors import wrap
+from drivax.scenario.bank.scenario_bank import Scalar
 from drivax.scenario.record import record
 from drivax.scenario.schema import DT_S
 from drivax.simulator.dynamics import bicycle
@@ -25,17 +25,17 @@ from drivax.simulator.types import MOTION_HEADING, MOTION_SPEED
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """The tracker and the car; the defaults are nuPlan's.
+    """Tracker and vehicle model; defaults as in nuPlan.
 
     Attributes:
-        horizon: Steps over which the commands are held, and how far ahead errors are looked at.
-        speed_weight, acceleration_weight: Prices of a squared speed error and acceleration.
-        lateral_weight, heading_weight, steering_weight, rate_weight: Prices of a squared lateral error (m),
+        horizon: Steps for which commands are held and after which errors are measured.
+        speed_weight, acceleration_weight: Costs of squared speed error and acceleration.
+        lateral_weight, heading_weight, steering_weight, rate_weight: Costs of squared lateral error (m),
             heading error (rad), steering angle (rad) and steering rate (rad/s).
-        stopping_mps, stopping_gain: Below this speed a car that is to stand is stopped by this gain, 1/s, instead.
+        stopping_mps, stopping_gain: Below this speed a stopping car uses this gain, 1/s, instead.
         acceleration_lag_s, steering_lag_s: Time constants of the actuators.
         most_steering: Largest steering angle, rad.
-        wheelbase: As a share of the length (nuPlan's vehicle: 3.089 m of 5.176 m).
+        wheelbase: Relative to the length (nuPlan's vehicle: 3.089 m of 5.176 m).
     """
 
     horizon: int = 10
@@ -70,12 +70,12 @@ class Car:
 
 @record
 class Reference:
-    """What is tracked, at steps of 0.1 s from now on.
+    """Reference trajectory, at steps of 0.1 s from now on.
 
     Attributes:
         pose: x, y, cosine and sine of the heading.
         speed: m/s.
-        curvature: Of the path there, 1/m.
+        curvature: Of the path, 1/m.
     """
 
     pose: Float[Array, "*batch T 4"]
@@ -83,9 +83,7 @@ class Reference:
     curvature: Float[Array, "*batch T"]
 
 
-def acceleration_to(
-    speed: Float[Array, ""], desired: Float[Array, ""], config: TrackingConfig
-) -> Float[Array, ""]:
+def acceleration_to(speed: Scalar, desired: Scalar, config: TrackingConfig) -> Scalar:
     """Acceleration that minimises ``q (v_N - v*)^2 + r a^2`` with ``v_N = v + N dt a``, m/s2.
 
     Args:
@@ -101,9 +99,9 @@ def steering_rate(
     error: tuple[Array, Array, Array],
     speeds: Float[Array, " N"],
     curvatures: Float[Array, " N"],
-    wheelbase: Float[Array, ""],
+    wheelbase: Scalar,
     config: TrackingConfig,
-) -> Float[Array, ""]:
+) -> Scalar:
     """Constant steering rate u that minimises ``x_N' Q x_N + r u^2``, rad/s.
 
     x is (lateral error e, heading error h, steering angle d), and per step
@@ -129,10 +127,8 @@ def steering_rate(
     return -(q_e * be * e + q_h * bh * h + q_d * bd * d) / gain
 
 
-def moved(
-    car: Car, acceleration: Array, rate: Array, wheelbase: Float[Array, ""], config: TrackingConfig
-) -> Car:
-    """The car one step after a command: each actuator goes ``dt / (dt + lag)`` of the way to what is asked for."""
+def moved(car: Car, acceleration: Array, rate: Array, wheelbase: Scalar, config: TrackingConfig) -> Car:
+    """Return the car one step after a command; each actuator closes ``dt / (dt + lag)`` of its error."""
     share = DT_S / (DT_S + config.acceleration_lag_s), DT_S / (DT_S + config.steering_lag_s)
     acceleration = car.acceleration + share[0] * (acceleration - car.acceleration)
     steering = car.steering + share[1] * rate * DT_S
@@ -141,8 +137,8 @@ def moved(
     return Car(motion, acceleration, steering)
 
 
-def tracked(car: Car, reference: Reference, wheelbase: Float[Array, ""], config: TrackingConfig) -> Car:
-    """The car at every step of a reference, the present one included, as it tracks it."""
+def track(car: Car, reference: Reference, wheelbase: Scalar, config: TrackingConfig) -> Car:
+    """Return the car at every step of a reference, the present one included."""
     last = reference.speed.shape[0] - 1
     ahead = np.minimum(np.arange(last)[:, None] + np.arange(config.horizon), last)
     to_have = reference.speed[np.minimum(np.arange(last) + config.horizon, last)]

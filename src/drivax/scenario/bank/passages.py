@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool
 
 from drivax.geometry.vectors import norm, root
 from drivax.scenario.bank.columns import StrandColumn
 from drivax.scenario.bank.queries import LANE_CUTOFF_M, aligned_lanes
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.record import record
 
@@ -37,18 +37,17 @@ class Passage:
         merged: The previous strand ends, or joins this one, within 100 m.
     """
 
-    strand: Int[Array, ""]
+    strand: Integer
     changed: Bool[Array, ""]
     merged: Bool[Array, ""]
 
 
 def lane_passage(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
-    z: Float[Array, ""], before: Any,
-) -> Passage:  # fmt: skip
+    bank: ScenarioBank, index: Integer, xy: Vector, heading: Vector, z: Scalar, before: Any
+) -> Passage:
     """Return the passage of a step; ``z`` is the height of the ground, ``before`` the previous strand or -1."""
     lane, squared, side = aligned_lanes(bank, index, xy, heading, z)
-    codes = bank.lane_codes[index]
+    codes = bank.lane_strands[index]
     strand = jnp.where(lane >= 0, codes[lane, StrandColumn.STRAND], -1.0).astype(jnp.int32)
     best = first_smallest(squared)
     own = jnp.where((strand == before) & (strand >= 0), squared, _FAR)

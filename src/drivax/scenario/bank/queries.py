@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from drivax.geometry.vectors import root
 from drivax.scenario.bank.columns import EdgeRow, LaneRow, LightRow, RouteColumn
-from drivax.scenario.bank.scenario_bank import ScenarioBank
+from drivax.scenario.bank.scenario_bank import Integer, Scalar, ScenarioBank, Vector
 from drivax.scenario.bank.smallest import first_smallest
 from drivax.scenario.build.grid import NOT_DRIVABLE, SPLIT
 from drivax.scenario.record import record
@@ -35,9 +35,8 @@ _WINDOW_BEHIND = 6
 
 
 def left_of_edges(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
-    z: Float[Array, ""],
-) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "P 2"], z: Scalar
+) -> tuple[Float[Array, " P"], Bool[Array, " P"]]:
     """Signed distance of points to the nearest road edge: positive on its drivable (left) side, in metres.
 
     At a vertex two segments are equally near; the segment whose line is further away decides. Points must lie within 5
@@ -58,14 +57,14 @@ def left_of_edges(
 
 
 def edges_around(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]
+    bank: ScenarioBank, index: Integer, xy: Vector
 ) -> tuple[Float[Array, "5 K"], Bool[Array, " K"]]:
     """Road edges (:class:`EdgeRow`) in the 3 x 3 cells around a point, and the mask of valid ones."""
     return _around(bank, bank.grid_edge, bank.edges, bank.edge_run, index, xy)
 
 
 def lanes_around(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]
+    bank: ScenarioBank, index: Integer, xy: Vector
 ) -> tuple[Float[Array, "8 K"], Bool[Array, " K"]]:
     """Car lanes (:class:`LaneRow`) in the 3 x 3 cells around a point, and the mask of valid ones."""
     return _around(bank, bank.grid_lane, bank.lanes, bank.lane_run, index, xy)
@@ -73,7 +72,7 @@ def lanes_around(
 
 def _around(
     bank: ScenarioBank, start: Int[Array, "N cells1"], rows: Float[Array, "N F S"], run: int,
-    index: Int[Array, ""], xy: Float[Array, " 2"],
+    index: Integer, xy: Vector,
 ) -> tuple[Float[Array, "F K"], Bool[Array, " K"]]:  # fmt: skip
     """Read three contiguous runs of fixed length; a grid of a single cell is read whole."""
     grid = round((start.shape[1] - 1) ** 0.5)
@@ -106,7 +105,7 @@ def to_segments(
     return dx * dx + dy * dy, (ux * wy - uy * wx) * jax.lax.rsqrt(squared)
 
 
-def _level(height: Float[Array, " K"], z: Float[Array, ""]) -> Bool[Array, " K"]:
+def _level(height: Float[Array, " K"], z: Scalar) -> Bool[Array, " K"]:
     """Whether segments lie on the level of a height."""
     return jnp.abs(height - z) <= LEVEL_M
 
@@ -116,7 +115,7 @@ def _chord(rows: Float[Array, "F K"]) -> tuple[Float[Array, " K"], Float[Array, 
     return rows[LaneRow.X_B] - rows[LaneRow.X_A], rows[LaneRow.Y_B] - rows[LaneRow.Y_A]
 
 
-def _runs_along(rows: Float[Array, "F K"], heading: Float[Array, " 2"]) -> Bool[Array, " K"]:
+def _runs_along(rows: Float[Array, "F K"], heading: Vector) -> Bool[Array, " K"]:
     """Whether segments lead less than 90 degrees away from a heading."""
     ux, uy = _chord(rows)
     return ux * heading[0] + uy * heading[1] > 0.0
@@ -145,15 +144,15 @@ class LaneHits:
     wrong_way: Bool[Array, ""]
     straddling: Bool[Array, ""]
     leaving_lane: Bool[Array, ""]
-    limit: Float[Array, ""]
-    lane: Int[Array, ""]
-    offset: Float[Array, ""]
-    z: Float[Array, ""]
+    limit: Scalar
+    lane: Integer
+    offset: Scalar
+    z: Scalar
 
 
 def around_lanes(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], heading: Float[Array, " 2"],
-    points: Float[Array, "P 2"], z: Float[Array, ""],
+    bank: ScenarioBank, index: Integer, centre: Vector, heading: Vector,
+    points: Float[Array, "P 2"], z: Scalar,
 ) -> LaneHits:  # fmt: skip
     """Query the lanes around a box given by centre, heading (cosine, sine), corners ``points`` and height."""
     rows, inside = lanes_around(bank, index, centre)
@@ -195,9 +194,8 @@ def around_lanes(
 
 
 def aligned_lanes(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
-    z: Float[Array, ""],
-) -> tuple[Int[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, xy: Vector, heading: Vector, z: Scalar
+) -> tuple[Int[Array, " K"], Float[Array, " K"], Float[Array, " K"]]:
     """Lane segments around a point in its direction: lane, squared distance, signed distance to the line (left +).
 
     Others have lane -1 and a very large distance.
@@ -212,9 +210,7 @@ def aligned_lanes(
     )
 
 
-def lane_distance(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], z: Float[Array, ""]
-) -> Float[Array, ""]:
+def lane_distance(bank: ScenarioBank, index: Integer, xy: Vector, z: Scalar) -> Scalar:
     """Distance to the nearest lane centre in any direction, m; infinite beyond the cut-off."""
     rows, inside = lanes_around(bank, index, xy)
     squared = to_segments(rows, xy[None])[0][0]
@@ -223,8 +219,8 @@ def lane_distance(
 
 
 def vertex_distances(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], spacing_m: float
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    bank: ScenarioBank, index: Integer, xy: Vector, spacing_m: float
+) -> tuple[Scalar, Scalar]:
     """Distance to the nearest vertex of a road edge and of a lane centre, on any level, m.
 
     The measure of tools that keep maps as points: segments get a vertex every ``spacing_m`` from their beginning, and
@@ -237,8 +233,8 @@ def vertex_distances(
 
 
 def _nearest_vertex(
-    rows: Float[Array, "F K"], inside: Bool[Array, " K"], xy: Float[Array, " 2"], spacing_m: float
-) -> Float[Array, ""]:
+    rows: Float[Array, "F K"], inside: Bool[Array, " K"], xy: Vector, spacing_m: float
+) -> Scalar:
     begin, end = rows[EdgeRow.A], rows[EdgeRow.B]
     u, w = end - begin, xy[:, None] - begin
     length = root(jnp.sum(u * u, axis=0))
@@ -258,11 +254,7 @@ def _outside_lanes(
 
 
 def _corner_lanes(
-    bank: ScenarioBank,
-    index: Int[Array, ""],
-    point: Float[Array, " 2"],
-    heading: Float[Array, " 2"],
-    z: Float[Array, ""],
+    bank: ScenarioBank, index: Integer, point: Vector, heading: Vector, z: Scalar
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether a lane is near to a corner of a long box, and whether the corner is outside all lanes."""
     rows, inside = lanes_around(bank, index, point)
@@ -273,8 +265,8 @@ def _corner_lanes(
 
 
 def offroad_distance(
-    bank: ScenarioBank, index: Int[Array, ""], centre: Float[Array, " 2"], points: Float[Array, "P 2"],
-    points_near_lane: Bool[Array, " P"], z: Float[Array, ""],
+    bank: ScenarioBank, index: Integer, centre: Vector, points: Float[Array, "P 2"],
+    points_near_lane: Bool[Array, " P"], z: Scalar,
 ) -> Float[Array, " P"]:  # fmt: skip
     """Signed distance of points beyond the nearest road edge, m: positive off the road, negative on it.
 
@@ -291,7 +283,7 @@ def offroad_distance(
     return jnp.where(known, -left, jnp.where(off, EDGE_CUTOFF_M, -EDGE_CUTOFF_M))
 
 
-def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array, "P 2"]) -> Int[Array, " P"]:
+def _stored_side(bank: ScenarioBank, index: Integer, points: Float[Array, "P 2"]) -> Int[Array, " P"]:
     """Code of the side cell of each point (``scenario.build.grid.packed``); 0 outside the grid."""
     grid = round(bank.grid_side.shape[1] ** 0.5)
     fine = jnp.floor((points - bank.grid_origin[index]) / (bank.cell_m / SPLIT)).astype(jnp.int32)
@@ -301,13 +293,13 @@ def _stored_side(bank: ScenarioBank, index: Int[Array, ""], points: Float[Array,
     return jnp.where(inside, (word >> (2 * (part[:, 1] * SPLIT + part[:, 0]))) & 3, 0)
 
 
-def left_the_map(bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"]) -> Bool[Array, ""]:
+def left_the_map(bank: ScenarioBank, index: Integer, xy: Vector) -> Bool[Array, ""]:
     """Return whether a point lies outside the box of all edges and lanes."""
     box = bank.map_box[index]
     return ((xy < box[:2]).any() | (xy > box[2:]).any()) & is_mapped(bank, index)
 
 
-def is_mapped(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, ""]:
+def is_mapped(bank: ScenarioBank, index: Integer) -> Bool[Array, ""]:
     """Return whether the scenario has any edge or lane."""
     return (bank.grid_edge[index, -1] > 0) | (bank.grid_lane[index, -1] > 0)
 
@@ -316,18 +308,18 @@ def is_mapped(bank: ScenarioBank, index: Int[Array, ""]) -> Bool[Array, ""]:
 class RouteHit:
     """Projection on the route: arc length, signed lateral distance (left positive), m; heading cosine and sine."""
 
-    along_m: Float[Array, ""]
-    lateral_m: Float[Array, ""]
-    distance_m: Float[Array, ""]
-    heading: Float[Array, " 2"]
+    along_m: Scalar
+    lateral_m: Scalar
+    distance_m: Scalar
+    heading: Vector
 
 
 def project_on_route(
     bank: ScenarioBank,
-    index: Int[Array, ""],
-    xy: Float[Array, " 2"],
-    near_m: Float[Array, ""],
-    ahead_m: float | Float[Array, ""] = 33.0,
+    index: Integer,
+    xy: Vector,
+    near_m: Scalar,
+    ahead_m: float | Scalar = 33.0,
     route: int = 0,
 ) -> RouteHit:
     """Project a point on a route within a window from 6 m behind to ``ahead_m`` ahead of ``near_m``.
@@ -364,9 +356,8 @@ def project_on_route(
 
 
 def route_ahead(
-    bank: ScenarioBank, index: Int[Array, ""], along_m: Float[Array, ""], offsets_m: Float[Array, " K"],
-    route: int = 0,
-) -> tuple[Float[Array, "K 7"], Bool[Array, " K"]]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, along_m: Scalar, offsets_m: Float[Array, " K"], route: int = 0
+) -> tuple[Float[Array, "K 7"], Bool[Array, " K"]]:
     """Points of a route (:class:`RouteColumn`) at arc lengths ``along_m + offsets_m``, and the mask of valid ones."""
     at = jnp.maximum(along_m + offsets_m, 0.0)
     last = bank.route_points[index, route] - 1
@@ -378,11 +369,7 @@ def route_ahead(
 
 
 def light_crossing(
-    bank: ScenarioBank,
-    index: Int[Array, ""],
-    before: Float[Array, " 2"],
-    now: Float[Array, " 2"],
-    z: Float[Array, ""],
+    bank: ScenarioBank, index: Integer, before: Vector, now: Vector, z: Scalar
 ) -> tuple[Bool[Array, " L"], Float[Array, " L"]]:
     """Mask of the stop lines that a point crossed forwards between two steps, and its distance before each line, m.
 
@@ -392,7 +379,7 @@ def light_crossing(
     line = bank.light_line[index]
     cos, sin, half = line[LightRow.COS], line[LightRow.SIN], line[LightRow.HALF]
 
-    def split(point: Float[Array, " 2"]) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
+    def split(point: Vector) -> tuple[Float[Array, " L"], Float[Array, " L"]]:
         dx, dy = point[0] - line[LightRow.X], point[1] - line[LightRow.Y]
         return dx * cos + dy * sin, dy * cos - dx * sin
 
@@ -405,9 +392,8 @@ def light_crossing(
 
 
 def lane_course(
-    bank: ScenarioBank, index: Int[Array, ""], xy: Float[Array, " 2"], heading: Float[Array, " 2"],
-    z: Float[Array, ""],
-) -> tuple[Float[Array, " 2"], Float[Array, ""], Bool[Array, ""]]:  # fmt: skip
+    bank: ScenarioBank, index: Integer, xy: Vector, heading: Vector, z: Scalar
+) -> tuple[Vector, Scalar, Bool[Array, ""]]:
     """Direction of the lane that a car at a pose follows.
 
     It is the best lane within 2.5 m and 60 degrees, where a metre weighs as much as 15 degrees: a car that has started

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt, UInt32
 from drivax.errors import DataError, DrivaxError
 from drivax.geometry.vectors import wrap
 from drivax.scenario.bank.columns import RoadLayer, SizeColumn
-from drivax.scenario.bank.strands import corridor_lanes, lane_codes
+from drivax.scenario.bank.strands import corridor_lanes, lane_strands
 from drivax.scenario.record import record, static
 from drivax.scenario.schema import (
     EDGE_KINDS,
@@ -33,6 +33,10 @@ from drivax.scenario.schema import (
     among,
 )
 
+#: Types of map queries: a number, an index, and a point or direction.
+Scalar = Float[Array, ""]
+Integer = Int[Array, ""]
+Vector = Float[Array, " 2"]
 #: Sizes are multiples of this, so that banks of similar scenarios share programs.
 _MULTIPLE = 8
 #: Lane width where the source gives none, m.
@@ -73,18 +77,11 @@ class Sizes:
     @classmethod
     def whole(cls, capacity: Capacity) -> Sizes:
         """Return the sizes of a capacity."""
+        c = capacity
         return cls(
-            agents=capacity.agents,
-            slots=capacity.agents + capacity.parked,
-            lights=capacity.lights,
-            edges=capacity.segments,
-            lanes=capacity.segments,
-            edge_run=capacity.edge_run,
-            lane_run=capacity.lane_run,
-            graphs=capacity.lanes,
-            road=capacity.road_rows,
-            long_ego=False,
-        )
+            agents=c.agents, slots=c.agents + c.parked, lights=c.lights, edges=c.segments, lanes=c.segments,
+            edge_run=c.edge_run, lane_run=c.lane_run, graphs=c.lanes, road=c.road_rows, long_ego=False,
+        )  # fmt: skip
 
     @classmethod
     def used(cls, scenarios: Iterable[Scenario]) -> Sizes:
@@ -157,7 +154,7 @@ class ScenarioBank:
         light_line: Stop lines, :class:`LightRow`.
         edges: Road-edge segments (drivable side on the left) sorted by grid cell, :class:`EdgeRow`.
         lanes: Car-lane segments sorted by grid cell, :class:`LaneRow`.
-        lane_codes: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
+        lane_strands: Strand, neighbours and end of every lane of the graph, :class:`StrandColumn`.
         grid_edge, grid_lane: Start of the run of each cell in ``edges`` and ``lanes`` (row-major, plus the end).
         grid_side: Drivable sides beyond the cut-off of all edges (``scenario.build.grid.packed``).
         map_box: Smallest and largest x, y of edges and lanes.
@@ -183,7 +180,7 @@ class ScenarioBank:
     light_state: Int[Array, "N T L"]
     edges: Float[Array, "N 5 E"]
     lanes: Float[Array, "N 8 C"]
-    lane_codes: Float[Array, "N G 6"]
+    lane_strands: Float[Array, "N G 6"]
     grid_edge: Int[Array, "N cells1"]
     grid_lane: Int[Array, "N cells1"]
     grid_side: Int[Array, "N cells"]
@@ -219,11 +216,11 @@ class ScenarioBank:
         """Bytes of the bank on the device."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
 
-    def length_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+    def length_m(self, index: Integer, slot: int | Integer) -> Scalar:
         """Length of an agent, m."""
         return self.agent_box[index, slot, SizeColumn.LENGTH]
 
-    def height_m(self, index: Int[Array, ""], slot: int | Int[Array, ""]) -> Float[Array, ""]:
+    def height_m(self, index: Integer, slot: int | Integer) -> Scalar:
         """Height of an agent, m."""
         return self.agent_box[index, slot, SizeColumn.HEIGHT]
 
@@ -285,31 +282,34 @@ def identities(names: Iterable[tuple[str, str]]) -> UInt32[np.ndarray, " n"]:
     return np.array(numbers, np.uint32)
 
 
+_Arrays = dict[str, np.ndarray[Any, Any]]
+
+
 def _column(scenarios: Sequence[Scenario], name: str) -> np.ndarray[Any, Any]:
     return np.stack([scenario.record[name] for scenario in scenarios])
 
 
-def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+def _columns(scenarios: Sequence[Scenario], prefix: str, *names: str) -> list[np.ndarray[Any, Any]]:
+    return [_column(scenarios, f"{prefix}_{name}") for name in names]
+
+
+def _join(*parts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Concatenate columns in float32; parts with one dimension less than the first are single columns."""
+    rank = parts[0].ndim
+    return np.concatenate([p if p.ndim == rank else p[..., None] for p in parts], -1, dtype=np.float32)
+
+
+def _stack(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     arrays = _stack_agents(scenarios, sizes) | _stack_routes(scenarios) | _stack_lights(scenarios, sizes)
     return arrays | _stack_road(scenarios, sizes) | _stack_maps(scenarios, sizes)
 
 
-def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
-    valid, count = _column(scenarios, "agent_valid"), sizes.agents
-    heading, size = _column(scenarios, "agent_heading"), _column(scenarios, "agent_size")
-    agents = np.concatenate(
-        [
-            _column(scenarios, "agent_xy"),
-            _column(scenarios, "agent_z")[..., None],
-            np.cos(heading)[..., None],
-            np.sin(heading)[..., None],
-            _column(scenarios, "agent_velocity"),
-            valid[..., None],
-        ],
-        -1,
-        dtype=np.float32,
-    )[:, :, :count]
-    box = np.concatenate([size, _column(scenarios, "agent_kind")[..., None]], -1, dtype=np.float32)[:, :count]
+def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
+    names = ("xy", "z", "heading", "velocity", "valid", "size", "kind")
+    xy, z, heading, velocity, valid, size, kind = _columns(scenarios, "agent", *names)
+    count = sizes.agents
+    agents = _join(xy, z, np.cos(heading), np.sin(heading), velocity, valid)[:, :, :count]
+    box = _join(size, kind)[:, :count]
     return {
         "agents": agents,
         "extension": _column(scenarios, "agent_extension")[:, :count],
@@ -321,22 +321,19 @@ def _stack_agents(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.n
 
 def _stack_parked(
     scenarios: Sequence[Scenario], slots: int, first: np.ndarray[Any, Any], box: np.ndarray[Any, Any]
-) -> dict[str, np.ndarray[Any, Any]]:
+) -> _Arrays:
     """Parked agents, from slot ``first`` of their scenario on, and the boxes of all agents."""
-    valid, heading = _column(scenarios, "parked_valid"), _column(scenarios, "parked_heading")
+    names = ("xy", "z", "heading", "valid", "size", "kind")
+    xy, z, heading, valid, size, kind = _columns(scenarios, "parked", *names)
     count = last_used(valid.any(1))
-    scenario, place = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
+    scenario, place = chosen = np.nonzero(np.arange(valid.shape[2]) < count[:, None])
     at = scenario, first[scenario] + place
     rows = np.zeros((len(scenarios), slots, 8), np.float32)
-    heading, z = heading[scenario, place], _column(scenarios, "parked_z")[scenario, place]
-    xy = _column(scenarios, "parked_xy")[scenario, place]
-    still, there = np.zeros((len(z), 2)), np.ones((len(z), 1))
-    pose = [xy, z[:, None], np.cos(heading)[:, None], np.sin(heading)[:, None]]
-    rows[at] = np.concatenate([*pose, still, there], axis=1)
+    xy, z, heading = xy[chosen], z[chosen], heading[chosen]
+    rows[at] = _join(xy, z, np.cos(heading), np.sin(heading), np.zeros((len(z), 2)), np.ones(len(z)))
     boxes = np.zeros((len(scenarios), slots, 4), np.float32)
     boxes[:, : box.shape[1]] = box
-    size, kind = _column(scenarios, "parked_size"), _column(scenarios, "parked_kind")
-    boxes[at] = np.concatenate([size, kind[..., None]], -1)[scenario, place]
+    boxes[at] = np.concatenate([size, kind[..., None]], -1)[chosen]
     when = np.zeros((len(scenarios), valid.shape[1], slots), bool)
     when[scenario, :, at[1]] = valid[scenario, :, place]
     return {"agent_box": boxes, "parked": rows, "parked_when": as_words(when)}
@@ -350,22 +347,11 @@ def as_words(when: Bool[np.ndarray, "N T S"]) -> UInt[np.ndarray, "N W S"]:
     return (bits << np.arange(WORD, dtype=np.uint32)[:, None]).sum(axis=2, dtype=np.uint32)
 
 
-def _stack_routes(scenarios: Sequence[Scenario]) -> dict[str, np.ndarray[Any, Any]]:
-    heading = _column(scenarios, "route_heading")[:, :2, :, None]
-    routes = np.concatenate(
-        [
-            _column(scenarios, "route_xy")[:, :2],
-            _column(scenarios, "route_z")[:, :2, :, None],
-            np.cos(heading),
-            np.sin(heading),
-            _column(scenarios, "route_limit")[:, :2, :, None],
-            _column(scenarios, "route_lane")[:, :2, :, None],
-        ],
-        -1,
-        dtype=np.float32,
-    )
+def _stack_routes(scenarios: Sequence[Scenario]) -> _Arrays:
+    names = ("xy", "z", "heading", "limit", "lane")
+    xy, z, heading, limit, lane = (column[:, :2] for column in _columns(scenarios, "route", *names))
     return {
-        "routes": routes,
+        "routes": _join(xy, z, np.cos(heading), np.sin(heading), limit, lane),
         "route_points": _column(scenarios, "route_points")[:, :2].astype(np.int32),
         "goal": _column(scenarios, "goal_xy"),
         "log_progress": _column(scenarios, "log_progress"),
@@ -381,9 +367,9 @@ def _log_ahead(scenarios: Sequence[Scenario]) -> np.ndarray[Any, Any]:
     return np.concatenate([ahead, np.zeros_like(ahead[:, :1])], axis=1).astype(np.float32)
 
 
-def _stack_lights(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_lights(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     line, state = _column(scenarios, "light_line").astype(np.float64), _column(scenarios, "light_state")
-    z, heading, exits = (_column(scenarios, f"light_{name}") for name in ("z", "heading", "exit_heading"))
+    z, heading, exits = _columns(scenarios, "light", "z", "heading", "exit_heading")
     middle, along = (line[..., :2] + line[..., 2:]) / 2, line[..., 2:] - line[..., :2]
     half = np.hypot(*np.moveaxis(along, -1, 0)) / 2
     x, y = np.moveaxis(middle, -1, 0)
@@ -412,7 +398,7 @@ def _stop_arcs(scenario: Scenario, middle: np.ndarray[Any, Any]) -> np.ndarray[A
     return arcs
 
 
-def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     blocks = _column(scenarios, "segment_blocks").astype(np.int64)
     edge_count, lane_count = blocks[:, 1], blocks[:, 2] - blocks[:, 1]
     # Queries read whole runs, so a run must fit behind the last start.
@@ -430,7 +416,7 @@ def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.nda
     return {
         "edges": edges,
         "lanes": lanes,
-        "lane_codes": np.stack([lane_codes(scenario) for scenario in scenarios])[:, : sizes.graphs],
+        "lane_strands": np.stack([lane_strands(scenario) for scenario in scenarios])[:, : sizes.graphs],
         "grid_edge": _column(scenarios, "grid_edge").astype(np.int16),
         "grid_lane": (_column(scenarios, "grid_lane") - blocks[:, 1:2]).astype(np.int16),
         "grid_side": _column(scenarios, "grid_side"),
@@ -439,19 +425,16 @@ def _stack_maps(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.nda
     }
 
 
-def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> dict[str, np.ndarray[Any, Any]]:
+def _stack_road(scenarios: Sequence[Scenario], sizes: Sizes) -> _Arrays:
     rows = _column(scenarios, "road_rows").astype(np.int32)
     used = sizes.road
-    xy, direction, length, kind, limit, curvature = (
-        _column(scenarios, f"road_{name}")[:, :used]
-        for name in ("xy", "direction", "length", "kind", "limit", "curvature")
-    )
+    names = ("xy", "direction", "length", "kind", "limit", "curvature")
+    xy, direction, length, kind, limit, curvature = (c[:, :used] for c in _columns(scenarios, "road", *names))
     layers = np.stack([among(kind, kinds) for kinds in (LANE_KINDS, EDGE_KINDS, POLYGON_KINDS)], axis=-1)
     there = np.arange(used) < rows[:, None]
     layer = np.where(there & layers.any(-1), np.argmax(layers, axis=-1), RoadLayer.NONE)
-    columns = [xy, direction, length[..., None], layer[..., None], limit[..., None]]
     return {
-        "road": np.concatenate(columns, -1, dtype=np.float32),
+        "road": _join(xy, direction, length, layer, limit),
         "road_at": np.stack([xy[..., 0], xy[..., 1], layer], axis=1, dtype=np.float32),
         "road_curvature": curvature.astype(np.float32),
     }

@@ -35,7 +35,7 @@ _KNOWN_M = 95.0
 _SLACK_M, _KEY_M = 1.0, 1e6
 
 
-def lane_codes(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
+def lane_strands(scenario: Scenario) -> Float32[np.ndarray, "lane 6"]:
     """Return the table :class:`StrandColumn` of a scenario, a row per stored lane.
 
     A strand is named by its last lane, or by the highest lane of a ring. It merges if its last lane leads onto another

@@ -1,7 +1,6 @@
-"""Paths of agents that react: where each goes along its own log and beyond, how fast, and past which stop lines.
+"""Paths of reacting agents: geometry along the log and beyond, speed limits, and stop lines.
 
-Computed once per bank, with numpy (:func:`with_paths`), so that a step only looks up: a pose is two neighbouring rows
-of a path, a curve's speed is one of its columns, a red light is an arc length.
+Computed once per bank with numpy (:func:`with_paths`); a step only looks up rows.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from drivax.simulator.traffic.bank_data import TrafficData, find_data, with_data
 
 #: Points of a path, equally far apart along it.
 PATH_POINTS = 96
-#: What looking ahead reads is apart from the rest: half as many cache lines, and it is most of what is read.
+#: Columns read by the look-ahead are stored apart: half as many cache lines for most of the reads.
 PATH_X, PATH_Y, PATH_COS, PATH_SIN = range(4)
 PROFILE_Z, PROFILE_SPEED = range(2)
 #: How far a path goes on beyond the last logged pose, m (semantics, Traffic), and the stored points' distance.
 EXTENSION_M, _EXTENSION_STEP_M = 60.0, 4.0
 #: An agent reacts if it travels further than this in the rest of its log, m.
 TRAVELS_M = 2.0
-#: How many things that an agent overlaps in its log are remembered per step.
+#: Overlapping agents stored per step.
 OVERLAPS = 2
 #: Logged positions nearer to each other than this do not shape a path, m: a standing car's boxes jitter.
 _KEY_M = 1.0
-#: A log that goes backwards further than this is one of a reversing vehicle, m.
+#: A log that moves backwards further than this belongs to a reversing vehicle, m.
 _BACKWARDS_M = 1.5
 #: Lateral acceleration in curves and braking towards them, m/s2.
 CURVE_MPS2, CURVE_BRAKING_MPS2 = 2.5, 1.5
@@ -53,16 +52,16 @@ class AgentPaths(TrafficData):
 
     Attributes:
         slot: Agent slot of each path.
-        points: x, y, cos, sin, equally far apart.
-        profile: Height of the box centre, and the highest speed that peak and curves allow (m/s), at the same points.
+        points: x, y, cos, sin, evenly spaced.
+        profile: Height of the box centre, and speed limit from peak and curves (m/s), at the same points.
         spacing: Arc length between two points, m.
-        log_arc: Where the log is on the path at each step, m; never decreases, holds while the agent is unseen.
-        log_speed: Speed of the log at each step, not negative, m/s.
-        appears: The first step at or after each one at which the log has the agent; T where there is none.
+        log_arc: Arc length of the logged agent at each step, m; never decreases, holds while unobserved.
+        log_speed: Logged speed at each step, not negative, m/s.
+        appears: First step at or after each step at which the log has the agent; T for none.
         stop_arc: Arc lengths of the stop lines that the path crosses, m; very large for none.
         stop_light: Slot of the light of each of them.
-        overlaps: Slots of the frame whose boxes the agent's overlaps in the log, -1 for none; two at most are kept.
-        kinds: Classes of agents for which these paths were made.
+        overlaps: Up to two slots whose boxes the agent overlaps in the log, -1 for none.
+        kinds: Agent classes with paths.
     """
 
     slot: Int[Array, "N R"]
@@ -104,15 +103,11 @@ class _Courses:
 
 
 def with_paths(bank: ScenarioBank, kinds: tuple[int, ...] = (int(AgentKind.VEHICLE),)) -> ScenarioBank:
-    """The bank with the paths of every agent of these kinds that drives forward further than 2 m in its log.
+    """Return the bank with paths of all agents of ``kinds`` that drive forward more than 2 m in their log.
 
-    A path is the logged line, thinned to a metre, with the logged headings, and goes on for 60 m along the agent's
-    last lane. The speed along it is at most the log's peak and what 2.5 m/s2 of lateral acceleration allow, with
-    1.5 m/s2 of braking towards a curve.
-
-    Args:
-        bank: The scenarios; one that has such paths already is returned unchanged.
-        kinds: Classes of agents (``scenario.schema.AgentKind``) that may react.
+    A path is the logged line, thinned to a metre, with logged headings, extended by 60 m along the agent's last lane.
+    Its speed limit is the log's peak, 2.5 m/s2 of lateral acceleration, and 1.5 m/s2 of braking towards curves. A bank
+    that already has such paths is returned unchanged.
     """
     known = find_data(bank, AgentPaths)
     if known is not None and known.kinds == kinds:

@@ -1,8 +1,8 @@
-"""Who is in the way of vehicles on their paths: the nearest of the 8 closest things in each one's corridor.
+"""Find the leader of each vehicle on its path: the nearest of the 8 closest agents in its corridor.
 
-All R vehicles of a scenario at once. Of all S things, comparing boxes with three rectangles around the path ahead
-leaves those that are in the corridor or hardly next to it; the 8 closest of them are found by eight minima
-(a sort costs several times as much), and only these are measured against the path.
+Works on all R vehicles of a scenario at once. A test of S boxes against three rectangles around the path ahead keeps
+those in or near the corridor; eight minima select the 8 closest (a sort is several times slower), and only these are
+measured against the path.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from drivax.scenario.record import record
 from drivax.simulator.traffic.agent_paths import PATH_COS, PATH_POINTS, PATH_SIN, AgentPaths
 from drivax.simulator.types import Frame
 
-#: How many things C are measured against a path. Six would do (docs/log), but eight fill a vector.
+#: Number C of agents measured against a path. Six suffice (docs/log), but eight fill a vector.
 CLOSEST = 8
-#: Free space that a corridor has next to the vehicle, m.
+#: Margin of a corridor on either side of the vehicle, m.
 SIDE_M = 0.1
-#: Pieces that stand for the path ahead, and rectangles around as many of them each.
+#: Straight pieces that approximate the path ahead, and rectangles around equal numbers of them.
 PIECES, RECTANGLES = 12, 3
-#: How far the path may run next to its pieces, m: rectangles are so much wider.
+#: Largest offset of the path from its pieces, m; widens the rectangles.
 _BULGE_M = 0.5
-#: Things so far behind the vehicle are among the closest too, for those that wait for a place to appear in, m.
+#: Reach behind the vehicle, m, for vehicles that wait to appear.
 BEHIND_M = 1.0
-#: How far a vehicle looks: this, its way in this many seconds, and its way to stop with 3 m/s2; at most this far, m.
+#: Look-ahead: a constant, the distance in so many seconds, and the braking distance at 3 m/s2; capped, m.
 _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 #: Gap of a free road, m; a number, so that gradients stay finite.
 FREE_M = 1e4
-#: No gap between things that overlap is below this, m.
+#: Lower bound of the gap of overlapping agents, m.
 LEAST_GAP_M = -50.0
-#: Low bits of a squared distance that hold the thing or piece; the rest is exact to 0.03 % (of 1 m2 at least).
+#: Low bits of a squared distance that hold the slot or piece; the rest is exact to 0.03 % (of at least 1 m2).
 _SLOT_BITS, _PIECE_BITS = 10, 4
 
 
@@ -49,10 +49,10 @@ class Movers:
     Attributes:
         box: x, y, cos, sin, length, width.
         z: Height of the box centre, m.
-        arc: Place along the path, m.
+        arc: Arc length along the path, m.
         speed: m/s.
         slot: Slot of the frame.
-        ignored: Slots of things that do not count, -1 for none.
+        ignored: Slots of ignored agents, -1 for none.
     """
 
     box: Float[Array, "R 6"]
@@ -65,13 +65,13 @@ class Movers:
 
 @record
 class Leaders:
-    """What R vehicles have ahead of them.
+    """What is ahead of R vehicles.
 
     Attributes:
-        gap: Free path up to the nearest thing in the corridor, bumper to bumper, m; 10 km where there is none.
-        speed: Speed of that thing along the path, m/s.
-        things: Slots of the closest things around the corridor.
-        real: Whether there is one.
+        gap: Free path to the nearest agent in the corridor, bumper to bumper, m; 10 km if free.
+        speed: Speed of that agent along the path, m/s.
+        things: Slots of the closest agents around the corridor.
+        real: Mask of valid ``things``.
     """
 
     gap: Float[Array, " R"]
@@ -83,7 +83,7 @@ class Leaders:
 def path_poses(
     paths: AgentPaths, index: Int[Array, ""], arc: Float[Array, " R"]
 ) -> tuple[Float[Array, "R 4"], Float[Array, "R 2"]]:
-    """Poses (x, y, cos, sin) at arc lengths of a scenario's paths; heights and the speeds that the paths allow."""
+    """Return poses (x, y, cos, sin) at arc lengths of a scenario's paths, and their heights and speed limits."""
     at = arc / paths.spacing[index]
     low = jnp.clip(at.astype(jnp.int32), 0, PATH_POINTS - 2)
     part = jnp.clip(at - low, 0.0, 1.0)[:, None]
@@ -102,16 +102,10 @@ def path_poses(
 
 
 def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Frame) -> Leaders:
-    """The nearest thing in the corridor of each vehicle.
+    """Return the nearest agent in the corridor of each vehicle.
 
-    The corridor is as wide as the vehicle and 0.1 m more on either side. A thing is in it when its box, as wide as it
-    is across the path, reaches into it and its centre is ahead of the vehicle's; things on another level are not.
-
-    Args:
-        paths: Paths of the bank.
-        index: Row of the bank.
-        movers: The vehicles.
-        frame: All agents now.
+    The corridor is as wide as the vehicle plus 0.1 m on either side. An agent is in it if its box, projected across the
+    path, reaches into it, its centre is ahead of the vehicle's, and it is on the same level.
     """
     look = _look(movers.speed)
     rows, arcs = _path_ahead(paths, index, movers, look)
@@ -150,7 +144,7 @@ def leaders(paths: AgentPaths, index: Int[Array, ""], movers: Movers, frame: Fra
 
 
 def _both_ends(rows: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[Array, "R C 8"]:
-    """The rows of two points on end of each path, side by side: one contiguous read each."""
+    """Read the rows of two consecutive points of each path in one contiguous read."""
 
     def both(path: Float[Array, "K 4"], at: Array) -> Float[Array, " 8"]:
         return jax.lax.dynamic_slice(path, (at, jnp.int32(0)), (2, 4)).reshape(8)
@@ -159,7 +153,7 @@ def _both_ends(rows: Float[Array, "R K 4"], first: Int[Array, "R C"]) -> Float[A
 
 
 def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Where on a piece, as a share of it, the point nearest to another one lies, and their squared distance."""
+    """Return the relative position on a piece nearest to a point, and their squared distance."""
     ux, uy, wx, wy = x1 - x0, y1 - y0, x - x0, y - y0
     part = jnp.clip((ux * wx + uy * wy) / jnp.maximum(ux * ux + uy * uy, 1e-6), 0.0, 1.0)
     dx, dy = wx - part * ux, wy - part * uy
@@ -167,12 +161,12 @@ def _from_piece(x0: Any, y0: Any, x1: Any, y1: Any, x: Any, y: Any) -> tuple[Any
 
 
 def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
-    """How far to the left of a straight piece the path runs, as a share of its length: the cubic with both tangents.
+    """Offset of the path to the left of a straight piece, relative to its length: cubic with both tangents.
 
     Args:
-        part: Where on the piece, as a share of it.
+        part: Relative position on the piece.
         way: Direction of the piece: cosine, sine.
-        tangents: Directions of the path at its beginning and end: cosine, sine, cosine, sine.
+        tangents: Directions of the path at start and end: cosine, sine, cosine, sine.
     """
     (ux, uy), slopes = way, []
     for cos, sin in (tangents[:2], tangents[2:]):
@@ -181,14 +175,14 @@ def _bulge(part: Any, way: tuple[Any, Any], tangents: Sequence[Any]) -> Any:
 
 
 def _look(speed: Float[Array, " R"]) -> Float[Array, " R"]:
-    """How far a vehicle looks along its path, m."""
+    """Look-ahead distance along the path, m."""
     return jnp.minimum(_LOOK_M + _LOOK_S * speed + speed * speed / (2 * _LOOK_MPS2), _LOOK_MOST_M)
 
 
 def _path_ahead(
     paths: AgentPaths, index: Int[Array, ""], movers: Movers, look: Float[Array, " R"]
 ) -> tuple[Float[Array, "R K 4"], Float[Array, "R K"]]:
-    """Rows of the path from the point behind the vehicle to as far as it looks, and their arc lengths."""
+    """Return rows of the path from behind the vehicle to its look-ahead distance, and their arc lengths."""
     spacing = paths.spacing[index]
     # One point more than it takes, since the first one lies behind.
     stride = jnp.ceil(look / ((PIECES - 1) * spacing)).astype(jnp.int32)
@@ -201,7 +195,7 @@ def _path_ahead(
 def _closest(
     movers: Movers, frame: Frame, nodes: Float[Array, "R K 2"]
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
-    """The closest things whose box reaches into one of the rectangles around the corridor."""
+    """Return the closest agents whose boxes reach into the rectangles around the corridor."""
     me = movers.box[:, None]
     behind = me[..., LENGTH] / 2 + BEHIND_M
     box = columns(frame.box)
@@ -214,10 +208,9 @@ def _closest(
 
 
 def columns(box: Float[Array, "S 6"]) -> Float[Array, "6 S"]:
-    """The columns of boxes as rows of their own.
+    """Transpose boxes by a product with the unit matrix.
 
-    By a product with the unit matrix: a mere transposition is gone before operations are fused, and every one of them
-    reads with strides then.
+    XLA folds a plain transposition into its consumers, which then read with strides.
     """
     unit = jnp.eye(box.shape[1], dtype=box.dtype)
     return jnp.einsum("fg,sg->fs", unit, box, precision=jax.lax.Precision.HIGHEST)
@@ -226,7 +219,7 @@ def columns(box: Float[Array, "S 6"]) -> Float[Array, "6 S"]:
 def closest(
     near: Bool[Array, "R S"], me: Float[Array, "R 6"], box: Float[Array, "6 S"]
 ) -> tuple[Int[Array, "R C"], Bool[Array, "R C"]]:
-    """Of the boxes (their :func:`columns`) that are near the C whose centres are the closest; and which are real."""
+    """Return the C boxes (:func:`columns`) with the closest centres among ``near``, and the mask of valid ones."""
     dx, dy = box[X] - me[:, X : X + 1], box[Y] - me[:, Y : Y + 1]
     key = jnp.where(near, numbered(1.0 + (dx * dx + dy * dy), jnp.arange(near.shape[1]), _SLOT_BITS), jnp.inf)
     # Computed once: without the barrier XLA computes it again for each of the minima.
@@ -243,15 +236,15 @@ def reaching(
     box: Float[Array, "6 S"], nodes: Float[Array, "R K 2"], half: Float[Array, "R 1"], behind: Any, beyond: Any,
     rectangles: int,
 ) -> Bool[Array, "R S"]:  # fmt: skip
-    """Which boxes reach into one of the rectangles along the chords of K points on a path.
+    """Mask of boxes that reach into a rectangle along the chords of K points on a path.
 
     Args:
         box: Boxes, as :func:`columns`.
         nodes: Points on the path.
         half: Half the width of the corridor, m.
-        behind: How much further back the first rectangle reaches, m.
-        beyond: How much further on the last one reaches, m.
-        rectangles: How many; K - 1 is a multiple of it.
+        behind: Extension of the first rectangle backwards, m.
+        beyond: Extension of the last rectangle forwards, m.
+        rectangles: Number of rectangles; divides K - 1.
     """
     around = _rectangles(nodes, half, behind, beyond, rectangles)
     deep, wide = box[LENGTH] / 2, box[WIDTH] / 2
@@ -278,7 +271,7 @@ def _rectangles(
     rest_x, rest_y = x - x[..., :1], y - y[..., :1]
     chord_x, chord_y = nodes[:, long::long, X] - x[..., 0], nodes[:, long::long, Y] - y[..., 0]
     chord = jnp.sqrt(jnp.maximum(chord_x * chord_x + chord_y * chord_y, 1e-6))
-    # Beyond its end a path is one point; there any direction will do.
+    # Beyond its end a path is one point, and any direction works.
     cos, sin = jnp.where(chord > 1e-2, chord_x / chord, 1.0), jnp.where(chord > 1e-2, chord_y / chord, 0.0)
     ahead = rest_x * cos[..., None] + rest_y * sin[..., None]
     left = rest_y * cos[..., None] - rest_x * sin[..., None]

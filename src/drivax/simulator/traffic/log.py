@@ -1,4 +1,4 @@
-"""How agents that are not driven move. ``log``: they replay; they appear and disappear as recorded.
+"""How agents that are not motion move. ``log``: they replay; they appear and disappear as recorded.
 
 Others: ``simulator.traffic.reactive`` (``idm``) and ``simulator.traffic.override``; ``simulator.traffic.catalogue``
 knows them by name.
@@ -61,28 +61,28 @@ def logged_history(bank: ScenarioBank, index: Any, step: Any, slot: Any) -> Floa
 
 
 def frame_of(
-    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], cast: AgentContext, back: int
+    bank: ScenarioBank, index: Any, step: Any, agents: Float[Array, "A 8"], driven: AgentContext, back: int
 ) -> Frame:
-    """All agents at one step: traffic's rows, the driven agents put in their place, and the parked ones.
+    """Return the frame at one step from traffic rows, driven agents and parked agents.
 
     Args:
         bank: The scenarios.
         index: Row of the bank.
         step: The present step; the frame is that of ``step - back``.
         agents: Rows of the moving slots, from the traffic model.
-        cast: Contexts of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are empty.
-        back: How many steps ago, 0 to 15; reactive traffic remembers 9.
+        driven: Contexts of all driven agents of the scenario, stacked ``[K]``; slots beyond the last are empty.
+        back: Steps ago, 0 to 15; reactive traffic remembers 9.
     """
-    driven = cast.history[:, HISTORY - 1 - back]
-    cos, sin = jnp.cos(driven[:, 2]), jnp.sin(driven[:, 2])
+    motion = driven.history[:, HISTORY - 1 - back]
+    cos, sin = jnp.cos(motion[:, 2]), jnp.sin(motion[:, 2])
     present = jnp.ones_like(cos)
     # Heights apart: measuring changes them alone, so that the rest of the frame before and after it is computed once.
-    rows = [driven[:, 0], driven[:, 1], jnp.zeros_like(present), cos, sin]
-    rows += [driven[:, 3] * cos, driven[:, 3] * sin, present]
+    rows = [motion[:, 0], motion[:, 1], jnp.zeros_like(present), cos, sin]
+    rows += [motion[:, 3] * cos, motion[:, 3] * sin, present]
     # Before the recording no other agent was seen.
     agents = agents.at[:, AgentColumn.VALID].mul(step >= back)
-    z = agents[:, AgentColumn.Z].at[cast.slot].set(cast.z, mode="drop")
-    agents = agents.at[cast.slot].set(jnp.stack(rows, axis=-1), mode="drop")
+    z = agents[:, AgentColumn.Z].at[driven.slot].set(driven.z, mode="drop")
+    agents = agents.at[driven.slot].set(jnp.stack(rows, axis=-1), mode="drop")
     box = bank.agent_box[index]
     at = jnp.clip(step - back, 0, bank.steps - 1)
     bit = bank.parked_when[index, at // WORD] >> (at % WORD).astype(jnp.uint32)
@@ -103,5 +103,5 @@ def frame_of(
 
 
 def alone(context: AgentContext) -> AgentContext:
-    """The cast of a scenario with one driven agent."""
+    """Stack the context of a single driven agent."""
     return jax.tree.map(lambda leaf: leaf[None], context)

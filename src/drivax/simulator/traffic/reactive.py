@@ -1,4 +1,4 @@
-"""Traffic that reacts (``idm``): vehicles drive along their own logged paths by the Intelligent Driver Model."""
+"""Reactive traffic (``idm``): vehicles follow their own logged paths by the Intelligent Driver Model."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from drivax.simulator.traffic.bank_data import data_of
 from drivax.simulator.traffic.corridor import FREE_M, Leaders, Movers, columns, leaders, path_poses
 from drivax.simulator.types import AgentContext, Frame
 
-#: Steps of recent motion that are kept, which is what observations look back; older frames repeat the oldest.
+#: Steps of recent motion kept for observations; older frames repeat the oldest.
 PAST = 10
-#: What a vehicle does: it replays its log, waits to appear, drives, or has left.
+#: Phases of a vehicle.
 REPLAYS, WAITS, DRIVES, LEFT = range(4)
 #: Free space that an entry place needs beyond the box: at each end and on each side, m.
 _ENTRY_END_M, _ENTRY_SIDE_M = 0.5, 0.1
-#: Who stands with the front over a stop line waits too; slower than this is standing, m/s.
+#: Vehicles slower than this with the front over a stop line wait too, m/s.
 _STANDS_MPS = 0.5
 
 
@@ -42,13 +42,13 @@ class Reactive:
     """State of the R vehicles of a scenario that may react; the last of the 10 rows is now.
 
     Attributes:
-        begin: Step at which the episode began; until then all agents moved as logged.
+        begin: First step of the episode; until then all agents moved as logged.
         phase: Replays (0), waits to appear (1), drives (2), has left (3).
-        entry: Step at which the log has the vehicle appear.
-        arc: Place along the path, m.
+        entry: Step at which the vehicle appears in the log.
+        arc: Arc length along the path, m.
         speed: m/s.
         there: Whether the vehicle is on the road.
-        ignored: Slots of things that it overlapped when it appeared and has not parted from; -1 for none.
+        ignored: Slots of agents overlapped on appearing, until they separate; -1 for none.
     """
 
     begin: Int[Array, "*batch"]
@@ -62,25 +62,24 @@ class Reactive:
 
 @dataclass(frozen=True)
 class IdmTraffic:
-    """Vehicles react to ego, to each other, to everything else in their way and to red lights.
+    """Vehicles that react to ego, to all other agents and to red lights.
 
-    A vehicle that travels more than 2 m in the rest of its log follows its own path; every other agent replays. What a
-    driver cannot help is left alone: a pair that overlaps when the vehicle appears ignores each other until it parts.
+    A vehicle that travels more than 2 m in the rest of its log follows its own path; all other agents replay. Pairs
+    that overlap when the vehicle appears ignore each other until they separate.
 
     Attributes:
-        drivers: IDM parameters of each class of agents that reacts (``scenario.schema.AgentKind``); the other classes
-            replay.
+        drivers: IDM parameters of each reacting class (``scenario.schema.AgentKind``); other classes replay.
     """
 
     drivers: tuple[tuple[int, IdmParameters], ...] = ((int(AgentKind.VEHICLE), IdmParameters()),)
     name: str = "idm"
 
     def prepare(self, bank: ScenarioBank) -> ScenarioBank:
-        """The bank with the paths that this traffic needs; one that has them already is returned unchanged."""
+        """Return the bank with the paths of reacting vehicles; unchanged if it has them."""
         return with_paths(bank, tuple(kind for kind, _ in self.drivers))
 
     def start(self, bank: ScenarioBank, index: Any, step: Any) -> Reactive:
-        """All agents where the log has them at ``step``.
+        """Return the logged traffic state at ``step``.
 
         Raises:
             UsageError: The bank has no paths.
@@ -108,7 +107,7 @@ class IdmTraffic:
         )
 
     def agents(self, bank: ScenarioBank, context: AgentContext, back: int) -> Float[Array, "A 8"]:
-        """Rows of the moving slots ``back`` steps ago (at most 9): who reacts on its path, others as logged."""
+        """Return rows of the moving slots ``back`` steps ago (at most 9): reacting agents simulated, others logged."""
         paths, now = data_of(bank, AgentPaths), context.traffic
         step = context.step - back
         logged = bank.agents[context.index, jnp.clip(step, 0, bank.steps - 1)]
@@ -124,7 +123,7 @@ class IdmTraffic:
         return logged.at[jnp.where(reacts, slot, logged.shape[0])].set(driven, mode="drop")
 
     def advance(self, bank: ScenarioBank, context: AgentContext, frame: Frame) -> Reactive:
-        """One step of 0.1 s: every agent looks at the present frame, then all move."""
+        """Advance all vehicles by one step of 0.1 s from the present frame."""
         paths, now = data_of(bank, AgentPaths), context.traffic
         slot = paths.slot[context.index].astype(jnp.int32)
         movers, most = _movers(bank, context, slot)
@@ -150,7 +149,7 @@ class IdmTraffic:
         )
 
     def _class(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> Int[Array, " R"]:
-        """Which of the drivers each vehicle is; -1 where none."""
+        """Index of the driver parameters of each vehicle; -1 for none."""
         kind = bank.agent_box[index, jnp.maximum(slot, 0), SizeColumn.KIND].astype(jnp.int32)
         number = jnp.full(kind.shape, -1)
         for place, (name, _) in enumerate(self.drivers):
@@ -158,7 +157,7 @@ class IdmTraffic:
         return number
 
     def _parameters(self, bank: ScenarioBank, index: Any, slot: Int[Array, " R"]) -> IdmParameters:
-        """Parameters of each vehicle."""
+        """Return the IDM parameters of each vehicle."""
         if len(self.drivers) == 1:
             return self.drivers[0][1]
         number = self._class(bank, index, slot)
@@ -172,7 +171,7 @@ class IdmTraffic:
 def _movers(
     bank: ScenarioBank, context: AgentContext, slot: Int[Array, " R"]
 ) -> tuple[Movers, Float[Array, " R"]]:
-    """The vehicles where they are now (waiting ones where they will appear), and the speed that their paths allow."""
+    """Return the vehicles at their present (or entry) poses, and the speed limits of their paths."""
     now = context.traffic
     arc, speed = now.arc[-1], now.speed[-1]
     here, profile = path_poses(data_of(bank, AgentPaths), context.index, arc)
@@ -184,7 +183,7 @@ def _movers(
 def _without_parted(
     movers: Movers, frame: Frame, waits: Bool[Array, " R"]
 ) -> tuple[Movers, Int[Array, "R 2"]]:
-    """Ignores no longer what a vehicle has parted from; one that waits has not met it yet."""
+    """Stop ignoring agents that a driving vehicle has separated from."""
     other = jnp.maximum(movers.ignored, 0)
     level = jnp.abs(frame.z[other] - movers.z[:, None]) <= LEVEL_M
     together = overlap(movers.box[:, None], frame.box[other]) & frame.valid[other] & level
@@ -196,7 +195,7 @@ def _acceleration(
     bank: ScenarioBank, context: AgentContext, movers: Movers,
     most: Float[Array, " R"], ahead: Leaders, driver: IdmParameters
 ) -> Float[Array, " R"]:  # fmt: skip
-    """IDM behind the leader, and before a red light as behind a car that stands on the stop line."""
+    """IDM acceleration behind the leader, and before a red light as behind a standing car on the stop line."""
     stop = _stop_gap(bank, context, movers, driver)
     behind = idm_acceleration(movers.speed, most, ahead.gap, ahead.speed, driver)
     before = idm_acceleration(movers.speed, most, stop, jnp.zeros_like(stop), driver)
@@ -206,9 +205,9 @@ def _acceleration(
 def _stop_gap(
     bank: ScenarioBank, context: AgentContext, movers: Movers, driver: IdmParameters
 ) -> Float[Array, " R"]:
-    """Distance from the front bumper to the nearest stop line of the path that asks to stop, m.
+    """Distance from the front bumper to the nearest stop line that requires a stop, m.
 
-    A red light asks all that can still stop, a yellow one those that can do so comfortably.
+    Red stops all vehicles that still can, yellow those that can stop comfortably.
     """
     paths = data_of(bank, AgentPaths)
     light = paths.stop_light[context.index].astype(jnp.int32)
@@ -230,7 +229,7 @@ def _stop_gap(
 def _driven(
     arc: Float[Array, " R"], speed: Float[Array, " R"], acceleration: Float[Array, " R"]
 ) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
-    """Place and speed one step later; who would go below zero stops inside the step."""
+    """Return arc length and speed one step later; a vehicle that would reverse stops within the step."""
     unclipped = speed + acceleration * DT_S
     stops = unclipped < 0.0
     after = jnp.where(stops, 0.0, unclipped)
@@ -240,10 +239,10 @@ def _driven(
 
 
 def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Frame) -> Bool[Array, " R"]:
-    """Who of the waiting may appear one step from now: it is time, and the place will be free.
+    """Mask of the waiting vehicles that appear in the next step: due, and with a free entry.
 
-    Of two that wait for one place the one that is due first goes first; those that appear on time never exclude
-    each other, since the log has room for both.
+    Of two that wait for the same space the one due first enters first; vehicles on time never exclude each other, since
+    the log has room for both.
     """
     now = context.traffic
     size = jnp.asarray([0.0, 0.0, 0.0, 0.0, 2 * _ENTRY_END_M, 2 * _ENTRY_SIDE_M])
@@ -253,20 +252,20 @@ def _may_enter(context: AgentContext, movers: Movers, ahead: Leaders, frame: Fra
     entry = now.entry.astype(jnp.int32)
     ready = (now.phase == WAITS) & (context.step + 1 >= entry) & ~taken
     late = context.step + 1 > entry
-    # Whole numbers as floats: their minima vectorise.
+    # Minima of floats vectorise.
     order = (entry * entry.shape[0] + jnp.arange(entry.shape[0])).astype(jnp.float32)
     reach = jnp.sqrt(jnp.sum(movers.box[:, LENGTH : WIDTH + 1] ** 2, axis=-1)) / 2
     x, y = columns(movers.box)[:2]
     dx, dy = x[:, None] - x, y[:, None] - y
     near = dx * dx + dy * dy < (reach[:, None] + reach + 2 * _ENTRY_END_M) ** 2
-    # Those that are not ready come last; one that is due now makes way for those that are late.
+    # Vehicles that are not ready come last; one due now yields to late ones.
     order = jnp.where(ready, order, jnp.inf)
     rival = jnp.where(near & (late[None] | late[:, None]), order[None], jnp.inf)
     return ready & (jnp.min(rival, axis=1) >= order)
 
 
 def _entry_speed(movers: Movers, ahead: Leaders, driver: IdmParameters) -> Float[Array, " R"]:
-    """The logged speed, at most what lets a vehicle brake comfortably behind its leader."""
+    """Logged speed, limited so that the vehicle can brake comfortably behind its leader."""
     room = jnp.maximum(ahead.gap - driver.min_gap_m, 0.0)
     square = jnp.maximum(ahead.speed, 0.0) ** 2 + 2.0 * driver.comfortable_braking_mps2 * room
     return jnp.minimum(movers.speed, jnp.sqrt(jnp.maximum(square, 1e-6)))
