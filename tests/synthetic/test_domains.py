@@ -24,7 +24,7 @@ def test_every_family_belongs_to_a_domain_and_every_share_to_a_family():
 def test_families_come_up_as_often_as_their_shares_say():
     rng = np.random.default_rng(0)
     for domain in DOMAINS.values():
-        found = Counter(domain.drawn_family(rng).name for _ in range(4000))
+        found = Counter(domain.draw_family(rng).name for _ in range(4000))
         for family, share in domain.families:
             # Four standard deviations of a binomial count.
             assert abs(found[family.name] / 4000 - share) < 4 * np.sqrt(share * (1 - share) / 4000)

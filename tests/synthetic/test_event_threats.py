@@ -11,16 +11,16 @@ import pytest
 from drivax.scenario.schema import AgentKind
 from drivax.synthetic.events import (
     SEVERITY_MPS2,
+    EgoView,
     EventKind,
-    Scene,
-    Staged,
-    aims,
-    drawn_severity,
+    StagedEvent,
+    destinations_for,
+    draw_severity,
+    endangers_ego,
     possible,
-    threatens,
 )
-from drivax.synthetic.events.adversary import in_its_cross_way, required_deceleration, waiting_room
-from drivax.synthetic.events.leading import leader_requires
+from drivax.synthetic.events.adversary import required_deceleration, vehicles_that_cross, waiting_room
+from drivax.synthetic.events.leading import required_by_leader
 from drivax.synthetic.events.merging import cut_in_gap
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
@@ -61,7 +61,7 @@ def test_rooms_and_gaps_by_hand():
     assert waiting_room(10.0, 20 / 9, 3.0) == pytest.approx(20.0)
     assert waiting_room(10.0, 2.5, 60.0) == pytest.approx(20.0)
     # Leader at 10 m/s brakes at 5: 10 m; with a gap of 10 m ego has 20 m.
-    assert leader_requires(10.0, 10.0, 10.0, 5.0) == pytest.approx(2.5)
+    assert required_by_leader(10.0, 10.0, 10.0, 5.0) == pytest.approx(2.5)
     # 12 -> 4 m/s behind somebody who goes from 10 to 4 at 3 m/s2: 64 / (2 a) = g + 6.
     assert cut_in_gap(12.0, 10.0, 4.0, 3.0, 3.2) == pytest.approx(4.0)
 
@@ -84,34 +84,37 @@ def test_what_roads_must_have():
 
 
 def test_where_ego_should_be():
-    (end,) = aims(EventKind.LATE_MERGE, road(ends=True))
+    (end,) = destinations_for(EventKind.LATE_MERGE, road(ends=True))
     assert end.lane == 0 and end.along_m == (250.0, 250.0) and end.alone
     network, (_, way, _) = junction(True)
-    (line,) = aims(EventKind.TURN_CONFLICT, network)
+    (line,) = destinations_for(EventKind.TURN_CONFLICT, network)
     assert line.lane == way and line.along_m == (0.0, 0.0)
     # Who comes out of a side road, or crosses, does not turn left across ego's way from the opposite direction.
     crossing, _ = junction(False)
     lanes = [dataclasses.replace(lane, yields_to=(1,)) for lane in crossing.lanes]
-    assert aims(EventKind.TURN_CONFLICT, dataclasses.replace(crossing, lanes=tuple(lanes))) == ()
-    assert aims(EventKind.JAYWALKER, road()) == () and len(aims(EventKind.JAYWALKER, road(), again=True)) == 2
-    assert all(place.followed for place in aims(EventKind.TAILGATER, road()))
+    assert destinations_for(EventKind.TURN_CONFLICT, dataclasses.replace(crossing, lanes=tuple(lanes))) == ()
+    assert (
+        destinations_for(EventKind.JAYWALKER, road()) == ()
+        and len(destinations_for(EventKind.JAYWALKER, road(), again=True)) == 2
+    )
+    assert all(place.followed for place in destinations_for(EventKind.TAILGATER, road()))
 
 
 def crossed(side_m, speed=10.0):
     """Ego at 10 m/s towards a car that stands 40 m ahead, this far to the left of its way; somebody staged it."""
     roles, motion = scene(road(), [(0,), (0,)], [60.0, 60.0 + (FIRST + 20) + 40.0], [10.0, 0.0])
     motion = dataclasses.replace(motion, xy=motion.xy + np.array([[[0.0, 0.0]], [[0.0, side_m]]]))
-    staged = Staged(EventKind.STALLED_VEHICLE, Staging(), (1,), FIRST + 20, FIRST + 70, 3.0)
+    staged = StagedEvent(EventKind.STALLED_VEHICLE, Staging(), (1,), FIRST + 20, FIRST + 70, 3.0)
     slower = dataclasses.replace(motion, speed=motion.speed * np.array([[speed / 10.0], [1.0]]))
-    return Scene(roles, motion, FIRST), slower, staged
+    return EgoView(roles, motion, FIRST), slower, staged
 
 
 def test_an_event_counts_when_who_keeps_its_speed_would_collide():
-    assert threatens(*crossed(0.0)) and threatens(*crossed(1.5))
+    assert endangers_ego(*crossed(0.0)) and endangers_ego(*crossed(1.5))
     # Boxes are 2 m wide: at 2.1 m they pass, and at 1.9 m they only graze each other.
-    assert not threatens(*crossed(2.1)) and not threatens(*crossed(1.9))
+    assert not endangers_ego(*crossed(2.1)) and not endangers_ego(*crossed(1.9))
     # 40 m less a length of 4.8 m in 7 s: at 4 m/s it does not get so near as 0.8 s, at 5 m/s it does.
-    assert not threatens(*crossed(0.0, 4.4)) and threatens(*crossed(0.0, 5.2))
+    assert not endangers_ego(*crossed(0.0, 4.4)) and endangers_ego(*crossed(0.0, 5.2))
 
 
 def test_who_would_hit_somebody_that_crosses_is_known():
@@ -122,14 +125,14 @@ def test_who_would_hit_somebody_that_crosses_is_known():
     xy = np.stack([np.full(STEPS, 160.0), y], axis=-1)
     speed = np.gradient(y, 0.1)
     walker = Scripted(AgentKind.PEDESTRIAN, (0.5, 0.6, 1.7), xy, np.full(STEPS, math.pi / 2), speed, t >= 0.0)
-    assert in_its_cross_way(Scene(roles, motion, FIRST), walker) == (1,)
+    assert vehicles_that_cross(EgoView(roles, motion, FIRST), walker) == (1,)
     along = dataclasses.replace(walker, heading=np.zeros(STEPS))
-    assert in_its_cross_way(Scene(roles, motion, FIRST), along) == ()
+    assert vehicles_that_cross(EgoView(roles, motion, FIRST), along) == ()
 
 
 def test_hard_events_are_drawn_more_often():
     rng = np.random.default_rng(0)
-    drawn = np.array([drawn_severity(rng) for _ in range(2000)])
+    drawn = np.array([draw_severity(rng) for _ in range(2000)])
     low, high = SEVERITY_MPS2
     assert low <= drawn.min() and drawn.max() <= high
     # u^0.7 > 2/3 where u > (2/3)^(1/0.7) = 0.56.

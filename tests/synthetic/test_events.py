@@ -12,9 +12,9 @@ from drivax.simulator.idm import IdmParameters, idm_acceleration
 from drivax.synthetic.events import (
     SCRIPTS,
     SEVERITY_MPS2,
+    EgoView,
     EventKind,
-    Scene,
-    drawn_severity,
+    draw_severity,
     stage,
 )
 from drivax.synthetic.traffic.paths import Sway, lane_path
@@ -91,7 +91,7 @@ def test_an_ego_that_keeps_its_speed_meets_the_actor_and_one_that_brakes_as_requ
     for seed in range(14):
         rng = np.random.default_rng([int(kind), seed])
         roles, motion = occasion(kind, rng)
-        staged = stage(kind, Scene(roles, motion, FIRST), drawn_severity(rng), rng)
+        staged = stage(kind, EgoView(roles, motion, FIRST), draw_severity(rng), rng)
         if staged is None:
             continue
         staged_count += 1
@@ -120,7 +120,7 @@ def test_actors_are_plausible(kind):
     for seed in range(8):
         rng = np.random.default_rng([int(kind), seed])
         roles, motion = occasion(kind, rng)
-        staged = stage(kind, Scene(roles, motion, FIRST), drawn_severity(rng), rng)
+        staged = stage(kind, EgoView(roles, motion, FIRST), draw_severity(rng), rng)
         if staged is None:
             continue
         for override in staged.staging.overrides:
@@ -160,20 +160,20 @@ def test_actors_are_plausible(kind):
 def test_without_occasion_there_is_no_event(kind):
     # One lane, nobody else, no junction, no parked cars.
     roles, motion = scene(road(lanes=1), [(0,)], [60.0], [11.0])
-    assert stage(kind, Scene(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
+    assert stage(kind, EgoView(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
 @pytest.mark.parametrize("kind", sorted(SCRIPTS))
 def test_who_stands_meets_nobody(kind):
     roles, motion = scene(road(), [(0,), (0,)], [60.0, 75.0], [0.0, 0.0])
-    assert stage(kind, Scene(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
+    assert stage(kind, EgoView(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
 def test_a_runner_enters_at_red():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         roles, motion = occasion(EventKind.RED_LIGHT_RUNNER, rng)
-        staged = stage(EventKind.RED_LIGHT_RUNNER, Scene(roles, motion, FIRST), 2.5, rng)
+        staged = stage(EventKind.RED_LIGHT_RUNNER, EgoView(roles, motion, FIRST), 2.5, rng)
         if staged is not None:
             (extra,) = staged.staging.extras
             front = extra.xy[:, 1] + extra.size_m[0] / 2
@@ -191,7 +191,7 @@ def test_the_queue_at_the_runners_light_is_not_there():
         v = 11.0
         roles, motion = scene(network, [route, cross, cross], [166.0 - 10 * v, 195.0, 188.0], [v, 0.0, 0.0])
         rng = np.random.default_rng(seed)
-        staged = staged or stage(EventKind.RED_LIGHT_RUNNER, Scene(roles, motion, FIRST), 2.5, rng)
+        staged = staged or stage(EventKind.RED_LIGHT_RUNNER, EgoView(roles, motion, FIRST), 2.5, rng)
     assert staged is not None and staged.staging.removed == (1, 2)
     table = draw_drivers(3, Density(), np.random.default_rng(0))
     roles = dataclasses.replace(roles, drivers=table)

@@ -26,7 +26,7 @@ def test_conflicts_are_connectors_with_priority_that_need_not_wait():
     yielding = dataclasses.replace(network, lanes=tuple(lanes))
     assert conflicts_on(yielding, lane_path(yielding, (0, 1, 2), Sway())) == {4}
     assert conflicts_on(yielding, lane_path(yielding, (3, 4, 5), Sway())) == frozenset()
-    assert [aim.lane for aim in giving_way(yielding)] == [1]
+    assert [place.lane for place in giving_way(yielding)] == [1]
     lanes[4] = dataclasses.replace(lanes[4], yields_to=(1,))
     both = dataclasses.replace(network, lanes=tuple(lanes))
     assert conflicts_on(both, lane_path(both, (0, 1, 2), Sway())) == frozenset()
@@ -36,7 +36,7 @@ def test_conflicts_are_connectors_with_priority_that_need_not_wait():
 def test_all_crossing_connectors_conflict_at_an_all_way_stop():
     network = crossroads(control=[Control.ALL_WAY_STOP] * 2)
     assert conflicts_on(network, lane_path(network, (0, 1, 2), Sway())) == {4}
-    assert sorted(aim.lane for aim in giving_way(network)) == [1, 4]
+    assert sorted(place.lane for place in giving_way(network)) == [1, 4]
 
 
 def test_the_target_lane_of_a_lane_change_conflicts():

@@ -1,4 +1,4 @@
-"""Domains: worlds whose roads and drivers have other statistics, for studies of generalisation."""
+"""Domains: worlds with different statistics of roads and drivers, for studies of generalisation."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ from drivax.synthetic.traffic.population import Density
 
 @dataclass(frozen=True)
 class Domain:
-    """What the roads of a part of the world are like, and who is on them.
+    """Statistics of roads and traffic in a part of the world.
 
     Attributes:
-        name: A tag of every scenario.
-        style: Widths, limits and the like of its roads.
-        shares: How often each family of roads comes up, relative to the others; what is not named does not.
-        density: How full the roads are.
-        walkers: People per 100 m of sidewalk, low and high, drawn per scenario.
-        parked_share: Share of bays with a car in them, low and high, drawn per scenario.
-        double_share: Share of scenarios with bays in which somebody is double-parked.
+        name: Tag of every scenario.
+        shares: Relative frequency of each road family; families without one do not occur.
+        walkers: Pedestrians per 100 m of sidewalk, low and high, drawn per scenario.
+        parked_share: Share of occupied bays, low and high, drawn per scenario.
+        double_share: Share of scenarios with bays that have a double-parked car.
     """
 
     name: str
@@ -35,14 +33,14 @@ class Domain:
 
     @property
     def families(self) -> tuple[tuple[RoadFamily, float], ...]:
-        """The families of this domain with their shares, which add up to 1."""
+        """Families of this domain with their probabilities."""
         shares = dict(self.shares)
         chosen = [(family, shares[family.name]) for family in FAMILIES if family.name in shares]
         total = sum(share for _, share in chosen)
         return tuple((family, share / total) for family, share in chosen)
 
-    def drawn_family(self, rng: np.random.Generator) -> RoadFamily:
-        """One family by chance."""
+    def draw_family(self, rng: np.random.Generator) -> RoadFamily:
+        """Draw a family."""
         families = self.families
         return families[rng.choice(len(families), p=[share for _, share in families])][0]
 
@@ -66,7 +64,7 @@ GRID_DOMAIN = Domain(
         ("corridor", 0.07),
     ),
 )
-#: Narrow streets, roundabouts and signs in place of lights, dense traffic, cyclists, no highways.
+#: Narrow streets, roundabouts and signs instead of lights, dense traffic, cyclists, no highways.
 RING_DOMAIN = Domain(
     name="ring",
     style=RING,

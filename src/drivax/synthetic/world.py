@@ -20,17 +20,17 @@ from drivax.scenario.recording import Event, Light, Recording, Tracks
 from drivax.scenario.schema import CURRENT_STEP, DT_S, STEPS, Flag
 from drivax.synthetic.domains import DOMAINS, Domain
 from drivax.synthetic.events import (
+    EgoView,
     EventKind,
-    Scene,
-    Staged,
-    aims,
-    drawn_severity,
+    StagedEvent,
+    destinations_for,
+    draw_severity,
+    endangers_ego,
     possible,
     stage,
-    threatens,
 )
 from drivax.synthetic.events.conflict_start import critical_steps
-from drivax.synthetic.events.destinations import Aim
+from drivax.synthetic.events.destinations import Destination
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.expert.violations import EGO_SKIN_M
 from drivax.synthetic.roads.families import RoadFamily
@@ -162,7 +162,7 @@ def generate_one(seed: int, index: int, config: WorldConfig) -> Generated:
         place = (index, attempt) if event else (index // config.scenarios_per_map, attempt // _PER_MAP)
         family, network = _drawn_roads(config.domain, event, (seed, 3 if event else 1, *place))
         rng = np.random.default_rng([seed, 2, index, attempt])
-        places = aims(event, network, attempt > 0) if event else ()
+        places = destinations_for(event, network, attempt > 0) if event else ()
         result = _attempt(_Draw(network, places, event, severity), domain, config, rng)
         if isinstance(result, str):
             rejected[family.name, result] += 1
@@ -189,7 +189,7 @@ def _drawn_events(config: WorldConfig, rng: np.random.Generator) -> tuple[list[E
     """The kind of event (another one where that fails too often), or none, and what it should require of ego, m/s2."""
     kinds = [kind for kind in EventKind if kind]
     rare, order = rng.random() < config.rare_rate, rng.permutation(len(kinds)).tolist()
-    return ([kinds[k] for k in order] if rare else [EventKind.NONE]), drawn_severity(rng)
+    return ([kinds[k] for k in order] if rare else [EventKind.NONE]), draw_severity(rng)
 
 
 @lru_cache(maxsize=1)
@@ -197,7 +197,7 @@ def _drawn_roads(name: str, event: EventKind, seed: tuple[int, ...]) -> tuple[Ro
     """Roads of a domain, again and again until they have what the event needs; built once for draws in a row."""
     domain, rng = DOMAINS[name], np.random.default_rng(seed)
     for _ in range(_ATTEMPTS):
-        family = domain.drawn_family(rng)
+        family = domain.draw_family(rng)
         network = family.build(rng, domain.style)
         if not event or possible(event, network):
             return family, network
@@ -212,7 +212,7 @@ class _Draw:
     """Roads, places of which ego should pass one, and the event (or none) with what it should require of ego, m/s2."""
 
     network: RoadNetwork
-    aims: tuple[Aim, ...]
+    destinations: tuple[Destination, ...]
     event: EventKind
     severity_mps2: float
 
@@ -222,7 +222,14 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
     critical = not draw.event and rng.random() < config.critical_share
     times = (np.arange(_WARM_UP + STEPS + _LATER * critical) - _WARM_UP) * DT_S
     roles = assign_roles(
-        draw.network, domain, times, config.lane_change_share, config.signal_timing, rng, draw.aims, critical
+        draw.network,
+        domain,
+        times,
+        config.lane_change_share,
+        config.signal_timing,
+        rng,
+        draw.destinations,
+        critical,
     )
     traffic = Traffic(roles, times)
     if not draw.event:
@@ -235,15 +242,15 @@ def _attempt(draw: _Draw, domain: Domain, config: WorldConfig, rng: np.random.Ge
             roles, traffic.times_s, Staging(), begin, traffic.run, unplanned=motion
         )
         return cause or _perceived(replace(_recorded(roles, motion, begin, None), tags=tags), config, rng)
-    scene, cause = Scene(roles, traffic.run(), _WARM_UP), UNSUITED[0]
+    view, cause = EgoView(roles, traffic.run(), _WARM_UP), UNSUITED[0]
     for _ in range(_STAGINGS):
-        staged = stage(draw.event, scene, draw.severity_mps2, rng)
+        staged = stage(draw.event, view, draw.severity_mps2, rng)
         if staged is None:
             break
         # Ego may foresee an event a little: an attentive driver sees it coming.
         aware = staged.first_step - _FORESEEN
         motion, cause = expert.drive_ego(roles, times, staged.staging, _WARM_UP, traffic.run, aware)
-        if not cause and threatens(scene, motion, staged):
+        if not cause and endangers_ego(view, motion, staged):
             return _perceived(_recorded(roles, motion, _WARM_UP, staged), config, rng)
         cause = cause or UNSUITED[1]
     return cause
@@ -266,7 +273,7 @@ def _critical_step(traffic: Traffic, motion: Motion, rng: np.random.Generator) -
     return int(steps[rng.choice(candidates)]) if len(candidates) else None
 
 
-def _recorded(roles: Roles, motion: Motion, first: int, staged: Staged | None) -> Recording:
+def _recorded(roles: Roles, motion: Motion, first: int, staged: StagedEvent | None) -> Recording:
     """The log from a step on, without names."""
     network, motion = roles.network, motion.since(first)
     times = np.arange(STEPS) * DT_S

@@ -1,25 +1,25 @@
-"""Labelled events: something unusual that is staged in a scenario and written down with its actors and times.
+"""Labelled events: unusual situations that are staged in a scenario and stored with their actors and times.
 
-A script looks at how the scenario goes without it (``scene``), and proposes what an actor does, and when, so that an
-ego that keeps its speed would meet it; ``threat`` tells what that asks of ego, and ``choosing`` takes what is sound.
+A script reads the scenario without the event (``ego_view``) and proposes when an actor does what, so that an ego at
+constant speed would collide; ``adversary`` computes what this requires of ego, ``choosing`` checks the proposals.
 """
 
-from drivax.synthetic.events.adversary import threatens
-from drivax.synthetic.events.choosing import SCRIPTS, aims, drawn_severity, possible, stage
-from drivax.synthetic.events.ego_view import Scene
-from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, EventScript, Proposal, Staged
+from drivax.synthetic.events.adversary import endangers_ego
+from drivax.synthetic.events.choosing import SCRIPTS, destinations_for, draw_severity, possible, stage
+from drivax.synthetic.events.ego_view import EgoView
+from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, EventScript, Proposal, StagedEvent
 
 __all__ = [
     "SCRIPTS",
     "SEVERITY_MPS2",
+    "EgoView",
     "EventKind",
     "EventScript",
     "Proposal",
-    "Scene",
-    "Staged",
-    "aims",
-    "drawn_severity",
+    "StagedEvent",
+    "destinations_for",
+    "draw_severity",
+    "endangers_ego",
     "possible",
     "stage",
-    "threatens",
 ]

@@ -1,4 +1,4 @@
-"""Actors that move as told: along ego's way or along lanes, and how fast."""
+"""Scripted actors: speed profiles, and motion along ego's path or along lanes."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.ego_view import Track
+from drivax.synthetic.roads import curves
 from drivax.synthetic.roads.curves import Curve
 from drivax.synthetic.traffic.roles import Motion, Scripted
 
 CAR_M = (4.6, 1.85, 1.55)
 
 
-def changed_speed(
+def speed_change(
     first_mps: float, last_mps: float, rate_mps2: float, times_s: Float64[np.ndarray, " k"]
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
-    """Distance and speed of somebody who goes from one speed to another from time 0 on, and keeps it.
-
-    Before time 0 the first speed holds, and distances are negative.
-    """
+    """Distance and speed of a change between constant speeds that starts at time 0 (distances before are negative)."""
     lasts = abs(last_mps - first_mps) / rate_mps2
     rate = math.copysign(rate_mps2, last_mps - first_mps)
     during = np.clip(times_s, 0.0, lasts)
@@ -31,25 +29,25 @@ def changed_speed(
 
 
 def travel_s(distance_m: float, speed_mps: float, gain_mps2: float) -> float:
-    """Time for a distance from rest with this gain of speed up to a speed."""
+    """Time to cover a distance from rest: constant acceleration, then constant speed."""
     ramp = speed_mps**2 / (2 * gain_mps2)
     if distance_m <= ramp:
         return math.sqrt(2 * max(distance_m, 0.0) / gain_mps2)
     return speed_mps / gain_mps2 + (distance_m - ramp) / speed_mps
 
 
-def walked(
+def walk(
     distance_m: float,
     speed_mps: float,
     rates_mps2: tuple[float, float],
     times_s: Float64[np.ndarray, " k"],
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]] | None:
-    """Distance and speed of somebody who starts at time 0, goes a distance at a speed and stops; None: too short.
+    """Distance and speed of a walk from rest at time 0 to rest; None where it is too short to reach its speed.
 
     Args:
-        distance_m: How far it goes.
-        speed_mps: Its speed in between.
-        rates_mps2: How it gains and loses its speed.
+        distance_m: Length of the walk.
+        speed_mps: Speed in between.
+        rates_mps2: Acceleration and deceleration.
         times_s: Times.
     """
     gain, loss = rates_mps2
@@ -57,15 +55,14 @@ def walked(
     if distance_m < stopping + speed_mps**2 / (2 * gain):
         return None
     slows = travel_s(distance_m - stopping, speed_mps, gain)
-    gone, up = changed_speed(0.0, speed_mps, gain, np.minimum(times_s, slows))
-    more, down = changed_speed(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
+    gone, up = speed_change(0.0, speed_mps, gain, np.minimum(times_s, slows))
+    more, down = speed_change(speed_mps, 0.0, loss, np.maximum(times_s - slows, 0.0))
     return gone + more, np.where(times_s < slows, up, down)
 
 
 def smooth_step(times_s: Float64[np.ndarray, " k"], lasts_s: float) -> Float64[np.ndarray, " k"]:
-    """From 0 to 1 within a time, by the quintic whose speed and acceleration vanish at both ends."""
-    t = np.clip(times_s / lasts_s, 0.0, 1.0)
-    return t**3 * (10 - 15 * t + 6 * t**2)
+    """Quintic step from 0 to 1 within a duration; speed and acceleration vanish at both ends."""
+    return curves.smooth_step(times_s / lasts_s)
 
 
 def along_track(
@@ -77,20 +74,20 @@ def along_track(
     *,
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
-    """Somebody who moves along ego's way at a distance beside it; the heading is that of the movement."""
+    """Actor at stations and lateral offsets of ego's path, headed along its motion."""
     valid = valid & (station >= 0.0) & (station <= track.length_m - 1.0)
     xy, heading = track.pose(station, left_m)
-    return moving(xy, heading, kind, size_m, valid)
+    return scripted_motion(xy, heading, kind, size_m, valid)
 
 
-def moving(
+def scripted_motion(
     xy: Float64[np.ndarray, "time 2"],
     heading: Float64[np.ndarray, " time"],
     kind: AgentKind,
     size_m: tuple[float, float, float],
     valid: Bool[np.ndarray, " time"],
 ) -> Scripted:
-    """Somebody with these positions, headed where it goes; who stands keeps the last heading, or the given one."""
+    """Actor at positions, headed along its motion; at rest it keeps its last heading, or the given one."""
     step = np.gradient(xy, DT_S, axis=0)
     speed = np.hypot(step[:, 0], step[:, 1])
     drives = speed > 0.3
@@ -108,7 +105,7 @@ def along_curve(
     kind: AgentKind,
     size_m: tuple[float, float, float],
 ) -> Scripted:
-    """Somebody who drives along a curve; it exists while it is on it."""
+    """Actor that drives along a curve and is valid while it is on it."""
     arc = curve.arc_m
     xy = np.stack([np.interp(distance_m, arc, curve.xy[:, k]) for k in (0, 1)], axis=-1)
     speed = np.maximum(np.gradient(distance_m, DT_S), 0.0)
@@ -116,13 +113,13 @@ def along_curve(
     return Scripted(kind, size_m, xy, np.interp(distance_m, arc, curve.heading), speed, valid)
 
 
-def slowed(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
-    """A vehicle of the roles that brakes from a step on until it stands: it stays on the way it took."""
+def brake_to_halt(motion: Motion, row: int, step: int, braking_mps2: float) -> Scripted:
+    """Vehicle of the traffic that brakes from a step to a halt on its path."""
     xy, heading = motion.xy[row], np.unwrap(motion.heading[row])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     times = DT_S * (np.arange(len(xy)) - step)
     speed = float(motion.speed[row, step])
-    gone, slower = changed_speed(speed, 0.0, braking_mps2, times)
+    gone, slower = speed_change(speed, 0.0, braking_mps2, times)
     at = np.where(times < 0, arc, np.minimum(arc[step] + gone, arc))
     grows = np.concatenate([[True], np.diff(arc) > 1e-6])
     moved = np.stack([np.interp(at, arc[grows], xy[grows, k]) for k in (0, 1)], axis=-1)

@@ -1,4 +1,4 @@
-"""Which event happens in a scenario: scripts propose, proposals are checked, and one of the feasible kinds is drawn."""
+"""Staging of an event: a script proposes, and the first proposal that passes the checks is taken."""
 
 from __future__ import annotations
 
@@ -8,15 +8,22 @@ import numpy as np
 
 from drivax.synthetic.events.adversary import (
     comes_close,
+    enter_when_clear,
     first_blocked,
-    in_its_cross_way,
     severity,
-    with_room,
+    vehicles_that_cross,
 )
 from drivax.synthetic.events.crossing import CrossTraffic
-from drivax.synthetic.events.destinations import Aim, open_road
-from drivax.synthetic.events.ego_view import FULL_SWING, NOTICED, Scene
-from drivax.synthetic.events.kinds import SEVERITY_MPS2, AimedScript, EventKind, EventScript, Proposal, Staged
+from drivax.synthetic.events.destinations import Destination, open_road
+from drivax.synthetic.events.ego_view import FULL_SWING, NOTICED, EgoView
+from drivax.synthetic.events.kinds import (
+    SEVERITY_MPS2,
+    DestinationScript,
+    EventKind,
+    EventScript,
+    Proposal,
+    StagedEvent,
+)
 from drivax.synthetic.events.leading import LeadBrakes, StalledVehicle
 from drivax.synthetic.events.merging import CutIn
 from drivax.synthetic.events.roadside import Jaywalker, LaneBlocked, ReversingCar, WrongWayCyclist
@@ -41,95 +48,94 @@ SCRIPTS: dict[EventKind, EventScript] = {
         LeadBrakes(tailgater=True),
     )
 }
-#: Draws of an event before it counts as impossible here, how many of them with the wanted severity, and how many
-#: with each other one.
-_DRAWS, _AS_WANTED, _PER_SEVERITY = 40, 20, 5
-#: Severities are powers of uniform numbers: below 1 the hard ones come up more often.
+#: Proposals per event, how many of them with the requested severity, and how many with each other one.
+_DRAWS, _AS_REQUESTED, _PER_SEVERITY = 40, 20, 5
+#: Exponent of the uniform number behind a severity; below 1 hard events are more frequent.
 _HARD = 0.7
-#: Kinds that hardly ever find an occasion where ego goes where it likes.
+#: Kinds that rarely succeed unless ego is sent to a suitable place.
 _PLACED = (
     EventKind.RED_LIGHT_RUNNER,
     EventKind.TURN_CONFLICT,
     EventKind.LATE_MERGE,
     EventKind.TAILGATER,
 )
-#: A proposal counts where what it requires is so near to what was drawn, m/s2.
+#: Largest difference between a proposal's severity and the one that it really requires, m/s2.
 _NEAR_MPS2 = 0.6
 
 
 def possible(kind: EventKind, network: RoadNetwork) -> bool:
-    """Whether roads have what an event needs: a light, a lane that ends, bays; quick to tell before any traffic."""
+    """Whether a network has what an event needs, such as a light, a lane that ends or bays."""
     return SCRIPTS[kind].possible(network)
 
 
-def aims(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Aim, ...]:
-    """Places of which ego should pass one at a certain time, so that an event finds an occasion; empty: anywhere.
+def destinations_for(kind: EventKind, network: RoadNetwork, again: bool = False) -> tuple[Destination, ...]:
+    """Places of which ego should pass one, so that an event can be staged; empty: anywhere.
 
     Args:
         kind: The kind of event.
         network: The roads.
-        again: Whether scenarios in which ego went where it liked offered no occasion: then also for kinds that can
-            happen on any open road.
+        again: Whether staging has failed before: then kinds that can happen anywhere get places too.
     """
     script = SCRIPTS[kind]
     if not again and kind not in _PLACED:
         return ()
-    return script.aims(network) if isinstance(script, AimedScript) else open_road(network)
+    return script.destinations(network) if isinstance(script, DestinationScript) else open_road(network)
 
 
-def drawn_severity(rng: np.random.Generator) -> float:
-    """The deceleration that an event should require of ego, m/s2, more often hard than mild.
+def draw_severity(rng: np.random.Generator) -> float:
+    """Draw the deceleration that an event should require of ego, m/s2.
 
-    Hard events find an occasion less often, and who brakes ahead of ego in its lane stays below 3 or so: with this
-    slope all thirds of the range are filled.
+    Hard events are drawn more often, since they are harder to stage: staged events fill all thirds of the range.
     """
     low, high = SEVERITY_MPS2
     return low + (high - low) * float(rng.random() ** _HARD)
 
 
-def stage(kind: EventKind, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Staged | None:
-    """Stages an event of a kind, or returns None where the scenario offers no occasion.
+def stage(
+    kind: EventKind, view: EgoView, severity_mps2: float, rng: np.random.Generator
+) -> StagedEvent | None:
+    """Stage an event of a kind, or return None where no proposal passes.
 
     Args:
         kind: The kind.
-        scene: How the scenario goes without the event.
-        severity_mps2: What it should require of ego; where that finds no occasion something else is drawn.
-        rng: Source of chance.
+        view: The scenario without the event.
+        severity_mps2: Requested severity; other ones are drawn where it cannot be staged.
+        rng: Source of randomness.
     """
     script = SCRIPTS[kind]
     for draw in range(_DRAWS):
-        if draw >= _AS_WANTED and draw % _PER_SEVERITY == 0:
-            severity_mps2 = drawn_severity(rng)
-        proposal = script.propose(scene, severity_mps2, rng)
-        checked = None if proposal is None else _checked(proposal.scene or scene, proposal)
+        if draw >= _AS_REQUESTED and draw % _PER_SEVERITY == 0:
+            severity_mps2 = draw_severity(rng)
+        proposal = script.propose(view, severity_mps2, rng)
+        checked = None if proposal is None else _check(proposal.view or view, proposal)
         if proposal is not None and checked is not None:
             required, staging = checked
-            actor = len(scene.motion.kind) if proposal.vehicle is None else proposal.vehicle
+            actor = len(view.motion.kind) if proposal.vehicle is None else proposal.vehicle
             actors = (actor, *proposal.others)
-            return Staged(kind, staging, actors, proposal.first_step, proposal.last_step, required)
+            return StagedEvent(kind, staging, actors, proposal.first_step, proposal.last_step, required)
     return None
 
 
-def _checked(scene: Scene, proposal: Proposal) -> tuple[float, Staging] | None:
-    """The deceleration that a proposal really requires of ego, and its staging; None where it does not do."""
-    begin, threat = proposal.first_step, proposal.threat
-    required = severity(scene, threat, begin + NOTICED)
+def _check(view: EgoView, proposal: Proposal) -> tuple[float, Staging] | None:
+    """The deceleration that a proposal requires of ego, and its staging; None where the proposal fails a check."""
+    begin, adversary = proposal.first_step, proposal.adversary
+    required = severity(view, adversary, begin + NOTICED)
     low, high = SEVERITY_MPS2
     if not low <= required <= high or abs(required - proposal.severity_mps2) > _NEAR_MPS2:
         return None
-    blocked = np.isfinite(first_blocked(scene, threat, begin))
+    blocked = np.isfinite(first_blocked(view, adversary, begin))
     entered = begin + int(np.argmax(blocked))
-    if not blocked.any() or entered >= scene.first_step + FULL_SWING:
+    if not blocked.any() or entered >= view.first_step + FULL_SWING:
         return None
-    if not comes_close(scene, threat, begin):
+    if not comes_close(view, adversary, begin):
         return None
     staging = proposal.staging
     removed = sorted(
-        {*staging.removed, *(row for one in staging.extras for row in in_its_cross_way(scene, one))}
+        {*staging.removed, *(row for extra in staging.extras for row in vehicles_that_cross(view, extra))}
     )
     if set(removed) & set(proposal.others):
         return None
-    extras = tuple(with_room(scene, extra, entered, tuple(removed)) for extra in staging.extras)
+    extras = tuple(enter_when_clear(view, extra, entered, tuple(removed)) for extra in staging.extras)
     known = tuple(extra for extra in extras if extra is not None and extra.valid[begin])
     if len(known) < len(extras):
         return None

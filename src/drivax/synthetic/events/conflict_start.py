@@ -1,8 +1,8 @@
-"""From when on a scene is worth recording: where a driver who gives way to nobody would hit somebody.
+"""Interactive moments of a simulation: the steps from index a driver that only follows its leader would collide.
 
-Recorded data sets are mined for scenes in which road users interact, since most of what cars see is empty road. Here
-an ego is rolled out from several steps of the same traffic that follows its leader and stops for red, but sees nobody
-who is not ahead of it in its way. Where it hits somebody, driving well takes more than following.
+Recorded data sets are mined for interactions, since most driving is on empty roads. Here a reference driver that
+follows its leader and stops at red lights, but ignores all other agents, is rolled out from several steps of the same
+traffic. Where it collides, good driving takes more than car following.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from drivax.synthetic.traffic.path_arrays import speed_profile
 from drivax.synthetic.traffic.paths import Path
 from drivax.synthetic.traffic.roles import Motion
 
-#: The driver: common parameters, at the limit, and accelerations in bends and on the way to them, m/s2.
+#: The reference driver: IDM parameters, lateral acceleration in bends and braking before them, m/s2.
 _DRIVER, _LATERAL_MPS2, _SLOWING_MPS2 = IdmParameters(), 2.5, 2.0
-#: Room that it wants on either side, m; where it stops before a line, m.
+#: Its lateral margin on either side, m; its distance to a stop line, m.
 _SIDE_M, _STOP_SHORT_M = 0.3, 1.0
-#: Others further from ego's path never matter, m.
+#: Agents further from ego's path are ignored, m.
 _NEAR_M = 12.0
-#: Every second step is enough for a driver who only has to be judged.
+#: Simulate every second step.
 _STRIDE = 2
 
 
 @dataclass(frozen=True)
 class _Others:
-    """Those near ego's path at all steps, in its coordinates, m: from where to where along it and across it."""
+    """Agents near ego's path at all steps: extents along and across it, m."""
 
     near_m: Float64[np.ndarray, "user time"]
     far_m: Float64[np.ndarray, "user time"]
@@ -50,16 +50,16 @@ def critical_steps(
     colour: Int8[np.ndarray, "time lane"],
     steps: Int64[np.ndarray, " start"],
 ) -> Bool[np.ndarray, " start"]:
-    """Whether the driver who sees only what is ahead hits somebody in the recording that begins at each of some steps.
+    """Whether the reference driver collides in the recordings that begin at some steps.
 
     Args:
         network: The roads.
-        motion: How everybody moves; row 0 is ego.
-        colour: What lights show at each time.
+        motion: Motion of all agents; row 0 is ego.
+        colour: Colours of the lights at each time.
         steps: First steps of recordings, even numbers; the driver takes over ``CURRENT_STEP`` later.
     """
     path, motion = motion.paths[0], motion.every(_STRIDE)
-    others, colour = _seen(path, motion), colour[::_STRIDE]
+    others, colour = _project_others(path, motion), colour[::_STRIDE]
     length, width = motion.size_m[0, :2]
     now = (np.asarray(steps) + CURRENT_STEP) // _STRIDE
     at, speed = motion.distance_m[0, now], motion.speed[0, now]
@@ -67,11 +67,11 @@ def critical_steps(
     hit, behind = np.zeros(len(now), bool), np.zeros((len(others.near_m), len(now)), bool)
     for _ in range((STEPS - CURRENT_STEP - 1) // _STRIDE):
         gap, leader = _leader(others, now, at, (float(length), float(width)))
-        line = _line(network, path, colour[now], at + length / 2) + 2.0 - _STOP_SHORT_M
-        wanted = fastest[np.minimum((at / path.step_m).astype(int), len(fastest) - 1)]
+        line = _stop_line_m(network, path, colour[now], at + length / 2) + 2.0 - _STOP_SHORT_M
+        target_mps = fastest[np.minimum((at / path.step_m).astype(int), len(fastest) - 1)]
         a = idm_acceleration(
             np.stack([speed, speed]),
-            np.stack([wanted, wanted]),
+            np.stack([target_mps, target_mps]),
             np.stack([gap, line]),
             np.stack([leader, np.zeros_like(leader)]),
             _DRIVER,
@@ -82,8 +82,8 @@ def critical_steps(
     return hit
 
 
-def _seen(path: Path, motion: Motion) -> _Others:
-    """Everybody else."""
+def _project_others(path: Path, motion: Motion) -> _Others:
+    """Extents of all other agents in the coordinates of ego's path."""
     count, times = motion.valid.shape
     flat = (count - 1) * times
     boxes = Boxes(
@@ -92,25 +92,25 @@ def _seen(path: Path, motion: Motion) -> _Others:
         motion.speed[1:].reshape(flat),
         np.repeat(motion.size_m[1:, :2], times, axis=0),
     )
-    found, which = extents(path, boxes, _NEAR_M)
-    valid = motion.valid[1:].reshape(flat)[which]
-    place = np.clip((found.near_m + found.far_m) / 2 / path.step_m, 0, len(path.curve.xy) - 1).astype(int)
-    along = boxes.speed[which] * np.cos(boxes.heading[which] - path.curve.heading[place])
+    extent, index = extents(path, boxes, _NEAR_M)
+    valid = motion.valid[1:].reshape(flat)[index]
+    place = np.clip((extent.near_m + extent.far_m) / 2 / path.step_m, 0, len(path.curve.xy) - 1).astype(int)
+    along = boxes.speed[index] * np.cos(boxes.heading[index] - path.curve.heading[place])
 
     def table(values: Float64[np.ndarray, " k"], empty: float) -> Float64[np.ndarray, "user time"]:
         result = np.full(flat, empty)
-        result[which] = np.where(valid, values, empty)
+        result[index] = np.where(valid, values, empty)
         return result.reshape(count - 1, times)
 
     direction = np.stack([np.cos(boxes.heading), np.sin(boxes.heading)], axis=-1)
     box = np.concatenate([boxes.xy, direction, boxes.size_m], axis=-1).reshape(count - 1, times, 6)
-    near = table(found.near_m, np.inf)
+    near = table(extent.near_m, np.inf)
     rows = np.isfinite(near).any(axis=1)
     return _Others(
         near_m=near[rows],
-        far_m=table(found.far_m, np.inf)[rows],
-        right_m=table(found.right_m, np.inf)[rows],
-        left_m=table(found.left_m, np.inf)[rows],
+        far_m=table(extent.far_m, np.inf)[rows],
+        right_m=table(extent.right_m, np.inf)[rows],
+        left_m=table(extent.left_m, np.inf)[rows],
         speed=table(along, 0.0)[rows],
         box=box[rows],
     )
@@ -122,7 +122,7 @@ def _leader(
     at: Float64[np.ndarray, " start"],
     size_m: tuple[float, float],
 ) -> tuple[Float64[np.ndarray, " start"], Float64[np.ndarray, " start"]]:
-    """Gap to whoever is next ahead in the way, and its speed."""
+    """Gap to the next agent ahead on the path, and its speed."""
     if not len(others.near_m):
         return np.full(len(at), np.inf), np.zeros(len(at))
     near, far = others.near_m[:, now], others.far_m[:, now]
@@ -135,7 +135,7 @@ def _leader(
     return gap[first, columns], others.speed[:, now][first, columns]
 
 
-def _line(
+def _stop_line_m(
     network: RoadNetwork,
     path: Path,
     colour: Int8[np.ndarray, "start lane"],
@@ -159,7 +159,7 @@ def _hits(
     size_m: tuple[float, float],
     behind: Bool[np.ndarray, "user start"],
 ) -> Bool[np.ndarray, " start"]:
-    """Whether somebody is where ego is who did not come from behind; adds those who do to ``behind``."""
+    """Whether an agent overlaps ego and did not come from behind; adds agents that did to ``behind``."""
     result = np.zeros(len(at), bool)
     if not len(others.near_m):
         return result
@@ -168,12 +168,12 @@ def _hits(
     maybe = (near < at + half) & (far > at - half)
     maybe &= (others.right_m[:, now] < size_m[1] / 2) & (others.left_m[:, now] > -size_m[1] / 2)
     behind |= maybe & ((near + far) / 2 <= at - half)
-    who, start = np.nonzero(maybe & ~behind)
-    if len(who):
+    user, start = np.nonzero(maybe & ~behind)
+    if len(user):
         place = np.minimum((at[start] / path.step_m).astype(int), len(path.curve.xy) - 1)
         heading = path.curve.heading[place]
         ego = np.column_stack(
-            [path.curve.xy[place], np.cos(heading), np.sin(heading), np.tile(size_m, (len(who), 1))]
+            [path.curve.xy[place], np.cos(heading), np.sin(heading), np.tile(size_m, (len(user), 1))]
         )
-        result[start[overlap(ego, others.box[who, now[start]])]] = True
+        result[start[overlap(ego, others.box[user, now[start]])]] = True
     return result

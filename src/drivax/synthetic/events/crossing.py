@@ -1,4 +1,4 @@
-"""Events at junctions: somebody who runs a red light across ego's way, and somebody who turns left across it."""
+"""Events at junctions: a vehicle that runs a red light, and one that turns left across ego's path."""
 
 from __future__ import annotations
 
@@ -11,56 +11,61 @@ from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
 from drivax.synthetic.events.actors import CAR_M, along_curve
-from drivax.synthetic.events.adversary import comes_close, first_blocked, in_its_lane, required_by_samples
-from drivax.synthetic.events.destinations import Aim
-from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, Scene
+from drivax.synthetic.events.adversary import (
+    comes_close,
+    first_blocked,
+    required_by_samples,
+    vehicles_in_lane,
+)
+from drivax.synthetic.events.destinations import Destination
+from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
 from drivax.synthetic.roads.curves import Curve, joined
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
-#: Actors come from so far, and are followed so far beyond the junction, m.
+#: Length of an actor's path before and beyond the junction, m.
 _FROM_M, _BEYOND_M = 180.0, 60.0
-#: Who is to stop at a line and needs more than this to do so will not, m/s2: from then on ego can know.
+#: An actor that needs more than this to stop at the line will not stop, m/s2: ego can tell from then on.
 _BRAKING_MPS2 = 5.0
-#: How hard a turn slows its driver before it, m/s2, and how much lateral acceleration it takes.
+#: Braking before bends and lateral acceleration in them, m/s2.
 _SLOWING_MPS2, _LATERAL_MPS2 = 2.0, 3.0
-#: Who turns less goes straight on, rad; whose directions have a larger cosine than this drive along one road.
+#: Smaller changes of heading count as straight, rad; larger cosines of headings count as the same road.
 _TURN_RAD, _ALONG = math.radians(45.0), 0.7
 
 
 @dataclass(frozen=True)
-class _Way:
-    """Where an actor drives: a curve, and where on it the junction begins."""
+class _ActorPath:
+    """Path of an actor: a curve, and the distance along it at which the junction begins."""
 
     curve: Curve
     line_m: float
     limit_mps: float
 
     @classmethod
-    def through(cls, scene: Scene, way: int, rng: np.random.Generator) -> _Way:
-        """The way through a connector, from far before it."""
-        lanes = scene.roles.network.lanes
-        before, after = _chain(lanes, way, -1, _FROM_M, rng), _chain(lanes, way, 1, _BEYOND_M, rng)
+    def through(cls, view: EgoView, connector: int, rng: np.random.Generator) -> _ActorPath:
+        """Draw a path through a connector."""
+        lanes = view.roles.network.lanes
+        before, after = (
+            _chain(lanes, connector, -1, _FROM_M, rng),
+            _chain(lanes, connector, 1, _BEYOND_M, rng),
+        )
         ahead = [lanes[i].curve for i in reversed(before)]
         line = sum(float(curve.arc_m[-1]) for curve in ahead)
-        curve = joined(*ahead, lanes[way].curve, *(lanes[i].curve for i in after))
-        limit = lanes[before[0]].limit_mps if before else lanes[way].limit_mps
+        curve = joined(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
+        limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
         return cls(curve, line, limit)
 
     @cached_property
     def arc_m(self) -> Float64[np.ndarray, " point"]:
-        """Distances of the curve's samples."""
+        """Distance along the curve at its samples."""
         return self.curve.arc_m
 
     def distances(
         self, fastest_mps: float, times_s: Float64[np.ndarray, " time"]
     ) -> Float64[np.ndarray, " time"]:
-        """Where a driver is at times; at time 0 its front reaches the line.
-
-        It drives at a speed from which bends are reached with ordinary braking, as everybody's speed profile.
-        """
+        """Distance along the path at times; the front reaches the line at time 0, and bends limit the speed."""
         arc = self.arc_m
         rate = np.abs(
             np.gradient(self.curve.heading, np.maximum.accumulate(arc + 1e-9 * np.arange(len(arc))))
@@ -78,13 +83,13 @@ class _Way:
 
 
 def _chain(
-    lanes: tuple[Lane, ...], first: int, way: int, length_m: float, rng: np.random.Generator
+    lanes: tuple[Lane, ...], first: int, direction: int, length_m: float, rng: np.random.Generator
 ) -> list[int]:
-    """Lanes before (-1) or after (1) a lane, in the order in which they are met, until they are long enough."""
+    """Draw successive lanes before (-1) or after (1) a lane up to a total length."""
     result: list[int] = []
     total, at = 0.0, first
     while total < length_m:
-        links = lanes[at].successors if way > 0 else lanes[at].predecessors
+        links = lanes[at].successors if direction > 0 else lanes[at].predecessors
         if not links:
             break
         at = int(rng.choice(links))
@@ -99,12 +104,12 @@ def _straight_on(lane: Lane) -> bool:
 
 @dataclass(frozen=True)
 class CrossTraffic:
-    """Somebody crosses ego's way in a junction although ego goes first.
+    """A vehicle crosses ego's path in a junction although ego has right of way.
 
     Attributes:
-        turning: Somebody oncoming, who turns left and does not yield; else somebody who runs a red light.
-        speed_share: The actor's speed before the junction as a share of its limit, low and high.
-        arrival_s: Ego should come to the junction so long after the recording's beginning, low and high.
+        turning: An oncoming vehicle turns left without yielding; else a vehicle runs a red light.
+        speed_share: Speed of the actor before the junction as a share of its limit, low and high.
+        arrival_s: Time of ego's arrival at the junction, low and high.
     """
 
     turning: bool = False
@@ -118,51 +123,51 @@ class CrossTraffic:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: stop lines of ways that somebody may cross who ought to wait."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: stop lines of connectors that actors may cross."""
         if network.signals is None and not self.turning:
             return ()
         return tuple(
-            Aim(index, (0.0, 0.0), self.arrival_s)
+            Destination(index, (0.0, 0.0), self.arrival_s)
             for index, lane in enumerate(network.lanes)
-            if lane.connector and lane.predecessors and self._crossing(network, index)
+            if lane.connector and lane.predecessors and self._conflicting(network, index)
         )
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        ways = self._ways(scene)
+        connectors = self._crossing_connectors(view)
         share = float(rng.uniform(*self.speed_share))
-        if not ways:
+        if not connectors:
             return None
-        lane = int(rng.choice(ways))
-        way = _Way.through(scene, lane, rng)
-        fastest = share * way.limit_mps
-        # When the actor comes too late to stop: from there on it does what it should not.
+        lane = int(rng.choice(connectors))
+        path = _ActorPath.through(view, lane, rng)
+        fastest = share * path.limit_mps
+        # Steps before the entry at which the actor can no longer stop: the event begins.
         decides = max(3, round(float(rng.uniform(0.3, fastest / (2 * _BRAKING_MPS2))) / DT_S))
-        found = self._timed(scene, lane, way, (fastest, decides), severity_mps2)
-        if found is None:
+        scheduled = self._schedule(view, lane, path, (fastest, decides), severity_mps2)
+        if scheduled is None:
             return None
-        entry, threat, required = found
-        leaves = int(np.argmax(~np.isfinite(first_blocked(scene, threat, entry))[8:])) + 8 + entry
-        # The queue at its light would hold the actor: in the scenario with the event there is none.
-        removed = in_its_lane(scene, threat, entry + 5)
+        entry, adversary, required = scheduled
+        leaves = int(np.argmax(~np.isfinite(first_blocked(view, adversary, entry))[8:])) + 8 + entry
+        # A queue at its light would block the actor.
+        removed = vehicles_in_lane(view, adversary, entry + 5)
         return Proposal(
-            Staging(extras=(threat,), removed=removed),
+            Staging(extras=(adversary,), removed=removed),
             required,
-            threat,
+            adversary,
             entry - decides,
-            min(max(leaves, entry + 10), scene.last_step),
+            min(max(leaves, entry + 10), view.last_step),
         )
 
-    def _ways(self, scene: Scene) -> list[int]:
-        """Connectors of actors that cross one that ego will drive through during the recording."""
-        network = scene.roles.network
-        return sorted({other for mine in scene.connectors for other in self._crossing(network, mine)})
+    def _crossing_connectors(self, view: EgoView) -> list[int]:
+        """Connectors of actors that cross a connector on ego's path."""
+        network = view.roles.network
+        return sorted({other for mine in view.connectors for other in self._conflicting(network, mine)})
 
-    def _crossing(self, network: RoadNetwork, mine: int) -> list[int]:
-        """Connectors whose users would cross this one's, which lead straight on, although they ought to wait."""
+    def _conflicting(self, network: RoadNetwork, mine: int) -> list[int]:
+        """Connectors that cross a straight one and have to give way to it."""
         lane = network.lanes[mine]
         if not _straight_on(lane):
             return []
@@ -179,46 +184,46 @@ class CrossTraffic:
         lit = other.control == mine.control == Control.SIGNAL
         return lit and _straight_on(other) and abs(along) < _ALONG
 
-    def _timed(
-        self, scene: Scene, lane: int, way: _Way, pace: tuple[float, int], wanted: float
+    def _schedule(
+        self, view: EgoView, lane: int, path: _ActorPath, pace: tuple[float, int], requested: float
     ) -> tuple[int, Scripted, float] | None:
-        """The step at which the actor enters the junction so that it requires about this deceleration of ego."""
-        (fastest, decides), steps, track = pace, np.arange(scene.steps), scene.track
-        first = scene.first_step + EARLIEST + decides
-        last = min(scene.first_step + LATEST + decides, scene.last_step - 15)
+        """The entry step of the actor at which it requires about this deceleration, its motion, and its severity."""
+        (fastest, decides), steps, track = pace, np.arange(view.steps), view.track
+        first = view.first_step + EARLIEST + decides
+        last = min(view.first_step + LATEST + decides, view.last_step - 15)
 
         def entering(entry: int) -> Scripted:
-            distance = way.distances(fastest, DT_S * (steps - entry))
-            return along_curve(way.curve, distance, AgentKind.VEHICLE, CAR_M)
+            distance = path.distances(fastest, DT_S * (steps - entry))
+            return along_curve(path.curve, distance, AgentKind.VEHICLE, CAR_M)
 
         if first > last:
             return None
-        # What it blocks, and when, is the same for all timings but for the shift.
-        blocked = first_blocked(scene, entering(first), first - decides)
+        # The blocked stations are the same for all entry steps, shifted in time.
+        blocked = first_blocked(view, entering(first), first - decides)
         requires = np.zeros(last + 1)
         for entry in range(first, last + 1):
             begin = entry - decides + NOTICED
-            speed = float(scene.motion.speed[0, begin])
+            speed = float(view.motion.speed[0, begin])
             if speed > 4.0:
-                room = blocked[NOTICED:][: scene.last_step + 1 - begin] - track.at[begin]
+                room = blocked[NOTICED:][: view.last_step + 1 - begin] - track.at[begin]
                 requires[entry] = required_by_samples(speed, room)
         low, high = SEVERITY_MPS2
-        # The step at which the actor comes into ego's way, in time with the entry.
+        # The step at which the actor blocks ego's path, for each entry step.
         enters = np.arange(last + 1) - decides + int(np.argmax(np.isfinite(blocked)))
-        in_time = enters < scene.first_step + FULL_SWING
+        in_time = enters < view.first_step + FULL_SWING
         fits = np.flatnonzero((requires > low) & (requires < high) & in_time)
-        for entry in fits[np.argsort(np.abs(requires[fits] - wanted), kind="stable")[:6]].tolist():
-            # An ego that keeps its speed may be through before the actor comes.
-            threat = entering(entry)
-            if comes_close(scene, threat, entry - decides) and self._fits_lights(scene, lane, entry):
-                return entry, threat, float(requires[entry])
+        for entry in fits[np.argsort(np.abs(requires[fits] - requested), kind="stable")[:6]].tolist():
+            # An ego that keeps its speed may pass before the actor arrives.
+            adversary = entering(entry)
+            if comes_close(view, adversary, entry - decides) and self._fits_lights(view, lane, entry):
+                return entry, adversary, float(requires[entry])
         return None
 
-    def _fits_lights(self, scene: Scene, lane: int, entry: int) -> bool:
-        """A runner enters at red (not just now), a turner without a red light."""
-        network = scene.roles.network
+    def _fits_lights(self, view: EgoView, lane: int, entry: int) -> bool:
+        """Whether the light has been red for 1.2 s (red-light runner), or not red (turning vehicle)."""
+        network = view.roles.network
         if network.signals is None:
             return self.turning
-        colour, _ = network.signals.colours(scene.times_s, len(network.lanes))
+        colour, _ = network.signals.colours(view.times_s, len(network.lanes))
         seen = colour[entry - 12 : entry + 1, lane]
         return bool(np.all(seen != Colour.RED)) if self.turning else bool(np.all(seen == Colour.RED))

@@ -1,4 +1,4 @@
-"""Where ego should be, and when, so that something can happen there: its start and way are drawn to fit."""
+"""Destinations of ego for an event: places that it passes at a given time, and its route and start."""
 
 from __future__ import annotations
 
@@ -13,30 +13,29 @@ from drivax.synthetic.roads.signals import SignalPlan
 from drivax.synthetic.traffic.paths import onward
 from drivax.synthetic.traffic.population import Placement
 
-#: Ego's pace when nothing holds it up, as a share of the limit.
+#: Free speed of ego as a share of the limit.
 _PACE = 0.88
-#: Ego may have been under way for so long when the recording begins, s, and has so much road behind it at least, m.
+#: Road behind ego at the beginning of the recording: seconds at its free speed plus metres.
 _BEFORE_S, _BEHIND_M = 6.0, 15.0
-#: Ego's light turns green so early at the earliest, and where green is short it lasts until then, s.
+#: Earliest time at which ego's light turns green, and how long a short green lasts, s.
 _GREEN_S = (-5.0, 6.0)
-#: Where on an open road ego is at about the middle of the recording: so far from the lane's ends, m, and when, s.
+#: On open roads: distance of the place from the lane's ends, m, and time of ego's arrival, s.
 _BEFORE_M, _AFTER_M, _MIDWAY_S = 30.0, 30.0, (3.0, 6.0)
-#: Who is put behind ego begins so far behind it, that far from the next one and from the lane's beginning, m.
+#: A follower's distance behind ego, and its least distance to the next vehicle and to the lane's beginning, m.
 _FOLLOWS_M, _APART_M, _FROM_BEGIN_M = (16.0, 28.0), 20.0, 4.0
-#: A lane is begun this far from its end at least, m.
+#: Least distance of ego's start to the end of a lane, m.
 _FROM_END_M = 2.0
 
 
 @dataclass(frozen=True)
-class Aim:
+class Destination:
     """A place that ego should pass.
 
     Attributes:
-        lane: On which of ego's lanes it is.
-        along_m: How far along that lane, low and high.
-        when_s: How long after the recording's beginning ego should come there if nothing holds it up, low and high.
-        alone: Whether nobody may be ahead of ego on the way there.
-        followed: Whether somebody should be behind ego.
+        along_m: Distance along the lane, low and high.
+        when_s: Time of ego's arrival at free speed since the recording's beginning, low and high.
+        alone: Whether the lanes ahead of ego must be empty up to the place.
+        followed: Whether a vehicle must be behind ego.
     """
 
     lane: int
@@ -47,15 +46,13 @@ class Aim:
 
 
 @dataclass(frozen=True)
-class AimedWay:
-    """A way past such a place.
+class DestinationRoute:
+    """A route past a destination, with the destination's ``alone`` and ``followed``.
 
     Attributes:
         start: Where ego is when the recording begins.
-        lanes: Its lanes; some lie behind it.
-        place: Which of these the place is on.
-        alone: Whether nobody may be ahead of ego on the way there.
-        followed: Whether somebody should be behind ego.
+        lanes: Lanes of the route; some lie behind ego.
+        place: Which of these the destination is on.
     """
 
     start: Start
@@ -65,41 +62,51 @@ class AimedWay:
     followed: bool
 
 
-def open_road(network: RoadNetwork, least_mps: float = 0.0, beside: bool = False) -> tuple[Aim, ...]:
-    """Lanes on which ego may drive for a while in the middle of a recording, with others.
+def open_road(
+    network: RoadNetwork, lowest_limit_mps: float = 0.0, has_neighbour: bool = False
+) -> tuple[Destination, ...]:
+    """Places on ordinary lanes away from their ends.
 
     Args:
         network: The roads.
-        least_mps: The limit is at least this.
-        beside: Whether there must be a lane beside it.
+        lowest_limit_mps: Lowest speed limit of the lanes.
+        has_neighbour: Whether a lane must have a neighbour.
     """
     return tuple(
-        Aim(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
+        Destination(index, (_BEFORE_M, lane.length_m - _AFTER_M), _MIDWAY_S, alone=False)
         for index, lane in enumerate(network.lanes)
         if not (lane.connector or lane.ends or lane.exit_only or lane.kind == RoadKind.LANE_BIKE)
         and lane.length_m > _BEFORE_M + _AFTER_M
-        and lane.limit_mps >= least_mps
-        and (not beside or max(lane.left, lane.right) >= 0)
+        and lane.limit_mps >= lowest_limit_mps
+        and (not has_neighbour or max(lane.left, lane.right) >= 0)
     )
 
 
-def drawn_aimed_way(network: RoadNetwork, aims: Sequence[Aim], rng: np.random.Generator) -> AimedWay | None:
-    """A way past one of several places, as far as one of them can be reached; None without any."""
-    for place in rng.permutation(len(aims)).tolist():
-        way = aimed_way(network, aims[place], rng)
-        if way is not None:
-            return way
+def draw_route(
+    network: RoadNetwork, destinations: Sequence[Destination], rng: np.random.Generator
+) -> DestinationRoute | None:
+    """Draw a route past one of several destinations; None where none can be reached."""
+    for place in rng.permutation(len(destinations)).tolist():
+        route = route_past(network, destinations[place], rng)
+        if route is not None:
+            return route
     return None
 
 
-def aimed_way(network: RoadNetwork, aim: Aim, rng: np.random.Generator) -> AimedWay | None:
-    """A way to a place and on to the end of the map; None where a light or a sign before it would make ego late."""
-    time, lane, at = float(rng.uniform(*aim.when_s)), aim.lane, float(rng.uniform(*aim.along_m))
+def route_past(
+    network: RoadNetwork, destination: Destination, rng: np.random.Generator
+) -> DestinationRoute | None:
+    """Draw a route past a destination to the end of the map; None where a light or a sign before it delays ego."""
+    time, lane, at = (
+        float(rng.uniform(*destination.when_s)),
+        destination.lane,
+        float(rng.uniform(*destination.along_m)),
+    )
     lanes = [lane]
     while at < time * _pace(network, lane):
         time -= at / _pace(network, lane)
         before = _before(network, lanes)
-        if not before or (lane != aim.lane and network.lanes[lane].control != Control.NONE):
+        if not before or (lane != destination.lane and network.lanes[lane].control != Control.NONE):
             return None
         lane = int(rng.choice(before))
         lanes.insert(0, lane)
@@ -114,30 +121,30 @@ def aimed_way(network: RoadNetwork, aim: Aim, rng: np.random.Generator) -> Aimed
         room += network.lanes[lanes[0]].length_m
     place = len(lanes) - 1
     while network.lanes[lanes[-1]].successors:
-        ways = onward(network, lanes)
-        if not ways:
+        following = onward(network, lanes)
+        if not following:
             return None
-        lanes.append(int(rng.choice(ways)))
-    return AimedWay(start, tuple(lanes), place, aim.alone, aim.followed)
+        lanes.append(int(rng.choice(following)))
+    return DestinationRoute(start, tuple(lanes), place, destination.alone, destination.followed)
 
 
-def rearranged(
-    others: Placement, way: AimedWay, ego: tuple[int, float], rng: np.random.Generator
+def rearrange(
+    others: Placement, route: DestinationRoute, ego: tuple[int, float], rng: np.random.Generator
 ) -> Placement:
-    """The others as the aim wants them: nobody ahead of ego up to the lane after the place's, somebody behind it.
+    """Adapt the placement of other vehicles to a destination: empty lanes ahead of ego, a follower behind it.
 
     Args:
-        others: Who is placed where.
-        way: Ego's.
-        ego: On which lane of it ego begins, and how far along that.
-        rng: Source of chance.
+        others: Placement of other vehicles.
+        route: Route of ego.
+        ego: Lane on which ego begins, and distance along it.
+        rng: Source of randomness.
     """
     places = list(zip(others.lane, others.along_m, strict=True))
-    if way.alone:
-        first = way.lanes.index(ego[0])
-        ahead = way.lanes[first + 1 : way.place + 2]
+    if route.alone:
+        first = route.lanes.index(ego[0])
+        ahead = route.lanes[first + 1 : route.place + 2]
         places = [p for p in places if p[0] not in ahead and not (p[0] == ego[0] and p[1] > ego[1])]
-    if way.followed:
+    if route.followed:
         behind = (ego[0], ego[1] - float(rng.uniform(*_FOLLOWS_M)))
         near = [p for p in places if p[0] == ego[0] and behind[1] - _APART_M < p[1] < ego[1]]
         places += [behind] if behind[1] > _FROM_BEGIN_M and not near else []
@@ -145,7 +152,7 @@ def rearranged(
 
 
 def green_on_arrival(plan: SignalPlan, lane: int) -> SignalPlan:
-    """The plan with its clock set so that a lane's light is green when ego comes, and has been for long if it can."""
+    """Shift a plan so that a lane's light is green when ego arrives."""
     phase = plan.phase_of(lane)
     green_at = max(_GREEN_S[0], _GREEN_S[1] - plan.green_s[phase])
     return replace(plan, offset_s=green_at - plan.starts_s[phase])
@@ -156,6 +163,6 @@ def _pace(network: RoadNetwork, lane: int) -> float:
 
 
 def _before(network: RoadNetwork, lanes: list[int]) -> list[int]:
-    """Lanes that lead to the first one and are not yet part of the way."""
-    found = network.lanes[lanes[0]].predecessors
-    return [k for k in found if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]
+    """Predecessors of the first lane that are not part of the route."""
+    before = network.lanes[lanes[0]].predecessors
+    return [k for k in before if k not in lanes and network.lanes[k].kind != RoadKind.LANE_BIKE]

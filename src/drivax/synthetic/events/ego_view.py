@@ -1,4 +1,4 @@
-"""How a scenario goes without an event, seen along the way that ego drives: where things are staged."""
+"""The scenario without an event in coordinates of ego's path: input of the scripts that stage events."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from drivax.simulator.idm import idm_acceleration
 from drivax.synthetic.roads.curves import STEP_M
 from drivax.synthetic.traffic.roles import Motion, Roles
 
-#: Events begin in this range of steps of the recording, and are over or in full swing at the last one.
+#: Earliest and latest first step of an event, and the step before which its actor blocks ego's path.
 EARLIEST, LATEST, FULL_SWING = CURRENT_STEP + 2, CURRENT_STEP + 50, 78
-#: Steps from an event's first one until it can be seen what the actor is about to do, and the time, s.
+#: Steps from an event's first one until the actor's behaviour is visible, and the time, s.
 NOTICED = 4
 NOTICED_S = NOTICED * DT_S
-#: Ego's way goes on so far beyond the end of its drive, m.
+#: Ego's path continues this far beyond its last position, m.
 _BEYOND_M = 160.0
-#: Slower than this ego is no occasion for an event, m/s.
+#: Least speed of ego at the beginning of an event, m/s.
 _SLOWEST_MPS = 4.0
 
 
 @dataclass(frozen=True)
 class Track:
-    """Ego's way: where it went, and on along its path; samples half a metre apart.
+    """Ego's trace and the rest of its path as samples half a metre apart; stations are distances along it.
 
     Attributes:
         xy, heading: The samples.
-        at: Where on the way ego is at each step, m.
+        at: Station of ego at each step, m.
     """
 
     xy: Float64[np.ndarray, "point 2"]
@@ -46,7 +46,7 @@ class Track:
     def pose(
         self, station: Float64[np.ndarray, "*n"], left_m: Float64[np.ndarray, "*n"] | float = 0.0
     ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
-        """Positions this far to the left of stations, and the way's heading there."""
+        """Positions at stations and lateral offsets, and the path's headings there."""
         place = np.clip(station / STEP_M, 0.0, len(self.xy) - 1.001)
         index = place.astype(int)
         share = place - index
@@ -60,10 +60,10 @@ class Track:
         xy, heading = self.pose(np.array([station]))
         return xy[0], float(heading[0])
 
-    def projected(
+    def project(
         self, xy: Float64[np.ndarray, "n 2"]
     ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-        """Station of the nearest place of the way, and how far to its left points are."""
+        """Stations and lateral offsets (left positive) of points."""
         rel = xy[:, None] - self.xy
         index = np.argmin(np.sum(rel**2, axis=-1), axis=1)
         rel = rel[np.arange(len(xy)), index]
@@ -72,11 +72,11 @@ class Track:
 
 
 def ego_track(motion: Motion) -> Track:
-    """The way of row 0: its trace, then the rest of its path, or straight on where the path ends."""
+    """Return the track of row 0: its trace, the rest of its path, then straight on."""
     xy, heading = motion.xy[0], np.unwrap(motion.heading[0])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     moved = np.concatenate([[True], np.diff(arc) > 1e-3])
-    # Rounding must not let a standing ego creep.
+    # Rounding must not move an ego at rest.
     points, turned, along = xy[moved], heading[moved], arc[moved]
     if motion.paths:
         curve = motion.paths[0].curve
@@ -96,12 +96,11 @@ def ego_track(motion: Motion) -> Track:
 
 
 @dataclass(frozen=True)
-class Scene:
+class EgoView:
     """The scenario without the event.
 
     Attributes:
-        roles: Who is in it.
-        motion: How they go; row 0 is ego.
+        motion: Motion of all agents; row 0 is ego.
         first_step: Step of ``motion`` at which the recording begins.
     """
 
@@ -111,7 +110,7 @@ class Scene:
 
     @cached_property
     def track(self) -> Track:
-        """Ego's way."""
+        """Ego's trace and path."""
         return ego_track(self.motion)
 
     @property
@@ -134,8 +133,8 @@ class Scene:
         """Ego's length, width, height."""
         return self.motion.size_m[0]
 
-    def drawn_step(self, rng: np.random.Generator) -> int | None:
-        """A step at which an event may begin and ego is not slow, or None."""
+    def draw_step(self, rng: np.random.Generator) -> int | None:
+        """Draw a step at which an event may begin and ego is not slow; None without one."""
         steps = np.arange(self.first_step + EARLIEST, self.first_step + LATEST + 1)
         steps = steps[self.motion.speed[0, steps] > _SLOWEST_MPS]
         return int(rng.choice(steps)) if len(steps) else None
@@ -151,7 +150,7 @@ class Scene:
         )
 
     def lane_at(self, station: float) -> int:
-        """The lane on which ego is at a station (-1: none), the route's where several coincide."""
+        """Lane of ego at a station (-1: none), the route's where several coincide."""
         xy, heading = self.track.place(station)
         points, turned, lane = self._lane_points
         gap = np.hypot(*(points - xy).T)
@@ -163,7 +162,7 @@ class Scene:
         return int(lane[chosen][np.argmin(gap[chosen])])
 
     def neighbour(self, station: float, side: int) -> int:
-        """The lane of the same direction beside ego's at a station, 1 left, -1 right; -1 where there is none."""
+        """Neighbour of ego's lane at a station, left (1) or right (-1); -1 without one."""
         lane = self.lane_at(station)
         if lane < 0:
             return -1
@@ -172,24 +171,24 @@ class Scene:
 
     @cached_property
     def lane_ends(self) -> list[tuple[float, int]]:
-        """Where lanes beside ego's way end or lead off the road: stations, and on which side they are."""
+        """Ends of adjacent lanes: station, and side of ego's path (1 left, -1 right)."""
         result = []
         for lane in self.roles.network.lanes:
             if lane.ends or lane.exit_only:
-                (station,), (aside,) = self.track.projected(lane.curve.xy[-1:])
+                (station,), (aside,) = self.track.project(lane.curve.xy[-1:])
                 if 2.0 < abs(aside) < 5.5 and station > 0:
                     result.append((float(station), 1 if aside > 0 else -1))
         return result
 
     def edge_m(self, station: float, side: int) -> float:
-        """How far the nearest road edge is from ego's way at a station, to the left (1) or right (-1), m."""
+        """Distance of the nearest road edge from ego's path at a station, to the left (1) or right (-1), m."""
         origin, heading = self.track.place(station)
         out = side * np.array([-np.sin(heading), np.cos(heading)])
         best = math.inf
         for edge in self.roles.network.edges:
             a = edge.xy - origin
             b = np.roll(a, -1, axis=0)
-            # In the frame (out, along): where the side crosses the ray.
+            # Crossings of the edge's sides with the ray, in the frame (out, along).
             ay, by = a @ [-out[1], out[0]], b @ [-out[1], out[0]]
             across = (ay > 0) != (by > 0)
             if across.any():
@@ -199,7 +198,7 @@ class Scene:
         return best
 
     def plain_road(self, station: float) -> bool:
-        """Whether there is an ordinary lane, no junction, under ego at a station, and no crosswalk near."""
+        """Whether a station is on an ordinary lane, away from junctions and crosswalks."""
         lane = self.lane_at(station)
         network = self.roles.network
         if lane < 0 or network.lanes[lane].connector:
@@ -209,32 +208,29 @@ class Scene:
 
     @cached_property
     def connectors(self) -> list[int]:
-        """The ways across junctions that ego takes during the recording, or would take right after it."""
+        """Connectors on ego's path during the recording and right after it."""
         begin, end = self.track.at[self.first_step + EARLIEST], self.track.at[self.last_step] + 30.0
-        found = {self.lane_at(station) for station in np.arange(begin, end, 3.0).tolist()}
-        return sorted(i for i in found if i >= 0 and self.roles.network.lanes[i].connector)
+        lanes = {self.lane_at(station) for station in np.arange(begin, end, 3.0).tolist()}
+        return sorted(i for i in lanes if i >= 0 and self.roles.network.lanes[i].connector)
 
     def meets_junction(self, low_m: float, high_m: float) -> bool:
-        """Whether ego's way has a light, a sign or a crossing way between two stations, where actors are deaf."""
+        """Whether ego's path has a junction between two stations; scripted actors do not obey its rules."""
         lanes = self.roles.network.lanes
-        found = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
-        return any(lanes[lane].connector for lane in found if lane >= 0)
+        passed = {self.lane_at(station) for station in np.arange(low_m, high_m + 4.0, 4.0).tolist()}
+        return any(lanes[lane].connector for lane in passed if lane >= 0)
 
-    def on_way(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
-        """For all vehicles their station at a step, and whether they drive on ego's way (ego itself does not count)."""
+    def on_path(self, step: int) -> tuple[Float64[np.ndarray, " v"], Bool[np.ndarray, " v"]]:
+        """Stations of all vehicles at a step, and whether they drive on ego's path (False for ego itself)."""
         count = self.motion.vehicles
-        station, aside = self.track.projected(self.motion.xy[:count, step])
+        station, aside = self.track.project(self.motion.xy[:count, step])
         _, heading = self.track.pose(station)
         same = np.cos(self.motion.heading[:count, step] - heading) > 0.8
         on = self.motion.valid[:count, step] & (np.abs(aside) < 1.0) & same
         on[0] = False
         return station, on
 
-    def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> Scene:
-        """The scenario with somebody put ahead of ego, rear bumper at these stations, who is there since a step.
-
-        Ego drives as it would without, or slower by the common law of following.
-        """
+    def behind(self, rear_m: Float64[np.ndarray, " time"], since: int) -> EgoView:
+        """The scenario with a new leader, its rear bumper at stations from a step on: IDM slows ego behind it."""
         drivers, at, speed = self.roles.drivers.idm, self.track.at, self.motion.speed[0]
         law = replace(
             drivers,
@@ -250,7 +246,7 @@ class Scene:
             a = idm_acceleration(v, np.maximum(speed.max(keepdims=True), 1.0), gap, ahead[t : t + 1], law)
             after = max(0.0, float(v[0] + np.clip(a[0], -6.0, 2.0) * DT_S))
             moved = (float(v[0]) + after) / 2 * DT_S
-            # Bends, lights and others still hold it where they did.
+            # Ego is never ahead of where it was without the leader: bends, lights and other agents still hold it.
             where[t + 1] = min(where[t] + moved, at[t + 1])
             how[t + 1] = min(after, (where[t + 1] - where[t]) / DT_S if where[t + 1] == at[t + 1] else after)
         xy, heading = self.track.pose(where)
@@ -262,6 +258,6 @@ class Scene:
             speed=np.concatenate([how[None], motion.speed[1:]]),
         )
         result = replace(self, motion=changed)
-        # The way is the same; only where ego is on it is not.
+        # Only ego's stations change.
         result.__dict__["track"] = replace(self.track, at=where)
         return result

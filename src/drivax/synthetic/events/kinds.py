@@ -1,4 +1,4 @@
-"""What a labelled event is: its kind, who acts in it, when, and how hard it is to cope with."""
+"""Records of events: kinds, staged events, proposals and the protocols of scripts."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from drivax.synthetic.events.destinations import Aim
-from drivax.synthetic.events.ego_view import Scene
+from drivax.synthetic.events.destinations import Destination
+from drivax.synthetic.events.ego_view import EgoView
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
-#: Required decelerations of staged events, m/s2: from mild to the limit of what braking can avoid.
+#: Range of required decelerations of staged events, m/s2.
 SEVERITY_MPS2 = (1.5, 6.0)
 
 
 class EventKind(enum.IntEnum):
-    """Kinds of events; the numbers are stored in scenario sets and never change their meaning."""
+    """Kinds of events; scenario sets store these numbers."""
 
     NONE = 0
     LEAD_BRAKES = 1
@@ -36,16 +36,15 @@ class EventKind(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class Staged:
-    """An event that will happen.
+class StagedEvent:
+    """An event to simulate.
 
     Attributes:
-        kind: What it is.
-        staging: What has to change in how traffic goes.
-        actors: Rows of the motion that comes of it: of vehicles, or of the extras, which come last.
-        first_step, last_step: From when to when the actor does what it should not, both included.
-        severity_mps2: The constant deceleration with which ego just avoids the actor if it begins when it can see
-            what the actor is about to do, 0.4 s after the first step, and keeps its speed until then.
+        staging: Changes to the traffic.
+        actors: Rows of the actors in the simulated motion; extras come last.
+        first_step, last_step: Steps of the misbehaviour, both included.
+        severity_mps2: Constant deceleration with which ego just avoids the actor if it brakes 0.4 s after the first
+            step, when the actor's behaviour is visible, and keeps its speed until then.
     """
 
     kind: EventKind
@@ -58,48 +57,48 @@ class Staged:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An event as a script would like it, before it is checked.
+    """An event as a script proposes it, before the checks.
 
     Attributes:
-        severity_mps2: What it is meant to require of ego.
-        threat: How the actor will go if nobody disturbs it, at all steps.
-        vehicle: Its row if it is a vehicle of the roles; else it is the first of the extras.
+        severity_mps2: Intended severity.
+        adversary: Undisturbed motion of the actor at all steps.
+        vehicle: Row of the actor if it is a vehicle of the traffic; else it is the first of the extras.
         others: Rows of further actors.
-        scene: The scene with the actor in it, where ego drives otherwise because of it long before the event.
+        view: The scenario with the actor, where ego reacts to it before the event.
     """
 
     staging: Staging
     severity_mps2: float
-    threat: Scripted
+    adversary: Scripted
     first_step: int
     last_step: int
     vehicle: int | None = None
     others: tuple[int, ...] = ()
-    scene: Scene | None = None
+    view: EgoView | None = None
 
 
 @runtime_checkable
 class EventScript(Protocol):
-    """Thinks of an event of one kind."""
+    """Proposes events of one kind."""
 
     @property
     def kind(self) -> EventKind:
-        """What it stages."""
+        """Kind of event."""
         ...
 
     def possible(self, network: RoadNetwork) -> bool:
-        """Whether roads have what the event needs; where they do, the traffic may still leave no occasion."""
+        """Whether a network has what the event needs."""
         ...
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
-        """Proposes an event of about this severity, or None where this draw finds no occasion."""
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+        """Propose an event of about this severity, or None where this draw fails."""
         ...
 
 
 @runtime_checkable
-class AimedScript(EventScript, Protocol):
-    """One that needs ego at certain places; all others may happen on any open road."""
+class DestinationScript(EventScript, Protocol):
+    """Script that needs ego at certain places; all others may happen on any open road."""
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
         """Places of which ego should pass one."""
         ...

@@ -1,4 +1,4 @@
-"""Events with somebody ahead of ego in its lane: a leader who brakes hard (tailgater or not) or breaks down."""
+"""Events in ego's lane: a leader that brakes hard, with or without a tailgater behind ego, or stalls."""
 
 from __future__ import annotations
 
@@ -7,32 +7,31 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, changed_speed, slowed
+from drivax.synthetic.events.actors import CAR_M, along_track, brake_to_halt, speed_change
 from drivax.synthetic.events.adversary import severity
-from drivax.synthetic.events.destinations import Aim, open_road
-from drivax.synthetic.events.ego_view import NOTICED, Scene
+from drivax.synthetic.events.destinations import Destination, open_road
+from drivax.synthetic.events.ego_view import NOTICED, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Override, Staging, Tailgate
 
-#: Where everybody drives this slowly who brakes requires little of who follows, m/s.
+#: Lowest speed limit of the road, m/s: on slower roads a braking leader requires little of ego.
 _LEAST_MPS = 10.0
 #: Hard braking, up to locked wheels, m/s2.
 _HARD_MPS2, _HARDEST_MPS2 = 3.7, 8.0
-#: Who stopped for no reason stands so long, s, and at least until an ego that keeps its speed would be there.
+#: Time that a leader stands after ego would have reached it at constant speed, s.
 _HOLD_S = 1.5
-#: Who can be made to tailgate ego is at most this far behind it, m.
+#: Largest distance of a vehicle behind ego that becomes a tailgater, m.
 _FOLLOWER_M = 60.0
-#: A leader who is put there appears so many steps before the recording: ego has had no time to fall far back.
+#: A new leader appears this many steps before the recording, which leaves ego no time to fall back.
 _BEFORE = 5
 
 
-def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
-    """The deceleration that a leader who brakes to a halt requires of ego from the same moment on.
+def required_by_leader(speed_mps: float, gap_m: float, leader_mps: float, braking_mps2: float) -> float:
+    """Deceleration that a leader braking to a halt requires of ego from the same moment on.
 
-    Ego may roll ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). That is the whole condition where
-    ego comes to rest later than the leader, v / a >= v_l / b; else they are nearest while both move, and
-    a = b + (v - v_l)^2 / (2 g).
+    Ego may move ``gap_m`` further than the leader: v^2 / (2 a) = g + v_l^2 / (2 b). This holds where ego stops after
+    the leader, v / a >= v_l / b; else they are closest while both move, and a = b + (v - v_l)^2 / (2 g).
     """
     severity = speed_mps**2 / (2 * (gap_m + leader_mps**2 / (2 * braking_mps2)))
     if speed_mps / severity >= leader_mps / braking_mps2:
@@ -40,11 +39,11 @@ def leader_requires(speed_mps: float, gap_m: float, leader_mps: float, braking_m
     return braking_mps2 + max(speed_mps - leader_mps, 0.0) ** 2 / (2 * gap_m)
 
 
-def drawn_braking(
+def draw_braking(
     speed_mps: float, gap_m: float, leader_mps: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """How hard the leader brakes and what that requires, which is uniform where hard braking can bring it about."""
-    low, high = (leader_requires(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
+    """Draw the leader's deceleration and the severity, uniform over what hard braking can require; None: too little."""
+    low, high = (required_by_leader(speed_mps, gap_m, leader_mps, b) for b in (_HARD_MPS2, _HARDEST_MPS2))
     low, high = max(low, SEVERITY_MPS2[0]), min(high, SEVERITY_MPS2[1])
     if high <= low + 0.05:
         return None
@@ -55,15 +54,13 @@ def drawn_braking(
 
 @dataclass(frozen=True)
 class LeadBrakes:
-    """The vehicle ahead of ego brakes to a halt for no visible reason, and drives on after a moment.
-
-    Where nobody drives close ahead somebody is put there who does.
+    """The vehicle ahead of ego, or a new one, brakes to a halt without visible reason and drives on later.
 
     Attributes:
-        within_s: Who is ahead by at most this time gap is the one who brakes.
-        headway_s: Time gap of somebody who is put there, low and high.
-        tailgater: Whether somebody must be behind ego, who then follows it closely.
-        tailgating_s: The time gap that this one keeps, low and high.
+        within_s: Largest time gap of an existing leader; else a new vehicle is added.
+        headway_s: Time gap of a new leader, low and high.
+        tailgater: Whether a vehicle behind ego follows it closely.
+        tailgating_s: Time gap of the tailgater, low and high.
     """
 
     within_s: float = 2.0
@@ -78,21 +75,21 @@ class LeadBrakes:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: behind somebody who brakes on a slow street nobody has to brake."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: fast roads only."""
         places = open_road(network, _LEAST_MPS)
         return tuple(replace(place, followed=True) for place in places) if self.tailgater else places
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
-        step, headway = scene.drawn_step(rng), float(rng.uniform(*self.headway_s))
+        step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         tailgating = float(rng.uniform(*self.tailgating_s))
         if step is None:
             return None
-        motion, own = scene.motion, float(scene.track.at[step])
-        station, on = scene.on_way(step)
+        motion, own = view.motion, float(view.track.at[step])
+        station, on = view.on_path(step)
         speed = float(motion.speed[0, step])
         followers: tuple[int, ...] = ()
         tailgates: tuple[Tailgate, ...] = ()
@@ -106,24 +103,24 @@ class LeadBrakes:
         gap = np.where(on & (station > own), station - own - (length + length[0]) / 2, np.inf)
         leader = int(np.argmin(gap))
         if gap[leader] > self.within_s * speed:
-            return _put_ahead(scene, step, headway, rng, Staging(tailgates=tailgates), followers)
+            return _propose_leader(view, step, headway, rng, Staging(tailgates=tailgates), followers)
         lead = float(motion.speed[leader, step])
-        drawn = drawn_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
-        last = scene.last_step if drawn is None else step + _stands_until(speed, drawn[1])
-        if drawn is None or last > scene.last_step:
+        drawn = draw_braking(speed, float(gap[leader]), lead, rng) if lead > 3.0 else None
+        last = view.last_step if drawn is None else step + _stands_until(speed, drawn[1])
+        if drawn is None or last > view.last_step:
             return None
         staging = Staging(overrides=(Override(leader, step, last, -drawn[0]),), tailgates=tailgates)
-        threat = slowed(motion, leader, step, drawn[0])
-        required = severity(scene, threat, step + NOTICED)
-        return Proposal(staging, required, threat, step, last, leader, followers)
+        adversary = brake_to_halt(motion, leader, step, drawn[0])
+        required = severity(view, adversary, step + NOTICED)
+        return Proposal(staging, required, adversary, step, last, leader, followers)
 
 
 @dataclass(frozen=True)
 class StalledVehicle:
-    """A car that drives ahead of ego loses its power, comes to a halt and stays.
+    """A car ahead of ego loses its power, comes to a halt and stays.
 
     Attributes:
-        headway_s: How far it is ahead, low and high, as time.
+        headway_s: Time gap to the car, low and high.
     """
 
     headway_s: tuple[float, float] = (0.9, 1.4)
@@ -131,65 +128,63 @@ class StalledVehicle:
 
     def possible(self, network: RoadNetwork) -> bool:
         """See :class:`EventScript`."""
-        return bool(self.aims(network))
+        return bool(self.destinations(network))
 
-    def aims(self, network: RoadNetwork) -> tuple[Aim, ...]:
-        """See :class:`AimedScript`: behind somebody who brakes on a slow street nobody has to brake."""
+    def destinations(self, network: RoadNetwork) -> tuple[Destination, ...]:
+        """See :class:`DestinationScript`: fast roads only."""
         return open_road(network, _LEAST_MPS)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`; here what is possible is known, and the severity is drawn from that."""
-        step, headway = scene.drawn_step(rng), float(rng.uniform(*self.headway_s))
+        step, headway = view.draw_step(rng), float(rng.uniform(*self.headway_s))
         if step is None:
             return None
-        return _put_ahead(scene, step, headway, rng, None, ())
+        return _propose_leader(view, step, headway, rng, None, ())
 
 
 def _stands_until(speed_mps: float, severity_mps2: float) -> int:
-    """Steps until an ego that keeps its speed would be there, v / (2 a), and a moment more."""
+    """Steps that a leader stands: until ego would reach it at constant speed, v / (2 a), and a moment more."""
     return round((speed_mps / (2 * severity_mps2) + _HOLD_S) / DT_S)
 
 
-def _put_ahead(
-    scene: Scene,
+def _propose_leader(
+    view: EgoView,
     step: int,
     headway_s: float,
     rng: np.random.Generator,
     drives_on: Staging | None,
     others: tuple[int, ...],
 ) -> Proposal | None:
-    """A car that drives as ego does but ahead of it, and brakes to a halt at a step; ego keeps its distance before.
-
-    None where the car would meet a junction, or cannot brake so that it requires enough of ego.
+    """Propose a new leader at ego's speed that brakes to a halt; None near junctions, or where it requires too little.
 
     Args:
-        scene: The scene without it.
-        step: When it brakes.
-        headway_s: How far it is ahead where ego drives freely, as time.
-        rng: Source of chance.
-        drives_on: What else is staged with a car that drives on after a moment; None: it stays.
+        view: The scenario without it.
+        step: First step of braking.
+        headway_s: Time gap to an ego in free traffic.
+        rng: Source of randomness.
+        drives_on: Further staging of a car that drives on later; None: it stays.
         others: Further actors.
     """
-    track, lead = scene.track, float(scene.motion.speed[0, step])
-    lengths = (float(scene.ego_size_m[0]) + CAR_M[0]) / 2
+    track, lead = view.track, float(view.motion.speed[0, step])
+    lengths = (float(view.ego_size_m[0]) + CAR_M[0]) / 2
     cruising = track.at + headway_s * lead + lengths
-    if scene.meets_junction(float(cruising[scene.first_step]), float(cruising[step])):
+    if view.meets_junction(float(cruising[view.first_step]), float(cruising[step])):
         return None
-    appears = scene.first_step - _BEFORE
-    after = scene.behind(cruising - CAR_M[0] / 2, appears)
+    appears = view.first_step - _BEFORE
+    after = view.behind(cruising - CAR_M[0] / 2, appears)
     speed, gap = float(after.motion.speed[0, step]), float(cruising[step] - after.track.at[step]) - lengths
-    drawn = drawn_braking(speed, gap, lead, rng)
+    drawn = draw_braking(speed, gap, lead, rng)
     if drawn is None:
         return None
-    times = DT_S * (np.arange(scene.steps) - step)
-    gone, _ = changed_speed(lead, 0.0, drawn[0], times)
-    last = scene.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
-    onward, _ = changed_speed(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
+    times = DT_S * (np.arange(view.steps) - step)
+    gone, _ = speed_change(lead, 0.0, drawn[0], times)
+    last = view.last_step if drives_on is None else step + _stands_until(speed, drawn[1])
+    onward, _ = speed_change(0.0, lead, 1.5, np.maximum(times - DT_S * (last - step), 0.0))
     station = np.where(times < 0, cruising, cruising[step] + gone + onward)
-    if last > scene.last_step or scene.meets_junction(float(cruising[step]), float(station[scene.last_step])):
+    if last > view.last_step or view.meets_junction(float(cruising[step]), float(station[view.last_step])):
         return None
-    valid, left = np.arange(scene.steps) >= appears, np.zeros(scene.steps)
-    threat = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
-    staging = replace(drives_on or Staging(), extras=(threat,))
-    required = severity(after, threat, step + NOTICED)
-    return Proposal(staging, required, threat, step, last, None, others, after)
+    valid, left = np.arange(view.steps) >= appears, np.zeros(view.steps)
+    adversary = along_track(track, station, left, AgentKind.VEHICLE, CAR_M, valid=valid)
+    staging = replace(drives_on or Staging(), extras=(adversary,))
+    required = severity(after, adversary, step + NOTICED)
+    return Proposal(staging, required, adversary, step, last, None, others, after)

@@ -1,4 +1,4 @@
-"""Events that come from the roadside: people, cyclists, things that roll into the lane, cars that reverse out."""
+"""Events from the roadside: pedestrians, cyclists, objects that roll into the lane, reversing cars."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import DT_S, AgentKind
-from drivax.synthetic.events.actors import CAR_M, along_track, moving, smooth_step, travel_s, walked
+from drivax.synthetic.events.actors import CAR_M, along_track, scripted_motion, smooth_step, travel_s, walk
 from drivax.synthetic.events.adversary import waiting_room
-from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, Scene
+from drivax.synthetic.events.ego_view import EARLIEST, LATEST, NOTICED_S, EgoView
 from drivax.synthetic.events.kinds import EventKind, Proposal
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.traffic.roles import Scripted, Staging
 
 _PERSON_M, _BICYCLE_M, _THING_M = (0.5, 0.6, 1.75), (1.8, 0.65, 1.7), (1.0, 1.0, 0.9)
-#: Streets from whose sides things come: no faster than this, m/s.
+#: Highest limit of streets with such events, m/s.
 _STREET_MPS = 20.0
-#: How fast somebody who runs out gains speed, m/s2.
+#: Acceleration of a pedestrian, m/s2.
 _START_MPS2 = 3.0
-#: How fast a thing that falls or is pushed gains speed, m/s2.
+#: Acceleration of an object that falls or is pushed, m/s2.
 _ROLLING_MPS2 = 6.0
 
 
@@ -29,32 +29,32 @@ def _has_streets(network: RoadNetwork) -> bool:
     return any(lane.limit_mps <= _STREET_MPS for lane in network.lanes)
 
 
-def _place(scene: Scene, station: float) -> bool:
-    """Whether something may come from the side here: an ordinary street away from junctions and crosswalks."""
-    lane = scene.lane_at(station)
-    return scene.plain_road(station) and scene.roles.network.lanes[lane].limit_mps <= _STREET_MPS
+def _is_open_street(view: EgoView, station: float) -> bool:
+    """Whether a station is on an ordinary street, away from junctions and crosswalks."""
+    lane = view.lane_at(station)
+    return view.plain_road(station) and view.roles.network.lanes[lane].limit_mps <= _STREET_MPS
 
 
-def _across(
-    scene: Scene,
+def _crossing_actor(
+    view: EgoView,
     station: float,
     left_m: Float64[np.ndarray, " time"],
     kind: AgentKind,
     size: tuple[float, float, float],
 ) -> Scripted:
-    """Somebody who moves square to ego's way at a station, and faces it before."""
-    xy, heading = scene.track.pose(np.full(scene.steps, station), left_m)
+    """Actor that moves at a right angle to ego's path at a station; at rest it faces the path."""
+    xy, heading = view.track.pose(np.full(view.steps, station), left_m)
     toward = heading - math.copysign(math.pi / 2, float(left_m[0]))
-    return moving(xy, toward, kind, size, np.ones(scene.steps, bool))
+    return scripted_motion(xy, toward, kind, size, np.ones(view.steps, bool))
 
 
 @dataclass(frozen=True)
 class Jaywalker:
-    """Somebody walks out into the road where there is no crossing.
+    """A pedestrian crosses the road away from crossings.
 
     Attributes:
-        hidden: They come from behind a parked car; else from the kerb.
-        speed_mps: How fast they go, low and high.
+        hidden: From behind a parked car; else from the kerb.
+        speed_mps: Walking speed, low and high.
     """
 
     hidden: bool = False
@@ -69,76 +69,80 @@ class Jaywalker:
         """See :class:`EventScript`."""
         return bool(network.bays) if self.hidden else _has_streets(network)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
         pace = float(rng.uniform(*self.speed_mps))
-        if self.hidden:
-            found = self._behind_parked(scene, severity_mps2, pace, rng)
-        else:
-            found = self._from_kerb(scene, severity_mps2, pace, rng)
-        if found is None:
+        origin = (self._behind_parked if self.hidden else self._from_kerb)(view, severity_mps2, pace, rng)
+        if origin is None:
             return None
-        step, station, offset = found
-        if not _place(scene, station):
+        step, station, offset = origin
+        if not _is_open_street(view, station):
             return None
-        # Over to the other side of the road, and a little further.
+        # The walk ends beyond the other side of the road.
         side = -int(math.copysign(1, offset))
-        over = abs(offset) + min(scene.edge_m(station, side), 14.0) + 0.6
-        times = DT_S * (np.arange(scene.steps) - step)
-        went = walked(over, pace, (_START_MPS2, 2.0), times)
-        if went is None:
+        over = abs(offset) + min(view.edge_m(station, side), 14.0) + 0.6
+        times = DT_S * (np.arange(view.steps) - step)
+        gait = walk(over, pace, (_START_MPS2, 2.0), times)
+        if gait is None:
             return None
-        left = offset + side * went[0]
-        threat = _across(scene, station, left, AgentKind.PEDESTRIAN, _PERSON_M)
+        left = offset + side * gait[0]
+        adversary = _crossing_actor(view, station, left, AgentKind.PEDESTRIAN, _PERSON_M)
         last = step + round(travel_s(over, pace, _START_MPS2) / DT_S)
-        return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, min(last, scene.last_step))
+        return Proposal(
+            Staging(extras=(adversary,)), severity_mps2, adversary, step, min(last, view.last_step)
+        )
 
-    def _needs(self, scene: Scene, offset: float, speed: float, pace: float, wanted: float) -> float | None:
-        """Room from ego's front to the walker's line at the first step, or None where ego would be gone first."""
-        half = (scene.ego_size_m[1] + _PERSON_M[0]) / 2
+    def _required_room(
+        self, view: EgoView, offset: float, speed: float, pace: float, requested: float
+    ) -> float | None:
+        """Room from ego's front to the pedestrian's line at the first step; None where ego would pass first."""
+        half = (view.ego_size_m[1] + _PERSON_M[0]) / 2
         enters = travel_s(abs(offset) - half, pace, _START_MPS2)
         leaves = travel_s(abs(offset) + half, pace, _START_MPS2)
-        room = speed * NOTICED_S + waiting_room(speed, wanted, leaves - NOTICED_S)
+        room = speed * NOTICED_S + waiting_room(speed, requested, leaves - NOTICED_S)
         return room if room > speed * enters + 0.5 else None
 
     def _from_kerb(
-        self, scene: Scene, wanted: float, pace: float, rng: np.random.Generator
+        self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
-        step = scene.drawn_step(rng)
+        step = view.draw_step(rng)
         side = -1 if rng.random() < 0.7 else 1
         back = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        speed, own = float(scene.motion.speed[0, step]), float(scene.track.at[step])
-        front = own + (scene.ego_size_m[0] + _PERSON_M[1]) / 2
+        speed, own = float(view.motion.speed[0, step]), float(view.track.at[step])
+        front = own + (view.ego_size_m[0] + _PERSON_M[1]) / 2
         station, offset = front + speed, 0.0
-        # The kerb's distance is that at the place, which depends on it: twice is near enough.
+        # The distance of the kerb depends on the station, which depends on that distance: iterate twice.
         for _ in range(2):
-            offset = scene.edge_m(station, side) + back
+            offset = view.edge_m(station, side) + back
             if not offset < 10.0:
                 return None
-            room = self._needs(scene, offset, speed, pace, wanted)
+            room = self._required_room(view, offset, speed, pace, requested)
             if room is None:
                 return None
             station = front + room
         return step, station, side * offset
 
     def _behind_parked(
-        self, scene: Scene, wanted: float, pace: float, rng: np.random.Generator
+        self, view: EgoView, requested: float, pace: float, rng: np.random.Generator
     ) -> tuple[int, float, float] | None:
-        if not scene.roles.parked:
+        if not view.roles.parked:
             return None
-        centres = np.array([car.xy[0] for car in scene.roles.parked])
-        station, left = scene.track.projected(centres)
-        steps = np.arange(scene.first_step + EARLIEST, scene.first_step + LATEST)
-        speed = scene.motion.speed[0, steps]
-        beside = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > scene.track.at[steps[0]] + 6.0)
-        order = rng.permutation(np.flatnonzero(beside & (station < scene.track.at[steps[-1]] + 40.0)))
+        centres = np.array([car.xy[0] for car in view.roles.parked])
+        station, left = view.track.project(centres)
+        steps = np.arange(view.first_step + EARLIEST, view.first_step + LATEST)
+        speed = view.motion.speed[0, steps]
+        near = (np.abs(left) > 1.9) & (np.abs(left) < 5.0) & (station > view.track.at[steps[0]] + 6.0)
+        order = rng.permutation(np.flatnonzero(near & (station < view.track.at[steps[-1]] + 40.0)))
         for car in order[:6].tolist():
-            line = float(station[car]) + scene.roles.parked[car].size_m[0] / 2 + 0.55
+            line = float(station[car]) + view.roles.parked[car].size_m[0] / 2 + 0.55
             offset = float(left[car])
-            front = scene.track.at[steps] + (scene.ego_size_m[0] + _PERSON_M[1]) / 2
-            needs = [self._needs(scene, offset, float(v), pace, wanted) if v > 4.0 else None for v in speed]
+            front = view.track.at[steps] + (view.ego_size_m[0] + _PERSON_M[1]) / 2
+            needs = [
+                self._required_room(view, offset, float(v), pace, requested) if v > 4.0 else None
+                for v in speed
+            ]
             off = np.array([math.inf if need is None else need for need in needs]) - (line - front)
             best = int(np.argmin(np.abs(off)))
             if abs(off[best]) < 0.08 * speed[best]:
@@ -148,43 +152,43 @@ class Jaywalker:
 
 @dataclass(frozen=True)
 class LaneBlocked:
-    """A thing rolls from the roadside into ego's lane and stays there.
+    """An object rolls from the roadside into ego's lane and stays there.
 
     Attributes:
-        speed_mps: How fast it rolls, low and high.
+        speed_mps: Speed of the object, low and high.
     """
 
     speed_mps: tuple[float, float] = (2.5, 7.0)
     kind: EventKind = EventKind.LANE_BLOCKED
 
     def possible(self, network: RoadNetwork) -> bool:
-        """See :class:`EventScript`: anywhere."""
+        """See :class:`EventScript`: on all roads."""
         return bool(network.lanes)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        step, side = scene.drawn_step(rng), int(rng.choice([-1, 1]))
+        step, side = view.draw_step(rng), int(rng.choice([-1, 1]))
         pace, rest = float(rng.uniform(*self.speed_mps)), float(rng.uniform(-0.5, 0.5))
         out = float(rng.uniform(0.1, 0.7))
         if step is None:
             return None
-        speed = float(scene.motion.speed[0, step])
+        speed = float(view.motion.speed[0, step])
         room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-        station = float(scene.track.at[step]) + room + (scene.ego_size_m[0] + _THING_M[0]) / 2
-        offset = scene.edge_m(station, side) + out
-        half = (scene.ego_size_m[1] + _THING_M[1]) / 2
-        if not offset < 9.0 or not scene.plain_road(station):
+        station = float(view.track.at[step]) + room + (view.ego_size_m[0] + _THING_M[0]) / 2
+        offset = view.edge_m(station, side) + out
+        half = (view.ego_size_m[1] + _THING_M[1]) / 2
+        if not offset < 9.0 or not view.plain_road(station):
             return None
         if travel_s(offset - half, pace, _ROLLING_MPS2) > room / speed - 0.05:
             return None
-        times = DT_S * (np.arange(scene.steps) - step)
-        way = offset - rest
-        went = walked(way, pace, (_ROLLING_MPS2, max(3.0, pace**2 / way)), times)
-        if went is None:
+        times = DT_S * (np.arange(view.steps) - step)
+        length = offset - rest
+        gait = walk(length, pace, (_ROLLING_MPS2, max(3.0, pace**2 / length)), times)
+        if gait is None:
             return None
-        left = side * (offset - went[0])
-        threat = _across(scene, station, left, AgentKind.OTHER, _THING_M)
-        return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, scene.last_step)
+        left = side * (offset - gait[0])
+        adversary = _crossing_actor(view, station, left, AgentKind.OTHER, _THING_M)
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
 @dataclass(frozen=True)
@@ -192,8 +196,8 @@ class ReversingCar:
     """A car backs out of a driveway into ego's lane and stops there.
 
     Attributes:
-        speed_mps: How fast it reverses, low and high.
-        gain_mps2: How it gains that speed.
+        speed_mps: Speed in reverse, low and high.
+        gain_mps2: Acceleration.
     """
 
     speed_mps: tuple[float, float] = (2.0, 4.0)
@@ -204,41 +208,41 @@ class ReversingCar:
         """See :class:`EventScript`."""
         return _has_streets(network)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        step, pace = scene.drawn_step(rng), float(rng.uniform(*self.speed_mps))
+        step, pace = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
         into, back = float(rng.uniform(0.2, 1.2)), float(rng.uniform(-0.6, 0.4))
         if step is None:
             return None
-        speed = float(scene.motion.speed[0, step])
+        speed = float(view.motion.speed[0, step])
         room = speed * NOTICED_S + speed**2 / (2 * severity_mps2)
-        station = float(scene.track.at[step]) + room + (scene.ego_size_m[0] + CAR_M[1]) / 2
-        # Its rear bumper stands near the kerb on the right, and ends beyond the middle of ego's way.
-        rear = scene.edge_m(station, -1) + back
-        if not 1.3 < rear < 7.0 or not _place(scene, station):
+        station = float(view.track.at[step]) + room + (view.ego_size_m[0] + CAR_M[1]) / 2
+        # The rear bumper starts near the right kerb and ends beyond the middle of ego's path.
+        rear = view.edge_m(station, -1) + back
+        if not 1.3 < rear < 7.0 or not _is_open_street(view, station):
             return None
-        half = scene.ego_size_m[1] / 2
+        half = view.ego_size_m[1] / 2
         if travel_s(rear - half, pace, self.gain_mps2) > room / speed - 0.05:
             return None
-        times = DT_S * (np.arange(scene.steps) - step)
-        way = rear + into
-        went = walked(way, pace, (self.gain_mps2, max(2.5, pace**2 / way)), times)
-        if went is None:
+        times = DT_S * (np.arange(view.steps) - step)
+        length = rear + into
+        gait = walk(length, pace, (self.gain_mps2, max(2.5, pace**2 / length)), times)
+        if gait is None:
             return None
-        left = went[0] - (rear + CAR_M[0] / 2)
-        xy, heading = scene.track.pose(np.full(scene.steps, station), left)
+        left = gait[0] - (rear + CAR_M[0] / 2)
+        xy, heading = view.track.pose(np.full(view.steps, station), left)
         turned = heading - math.pi / 2
-        threat = Scripted(AgentKind.VEHICLE, CAR_M, xy, turned, -went[1], np.ones(scene.steps, bool))
-        return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, scene.last_step)
+        adversary = Scripted(AgentKind.VEHICLE, CAR_M, xy, turned, -gait[1], np.ones(view.steps, bool))
+        return Proposal(Staging(extras=(adversary,)), severity_mps2, adversary, step, view.last_step)
 
 
 @dataclass(frozen=True)
 class WrongWayCyclist:
-    """A cyclist comes along the edge of ego's side against traffic and swings out into ego's lane for a while.
+    """An oncoming cyclist at the edge of ego's side swings out into ego's lane for a while.
 
     Attributes:
         speed_mps: Speed, low and high.
-        out_s: How long they are in ego's way, low and high.
+        out_s: Time in ego's lane, low and high.
         swing_s: Duration of each swing.
     """
 
@@ -251,24 +255,24 @@ class WrongWayCyclist:
         """See :class:`EventScript`."""
         return _has_streets(network)
 
-    def propose(self, scene: Scene, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
+    def propose(self, view: EgoView, severity_mps2: float, rng: np.random.Generator) -> Proposal | None:
         """See :class:`EventScript`."""
-        step, pace = scene.drawn_step(rng), float(rng.uniform(*self.speed_mps))
+        step, pace = view.draw_step(rng), float(rng.uniform(*self.speed_mps))
         clear, inner = float(rng.uniform(*self.out_s)), float(rng.uniform(-0.9, -0.1))
         if step is None:
             return None
-        speed, own = float(scene.motion.speed[0, step]), float(scene.track.at[step])
+        speed, own = float(view.motion.speed[0, step]), float(view.track.at[step])
         room = speed * NOTICED_S + waiting_room(speed, severity_mps2, clear - NOTICED_S)
-        start = own + (scene.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace * clear
-        if not _place(scene, own + room) or not _place(scene, start):
+        start = own + (view.ego_size_m[0] + _BICYCLE_M[0]) / 2 + room + pace * clear
+        if not _is_open_street(view, own + room) or not _is_open_street(view, start):
             return None
-        half = (scene.ego_size_m[1] + _BICYCLE_M[1]) / 2
-        edge = scene.edge_m(start - pace * clear, -1)
+        half = (view.ego_size_m[1] + _BICYCLE_M[1]) / 2
+        edge = view.edge_m(start - pace * clear, -1)
         outer = -max(edge - 0.45, half + 0.35)
         if not edge < 4.5:
             return None
-        times = DT_S * (np.arange(scene.steps) - step)
-        # The lane is clear when the way back has brought them this share of the way out of it.
+        times = DT_S * (np.arange(view.steps) - step)
+        # Share of the swing back after which ego's lane is clear.
         share = (half + outer) / (outer - inner) if outer < inner else 1.0
         begin_back = clear - _time_of_share(1.0 - min(max(share, 0.0), 1.0)) * self.swing_s
         swing = smooth_step(times, self.swing_s) - smooth_step(times - begin_back, self.swing_s)
@@ -276,13 +280,15 @@ class WrongWayCyclist:
             return None
         left = outer + (inner - outer) * swing
         station = start - pace * times
-        valid = np.ones(scene.steps, bool)
-        threat = along_track(scene.track, station, left, AgentKind.CYCLIST, _BICYCLE_M, valid=valid)
+        valid = np.ones(view.steps, bool)
+        adversary = along_track(view.track, station, left, AgentKind.CYCLIST, _BICYCLE_M, valid=valid)
         last = step + round((begin_back + self.swing_s) / DT_S)
-        return Proposal(Staging(extras=(threat,)), severity_mps2, threat, step, min(last, scene.last_step))
+        return Proposal(
+            Staging(extras=(adversary,)), severity_mps2, adversary, step, min(last, view.last_step)
+        )
 
 
 def _time_of_share(share: float) -> float:
-    """When the smooth step has done this share, as a share of its duration."""
+    """Inverse of the smooth step: the share of its duration at which it reaches a share."""
     t = np.linspace(0.0, 1.0, 201)
     return float(np.interp(share, smooth_step(t, 1.0), t))

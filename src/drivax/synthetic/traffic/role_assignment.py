@@ -11,7 +11,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.synthetic.domains import Domain
-from drivax.synthetic.events.destinations import Aim, AimedWay, drawn_aimed_way, green_on_arrival, rearranged
+from drivax.synthetic.events.destinations import (
+    Destination,
+    DestinationRoute,
+    draw_route,
+    green_on_arrival,
+    rearrange,
+)
 from drivax.synthetic.expert import driver as expert
 from drivax.synthetic.roads.network import Control, RoadNetwork
 from drivax.synthetic.roads.signals import SignalPlan
@@ -34,10 +40,10 @@ _BACK_M = 160.0
 _WHEN_S = (0.4, 4.0)
 
 
-def giving_way(network: RoadNetwork) -> tuple[Aim, ...]:
+def giving_way(network: RoadNetwork) -> tuple[Destination, ...]:
     """Return destinations on connectors that yield to users with unconditional priority."""
     return tuple(
-        Aim(index, (0.0, min(3.0, lane.length_m)), _WHEN_S)
+        Destination(index, (0.0, min(3.0, lane.length_m)), _WHEN_S)
         for index, lane in enumerate(network.lanes)
         if lane.control == Control.ALL_WAY_STOP or any(not network.lanes[k].yields_to for k in lane.yields_to)
     )
@@ -89,7 +95,7 @@ def assign_roles(
     lane_change_share: float,
     timing: SignalTiming,
     rng: np.random.Generator,
-    destinations: Sequence[Aim] = (),
+    destinations: Sequence[Destination] = (),
     critical: bool = False,
 ) -> Roles:
     """Draw ego, its route and lights, then the others.
@@ -105,7 +111,7 @@ def assign_roles(
         critical: Ego's route leads where it must give way to dense traffic, if the roads allow it.
     """
     driver = expert.draw_expert(rng)
-    aimed = drawn_aimed_way(network, giving_way(network) if critical else destinations, rng)
+    aimed = draw_route(network, giving_way(network) if critical else destinations, rng)
     first_s = float(times_s[0])
     route = _draw_route(network, driver, first_s, lane_change_share, rng, aimed)
     for _ in range(_ROUTES if critical and aimed is None else 0):
@@ -122,7 +128,7 @@ def assign_roles(
     )
     others = placed(network, here.lane, at - here.begin_m, density, rng, parked, rivals)
     if aimed is not None:
-        others = rearranged(others, aimed, (here.lane, at - here.begin_m), rng)
+        others = rearrange(others, aimed, (here.lane, at - here.begin_m), rng)
     begin = [network.lanes[lane] for lane in others.lane]
     drivers = join_drivers(driver, draw_drivers(len(begin), density, rng, begin))
     paths = [path]
@@ -156,7 +162,7 @@ def _draw_route(
     first_s: float,
     lane_change_share: float,
     rng: np.random.Generator,
-    aimed: AimedWay | None,
+    aimed: DestinationRoute | None,
 ) -> _Route:
     """Ego begins so far back that the warm-up brings it to where the recording should begin."""
     if aimed is None:
@@ -175,7 +181,7 @@ def _lights(
     network: RoadNetwork,
     lanes: tuple[int, ...],
     timing: SignalTiming,
-    aimed: AimedWay | None,
+    aimed: DestinationRoute | None,
     rng: np.random.Generator,
 ) -> SignalPlan | None:
     """The lights with their clock set for the first one on ego's way, or on its way past the place it is aimed at."""

@@ -11,12 +11,12 @@ from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.families.junction import (
     Geometry,
     connect,
-    drawn_street,
+    draw_street,
     four_headings,
     open_site,
     starts,
 )
-from drivax.synthetic.roads.families.roadside import draw_alone, drawn_walk_m
+from drivax.synthetic.roads.families.roadside import draw_sidewalk_m, draw_surroundings
 from drivax.synthetic.roads.families.rules import set_all_way_stop
 from drivax.synthetic.roads.network import RoadNetwork
 from drivax.synthetic.roads.style import GRID, RoadStyle
@@ -48,11 +48,11 @@ class AllWayStop:
         streets = []
         for _ in range(2):
             lanes = 2 if rng.random() < self.two_lane_share else 1
-            streets.append(drawn_street(rng, style, (lanes, lanes), float(rng.choice(limits)), marked))
+            streets.append(draw_street(rng, style, (lanes, lanes), float(rng.choice(limits)), marked))
         arms = self.geometry.arms(rng, four_headings(rng, self.cross_skew), streets * 2)
         draft = Draft()
         site = connect(draft, open_site(rng, draft, arms, self.geometry), (False,) * 4)
-        draw_alone(draft, site, drawn_walk_m(rng, style, self.geometry))
+        draw_surroundings(draft, site, draw_sidewalk_m(rng, style, self.geometry))
         set_all_way_stop(draft, site.moves)
         return draft.network(
             self.name, starts(draft, [lane for approach in site.approaches for lane in approach.inward])

@@ -22,12 +22,12 @@ from drivax.synthetic.roads.families.junction import (
     Reach,
     Site,
     connect,
-    drawn_street,
+    draw_street,
     lay_lanes,
     open_approach,
     starts,
 )
-from drivax.synthetic.roads.families.roadside import add_crossings, drawn_walk_m, outline, paint
+from drivax.synthetic.roads.families.roadside import add_crossings, draw_sidewalk_m, outline, paint
 from drivax.synthetic.roads.families.rules import Conflicts, LeftTurns, set_lights, set_priorities
 from drivax.synthetic.roads.network import Control, RoadNetwork, conflicting
 from drivax.synthetic.roads.signals import SignalPlan, side_by_side
@@ -112,13 +112,13 @@ class Corridor:
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draws a network; ego begins before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
-        main = drawn_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
+        main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
         first = self._plot(rng, style, main).moved(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
         middle = self._between(rng, first.gate)
         second = self._plot(rng, style, main).moved(middle.end.turned())
         draft = Draft()
         sites, plots = self._sites(rng, draft, (first, second), middle), (first, second)
-        outline(draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, drawn_walk_m(rng, style, self.geometry))
+        outline(draft, sites, {(0, 0): (1, 0), (1, 0): (0, 0)}, draw_sidewalk_m(rng, style, self.geometry))
         paint(draft, main, middle)
         for site in sites:
             for approach in site.approaches[1:]:
@@ -139,7 +139,7 @@ class Corridor:
         kind = _KINDS[rng.choice(len(_KINDS), p=_SHARES)]
         marked = kind == _LIGHTS or bool(rng.random() < 0.4)
         slower = min(main.limit_mps, float(rng.choice(style.limits_mps)))
-        side = drawn_street(rng, style, (1, 1), slower, kind == _LIGHTS or bool(rng.random() < 0.6))
+        side = draw_street(rng, style, (1, 1), slower, kind == _LIGHTS or bool(rng.random() < 0.6))
         main = replace(main, marked=marked)
         streets, headings = [main, side, main, side], [k * math.pi / 2 for k in range(4)]
         if kind == _SIDE_ROAD:

@@ -198,7 +198,7 @@ class Geometry:
         return mouths
 
 
-def drawn_street(
+def draw_street(
     rng: np.random.Generator, style: RoadStyle, lanes: tuple[int, int], limit_mps: float, marked: bool = True
 ) -> CrossSection:
     """A street with this many lanes inward and outward, in the style of the domain."""

@@ -90,13 +90,13 @@ def _crossed(draft: Draft, site: Site, i: int) -> tuple[tuple[int, float], ...]:
     return (*entering, *leaving)
 
 
-def drawn_walk_m(rng: np.random.Generator, style: RoadStyle, geometry: Geometry) -> float | None:
+def draw_sidewalk_m(rng: np.random.Generator, style: RoadStyle, geometry: Geometry) -> float | None:
     """How far from the edge the sidewalks are, or None where there are none."""
     distance = float(rng.uniform(*geometry.walk_m))
     return distance if rng.random() < style.walk_share else None
 
 
-def draw_alone(draft: Draft, site: Site, walk_m: float | None) -> None:
+def draw_surroundings(draft: Draft, site: Site, walk_m: float | None) -> None:
     """Edges, sidewalks, markings and crossings of a junction that stands alone."""
     outline(draft, (site,), {}, walk_m)
     for approach in site.approaches:

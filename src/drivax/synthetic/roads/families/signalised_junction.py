@@ -16,12 +16,12 @@ from drivax.synthetic.roads.families.junction import (
     CrossSection,
     Geometry,
     connect,
-    drawn_street,
+    draw_street,
     four_headings,
     open_site,
     starts,
 )
-from drivax.synthetic.roads.families.roadside import draw_alone, drawn_walk_m
+from drivax.synthetic.roads.families.roadside import draw_sidewalk_m, draw_surroundings
 from drivax.synthetic.roads.families.rules import LeftTurns, set_lights
 from drivax.synthetic.roads.network import RoadNetwork, conflicting
 from drivax.synthetic.roads.style import GRID, RoadStyle
@@ -54,13 +54,13 @@ class SignalisedJunction:
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
         """Draws a junction; ego may begin on any approach, 12 to 85 m (6 s) before its stop line."""
-        streets = [_drawn_street(rng, style) for _ in range(2)]
+        streets = [_draw_street(rng, style) for _ in range(2)]
         arms = self.geometry.arms(rng, four_headings(rng, self.cross_skew), streets * 2)
         draft = Draft()
         site = open_site(rng, draft, arms, self.geometry)
         left_only = [_has_left_lane(street, rng, self.left_lane_share) for street in streets]
         site = connect(draft, site, left_only * 2)
-        draw_alone(draft, site, drawn_walk_m(rng, style, self.geometry))
+        draw_surroundings(draft, site, draw_sidewalk_m(rng, style, self.geometry))
         lefts = [
             LeftTurns(only and rng.random() < self.protected_share, rng.random() < self.permissive_share)
             for only in left_only
@@ -76,10 +76,10 @@ class SignalisedJunction:
         return draft.network(self.name, starts(draft, lanes), signals)
 
 
-def _drawn_street(rng: np.random.Generator, style: RoadStyle) -> CrossSection:
+def _draw_street(rng: np.random.Generator, style: RoadStyle) -> CrossSection:
     """A street as it meets lights."""
     layout = _LAYOUTS[rng.choice(len(_LAYOUTS), p=_SHARES)]
-    return drawn_street(rng, style, layout, float(rng.choice(style.limits_mps)))
+    return draw_street(rng, style, layout, float(rng.choice(style.limits_mps)))
 
 
 def _has_left_lane(street: CrossSection, rng: np.random.Generator, share: float) -> bool:

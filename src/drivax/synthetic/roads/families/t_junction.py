@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.families.junction import Geometry, connect, drawn_street, open_site, starts
-from drivax.synthetic.roads.families.roadside import draw_alone, drawn_walk_m
+from drivax.synthetic.roads.families.junction import Geometry, connect, draw_street, open_site, starts
+from drivax.synthetic.roads.families.roadside import draw_sidewalk_m, draw_surroundings
 from drivax.synthetic.roads.families.rules import set_priorities
 from drivax.synthetic.roads.network import Control, RoadNetwork, conflicting
 from drivax.synthetic.roads.style import GRID, RoadStyle
@@ -47,16 +47,16 @@ class TJunction:
         slower = min(limit, float(rng.choice(style.limits_mps)))
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main_marked, stem_marked = rng.random(2) < (self.marked_share, 2 * self.marked_share)
-        main = drawn_street(rng, style, (lanes, lanes), limit, bool(main_marked))
+        main = draw_street(rng, style, (lanes, lanes), limit, bool(main_marked))
         stem_lanes = (2, 1) if rng.random() < self.stem_lanes_share else (1, 1)
-        stem = drawn_street(rng, style, stem_lanes, slower, bool(stem_marked))
+        stem = draw_street(rng, style, stem_lanes, slower, bool(stem_marked))
         first = float(rng.uniform(-math.pi, math.pi))
         across = first + math.pi / 2 + float(rng.uniform(-self.stem_skew, self.stem_skew))
         arms = self.geometry.arms(rng, (first, across, first + math.pi), (main, stem, main))
         draft = Draft()
         site = open_site(rng, draft, arms, self.geometry)
         site = connect(draft, site, [bool(rng.random() < 0.5)] * 3)
-        draw_alone(draft, site, drawn_walk_m(rng, style, self.geometry))
+        draw_surroundings(draft, site, draw_sidewalk_m(rng, style, self.geometry))
         sign = Control.STOP if rng.random() < self.stop_share else Control.YIELD
         set_priorities(draft, site.moves, conflicting(tuple(draft.lanes)), (0, 2), sign)
         return draft.network(

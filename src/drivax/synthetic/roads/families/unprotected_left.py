@@ -14,12 +14,12 @@ from drivax.synthetic.roads.draft import Draft
 from drivax.synthetic.roads.families.junction import (
     Geometry,
     connect,
-    drawn_street,
+    draw_street,
     four_headings,
     open_site,
     starts,
 )
-from drivax.synthetic.roads.families.roadside import draw_alone, drawn_walk_m
+from drivax.synthetic.roads.families.roadside import draw_sidewalk_m, draw_surroundings
 from drivax.synthetic.roads.families.rules import LeftTurns, set_lights, set_priorities
 from drivax.synthetic.roads.network import Control, RoadNetwork, conflicting
 from drivax.synthetic.roads.style import GRID, RoadStyle
@@ -56,12 +56,12 @@ class UnprotectedLeft:
         limit = float(rng.choice(style.limits_mps))
         slower = min(limit, float(rng.choice(style.limits_mps)))
         layout = _LAYOUTS[rng.choice(len(_LAYOUTS), p=_SHARES)]
-        main = drawn_street(rng, style, layout, limit, lights)
-        side = drawn_street(rng, style, (1, 1), slower)
+        main = draw_street(rng, style, layout, limit, lights)
+        side = draw_street(rng, style, (1, 1), slower)
         arms = self.geometry.arms(rng, four_headings(rng, self.cross_skew), (main, side) * 2)
         draft = Draft()
         site = connect(draft, open_site(rng, draft, arms, self.geometry), (True, False) * 2)
-        draw_alone(draft, site, drawn_walk_m(rng, style, self.geometry))
+        draw_surroundings(draft, site, draw_sidewalk_m(rng, style, self.geometry))
         conflicts, signals = conflicting(tuple(draft.lanes)), None
         if lights:
             how = LeftTurns(protected=False, permissive=True)

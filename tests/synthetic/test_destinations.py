@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from drivax.synthetic.events.destinations import (
-    Aim,
-    AimedWay,
-    aimed_way,
-    drawn_aimed_way,
+    Destination,
+    DestinationRoute,
+    draw_route,
     green_on_arrival,
     open_road,
-    rearranged,
+    rearrange,
+    route_past,
 )
 from drivax.synthetic.roads.curves import Pose, straight
 from drivax.synthetic.roads.draft import Draft
@@ -40,11 +40,11 @@ def chain(lengths, control=Control.NONE):
 
 def test_ego_starts_as_far_back_as_it_drives_in_the_time():
     network = chain([100.0, 80.0, 20.0, 120.0], Control.SIGNAL)
-    way = aimed_way(network, Aim(2, (0.0, 0.0), (5.0, 5.0)), np.random.default_rng(0))
+    way = route_past(network, Destination(2, (0.0, 0.0), (5.0, 5.0)), np.random.default_rng(0))
     assert way is not None and way.lanes == (0, 1, 2, 3) and way.lanes[way.place] == 2
     # 5 s at 88 % of 10 m/s before the end of lane 1.
     assert way.start.lane == 1 and way.start.low_m == pytest.approx(80.0 - 44.0)
-    further = aimed_way(network, Aim(2, (10.0, 10.0), (12.5, 12.5)), np.random.default_rng(0))
+    further = route_past(network, Destination(2, (10.0, 10.0), (12.5, 12.5)), np.random.default_rng(0))
     assert further is not None and further.start.lane == 0
     assert further.start.low_m == pytest.approx(100.0 + 80.0 + 10.0 - 110.0)
 
@@ -52,15 +52,15 @@ def test_ego_starts_as_far_back_as_it_drives_in_the_time():
 def test_no_way_where_the_map_begins_too_late_or_a_rule_comes_before():
     network = chain([100.0, 80.0, 20.0, 120.0], Control.STOP)
     rng = np.random.default_rng(0)
-    assert aimed_way(network, Aim(1, (10.0, 10.0), (20.0, 20.0)), rng) is None
-    assert aimed_way(network, Aim(3, (5.0, 5.0), (6.0, 6.0)), rng) is None
+    assert route_past(network, Destination(1, (10.0, 10.0), (20.0, 20.0)), rng) is None
+    assert route_past(network, Destination(3, (5.0, 5.0), (6.0, 6.0)), rng) is None
     # Nor does ego begin on a connector.
-    assert aimed_way(network, Aim(3, (5.0, 5.0), (1.0, 1.0)), rng) is None
-    hopeless, good = Aim(1, (10.0, 10.0), (20.0, 20.0)), Aim(3, (60.0, 60.0), (3.0, 3.0))
+    assert route_past(network, Destination(3, (5.0, 5.0), (1.0, 1.0)), rng) is None
+    hopeless, good = Destination(1, (10.0, 10.0), (20.0, 20.0)), Destination(3, (60.0, 60.0), (3.0, 3.0))
     for seed in range(4):
-        way = drawn_aimed_way(network, (hopeless, good), np.random.default_rng(seed))
+        way = draw_route(network, (hopeless, good), np.random.default_rng(seed))
         assert way is not None and way.start.lane == 3
-    assert drawn_aimed_way(network, (hopeless,), rng) is None and drawn_aimed_way(network, (), rng) is None
+    assert draw_route(network, (hopeless,), rng) is None and draw_route(network, (), rng) is None
 
 
 @pytest.mark.parametrize("green_s", [7.0, 20.0])
@@ -73,20 +73,20 @@ def test_the_light_is_green_when_ego_comes(green_s):
 
 
 def test_the_road_ahead_is_free_and_somebody_follows():
-    way = AimedWay(Start(1, 40.0, 40.0), (0, 1, 2, 3, 4), 2, alone=True, followed=True)
+    way = DestinationRoute(Start(1, 40.0, 40.0), (0, 1, 2, 3, 4), 2, alone=True, followed=True)
     others = Placement((1, 1, 2, 3, 4, 7), (60.0, 5.0, 3.0, 30.0, 10.0, 50.0))
     rng = np.random.default_rng(0)
-    found = rearranged(others, way, (1, 40.0), rng)
+    found = rearrange(others, way, (1, 40.0), rng)
     # Somebody stands where the follower would be, or so near that there is no room.
     assert (found.lane, found.along_m) == ((1, 4, 7), (5.0, 10.0, 50.0))
-    found = rearranged(Placement((7,), (50.0,)), way, (1, 40.0), rng)
+    found = rearrange(Placement((7,), (50.0,)), way, (1, 40.0), rng)
     assert found.lane == (7, 1) and 12.0 <= found.along_m[1] <= 24.0
     plain = dataclasses.replace(way, alone=False, followed=False)
-    assert rearranged(others, plain, (1, 40.0), rng) == others
+    assert rearrange(others, plain, (1, 40.0), rng) == others
 
 
 def test_open_road():
     network = chain([100.0, 80.0, 20.0, 50.0])
-    assert [aim.lane for aim in open_road(network)] == [0, 1]
-    assert open_road(network, least_mps=12.0) == () and open_road(network, beside=True) == ()
-    assert all(30.0 <= aim.along_m[0] < aim.along_m[1] for aim in open_road(network))
+    assert [place.lane for place in open_road(network)] == [0, 1]
+    assert open_road(network, lowest_limit_mps=12.0) == () and open_road(network, has_neighbour=True) == ()
+    assert all(30.0 <= place.along_m[0] < place.along_m[1] for place in open_road(network))
