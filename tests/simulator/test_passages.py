@@ -17,7 +17,7 @@ from drivax.scenario.recording import MapFeature
 from drivax.scenario.schema import CAPACITIES, STEPS, RoadKind
 from drivax.simulator.simulator import Simulator
 from drivax.synthetic.roads.families.highway import Highway
-from drivax.synthetic.roads.families.lane_drop import LaneDrop
+from drivax.synthetic.roads.families.streets import LaneDrop
 from drivax.synthetic.roads.network import map_features
 from drivax.tasks.rewards import RewardConfig
 from drivax.tasks.task import Task

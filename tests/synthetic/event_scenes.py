@@ -69,7 +69,7 @@ def road(lanes=2, ends=False, limit=14.0):
         length = 250.0 if ends and k == 1 else 600.0
         draft.lane(straight(Pose(0.0, 3.5 * k, 0.0), length), 3.5, limit)
         if k:
-            draft.beside(k, k - 1)
+            draft.link_neighbours(k, k - 1)
     built = list(draft.lanes)
     if ends:
         built[1] = dataclasses.replace(built[1], ends=True)

@@ -9,11 +9,11 @@ from drivax.synthetic.roads.curves import (
     STEP_M,
     Curve,
     Pose,
-    connected,
+    connect_poses,
     from_curvature,
-    joined,
+    join_curves,
     quintic,
-    resampled,
+    resample,
     smooth_step,
     straight,
     turn,
@@ -50,7 +50,7 @@ def test_a_turn_ends_one_tangent_beyond_the_corner(angle):
 
 @pytest.mark.parametrize("end", [Pose(30.0, 12.0, 1.3), Pose(14.0, -25.0, -1.7), Pose(40.0, 2.0, 0.2)])
 def test_connected_poses_meet_and_bend_smoothly(end):
-    curve = connected(Pose(0.0, 0.0, 0.0), end)
+    curve = connect_poses(Pose(0.0, 0.0, 0.0), end)
     assert np.hypot(*curve.xy[0]) < 1e-6
     assert np.hypot(curve.end.x - end.x, curve.end.y - end.y) < 0.01
     assert curve.end.heading == pytest.approx(end.heading, abs=2e-3)
@@ -60,8 +60,8 @@ def test_connected_poses_meet_and_bend_smoothly(end):
 
 
 def test_poses_that_one_bend_cannot_join_are_refused():
-    with pytest.raises(ValueError, match="one bend"):
-        connected(Pose(0.0, 0.0, 0.0), Pose(-10.0, 5.0, math.pi / 2))
+    with pytest.raises(ValueError, match="no single bend"):
+        connect_poses(Pose(0.0, 0.0, 0.0), Pose(-10.0, 5.0, math.pi / 2))
 
 
 def test_a_quintic_begins_and_ends_straight():
@@ -78,7 +78,7 @@ def test_a_quintic_begins_and_ends_straight():
 def test_joining_keeps_one_point_per_joint_and_unwraps():
     a = straight(Pose(0.0, 0.0, 3.1), 5.0)
     b = straight(Pose(a.end.x, a.end.y, 3.1 - 2 * math.pi), 5.0)
-    both = joined(a, b)
+    both = join_curves(a, b)
     assert len(both.xy) == len(a.xy) + len(b.xy) - 1
     assert np.ptp(both.heading) < 1e-9
     assert both.arc_m[-1] == pytest.approx(10.0)
@@ -95,7 +95,7 @@ def test_shifting_and_reversing():
 
 
 def test_resampling_keeps_ends_and_spacing():
-    curve = resampled(from_curvature(np.full(77, 0.03), 0.33, Pose(0.0, 0.0, 1.0)), 0.5)
+    curve = resample(from_curvature(np.full(77, 0.03), 0.33, Pose(0.0, 0.0, 1.0)), 0.5)
     steps = np.diff(curve.arc_m)
     assert np.ptp(steps) < 1e-3 and abs(steps.mean() - 0.5) < 0.01
 

@@ -9,7 +9,7 @@ from drivax.scenario.schema import AgentKind
 from drivax.synthetic.expert.comfort import discomfort
 from drivax.synthetic.expert.plan import plan_ego
 from drivax.synthetic.expert.violations import find_violation
-from drivax.synthetic.roads.curves import Pose, joined, resampled, straight, turn
+from drivax.synthetic.roads.curves import Pose, join_curves, resample, straight, turn
 from drivax.synthetic.roads.network import Control
 from drivax.synthetic.roads.signals import LightGroup, SignalPlan
 from drivax.synthetic.traffic.roles import Override, Staging
@@ -142,7 +142,7 @@ def test_a_long_red_is_waited_for():
 def test_bends_are_driven_within_comfort():
     first = straight(Pose(0.0, 0.0, 0.0), 60.0)
     arc = turn(first.end, np.pi / 2, 14.0)
-    curve = resampled(joined(first, arc, straight(arc.end, 100.0)), 0.5)
+    curve = resample(join_curves(first, arc, straight(arc.end, 100.0)), 0.5)
     roles, motion = scene(road(turn=curve), 12.0)
     plan = plan_ego(roles, motion, TIMES, 0)
     assert discomfort(plan.heading, plan.speed) == ""

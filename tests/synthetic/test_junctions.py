@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from drivax.scenario.schema import Capacity, RoadKind
-from drivax.synthetic.roads.families.all_way_stop import AllWayStop
 from drivax.synthetic.roads.families.corridor import Corridor
-from drivax.synthetic.roads.families.junction import CrossSection, Geometry
-from drivax.synthetic.roads.families.signalised_junction import SignalisedJunction
-from drivax.synthetic.roads.families.t_junction import TJunction
-from drivax.synthetic.roads.families.unprotected_left import UnprotectedLeft
+from drivax.synthetic.roads.families.junction_layout import CrossSection, Geometry
+from drivax.synthetic.roads.families.junctions import (
+    AllWayStop,
+    SignalisedJunction,
+    TJunction,
+    UnprotectedLeft,
+)
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, map_features
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.roads.style import GRID, RING

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivax.synthetic.roads.curves import STEP_M, joined
+from drivax.synthetic.roads.curves import STEP_M, join_curves
 from drivax.synthetic.roads.families import CurvedRoad, SignalisedJunction
 from drivax.synthetic.traffic.paths import LaneChange, Sway, lane_path, random_lanes
 
@@ -69,7 +69,7 @@ def test_a_lane_change_leads_smoothly_from_one_centre_to_the_next():
     lanes = (0, 1, 2, *random_lanes(network, beside, np.random.default_rng(0)))
     path = lane_path(network, lanes, Sway(), change)
     begin = next(s.begin_m for s in path.spans if s.lane == 2)
-    old, new = (joined(*(network.lanes[i].curve for i in ids)).xy for ids in ((0, 1, 2), lanes[3:]))
+    old, new = (join_curves(*(network.lanes[i].curve for i in ids)).xy for ids in ((0, 1, 2), lanes[3:]))
 
     def gap(at, centre):
         return distance_to_polyline(path.curve.xy[round(at / path.step_m)][None], centre)[0]

@@ -9,8 +9,8 @@ from drivax.synthetic.roads.signals import (
     Colour,
     LightGroup,
     SignalPlan,
+    combine_plans,
     light_states,
-    side_by_side,
     yellow_time_s,
 )
 
@@ -63,7 +63,7 @@ def test_yellow_lasts_as_long_as_it_takes_to_react_and_stop():
 
 def test_two_junctions_keep_their_own_cycles():
     second = SignalPlan((LightGroup((4, 5), False), LightGroup((6,), False)), ((0,), (1,)), (4.0, 6.0))
-    both = side_by_side(PLAN, second, 1.0)
+    both = combine_plans(PLAN, second, 1.0)
     assert both.cycle_s == 22.0
     assert both.starts_s == (0.0, 9.5, 1.0, 9.5)
     assert [both.phase_of(lane) for lane in (0, 2, 5, 6)] == [0, 1, 2, 3]

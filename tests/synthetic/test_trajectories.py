@@ -10,7 +10,7 @@ from drivax.synthetic.expert.trajectories import (
     candidate_corners,
     shifted_path,
 )
-from drivax.synthetic.roads.curves import Pose, joined, resampled, straight, turn
+from drivax.synthetic.roads.curves import Pose, join_curves, resample, straight, turn
 
 from .oracles import distance_to_polyline
 from .staged_scenes import CAR, road, scene
@@ -19,7 +19,7 @@ from .staged_scenes import CAR, road, scene
 def bend():
     first = straight(Pose(0.0, 0.0, 0.0), 60.0)
     arc = turn(first.end, np.pi / 2, 20.0)
-    return resampled(joined(first, arc, straight(arc.end, 100.0)), 0.5)
+    return resample(join_curves(first, arc, straight(arc.end, 100.0)), 0.5)
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def road(length_m=600.0, limit=15.0, lanes=1, sections=1, width_m=3.5):
         columns.append(column)
     for left, right in pairwise(columns):
         for a, b in zip(left, right, strict=True):
-            draft.beside(a, b)
+            draft.link_neighbours(a, b)
     return RoadNetwork("test", tuple(draft.lanes), ()), columns
 
 

@@ -20,7 +20,7 @@ from drivax.synthetic.events.adversary import (
 from drivax.synthetic.events.destinations import Destination
 from drivax.synthetic.events.ego_view import EARLIEST, FULL_SWING, LATEST, NOTICED, EgoView
 from drivax.synthetic.events.kinds import SEVERITY_MPS2, EventKind, Proposal
-from drivax.synthetic.roads.curves import Curve, joined
+from drivax.synthetic.roads.curves import Curve, join_curves
 from drivax.synthetic.roads.network import Control, Lane, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.roles import Scripted, Staging
@@ -53,7 +53,7 @@ class _ActorPath:
         )
         ahead = [lanes[i].curve for i in reversed(before)]
         line = sum(float(curve.arc_m[-1]) for curve in ahead)
-        curve = joined(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
+        curve = join_curves(*ahead, lanes[connector].curve, *(lanes[i].curve for i in after))
         limit = lanes[before[0]].limit_mps if before else lanes[connector].limit_mps
         return cls(curve, line, limit)
 

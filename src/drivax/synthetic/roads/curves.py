@@ -1,4 +1,4 @@
-"""Smooth plane curves from which roads are made: positions with exact tangent headings, about 0.5 m apart."""
+"""Smooth plane curves of roads: positions with exact tangent headings, sampled at about 0.5 m."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from drivax.geometry.vectors import wrap
 
 #: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
 STEP_M = 0.5
-#: Below this change of heading two poses are joined by a quintic, above by a fillet.
+#: Poses with a smaller change of heading are joined by a quintic, others by a fillet.
 _FILLET_ANGLE = math.radians(25.0)
-#: A straight remainder shorter than this is left out, m.
+#: Shorter straight remainders are left out, m.
 _SHORTEST_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Pose:
-    """A place and a direction: metres and radians CCW from +x."""
+    """Position and heading: metres and radians CCW from +x."""
 
     x: float
     y: float
     heading: float
 
     def ahead(self, metres: float) -> Pose:
-        """The pose this far straight ahead."""
+        """Pose at a distance straight ahead."""
         return Pose(
             self.x + metres * math.cos(self.heading), self.y + metres * math.sin(self.heading), self.heading
         )
 
     def aside(self, left_m: float) -> Pose:
-        """The pose this far to the left (right where negative)."""
+        """Pose at a distance to the left (negative: right)."""
         return Pose(
             self.x - left_m * math.sin(self.heading), self.y + left_m * math.cos(self.heading), self.heading
         )
 
     def turned(self) -> Pose:
-        """The same place, looking back."""
+        """Pose at the same place with the opposite heading."""
         return Pose(self.x, self.y, self.heading + math.pi)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A sampled curve: points in metres and the tangent's heading in radians, unwrapped (no jumps of 2 pi)."""
+    """Sampled curve: points in metres and unwrapped tangent headings in radians."""
 
     xy: Float64[np.ndarray, "point 2"]
     heading: Float64[np.ndarray, " point"]
@@ -61,27 +61,27 @@ class Curve:
 
     @property
     def start(self) -> Pose:
-        """Where the curve begins."""
+        """First pose."""
         return self.pose(0)
 
     @property
     def end(self) -> Pose:
-        """Where the curve ends."""
+        """Last pose."""
         return self.pose(-1)
 
     def pose(self, sample: int) -> Pose:
-        """Place and direction at a sample."""
+        """Pose at a sample."""
         return Pose(float(self.xy[sample, 0]), float(self.xy[sample, 1]), float(self.heading[sample]))
 
     def shifted(self, left_m: float) -> Curve:
-        """The parallel curve this far to the left (right where negative)."""
+        """Parallel curve at a distance to the left (negative: right)."""
         normal = np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=-1)
         return Curve(self.xy + left_m * normal, self.heading)
 
     def displaced(self, left_m: Float64[np.ndarray, " point"]) -> Curve:
-        """The curve at a distance to the left that changes along the way; its heading is its own tangent.
+        """Curve at a distance to the left that varies along it, with its own tangent headings.
 
-        With arc s, curvature k and displacement d the tangent turns by ``atan2(dd/ds, 1 - d k)``.
+        With arc length s, curvature k and displacement d the tangent turns by ``atan2(dd/ds, 1 - d k)``.
         """
         stretch = 1.0 - left_m * np.gradient(self.heading, self.arc_m)
         slope = np.gradient(left_m, self.arc_m)
@@ -89,22 +89,22 @@ class Curve:
         return Curve(self.xy + left_m[:, None] * normal, self.heading + np.arctan2(slope, stretch))
 
     def reversed(self) -> Curve:
-        """The same points in the other direction."""
+        """Curve in the other direction."""
         return Curve(self.xy[::-1].copy(), self.heading[::-1] + math.pi)
 
     def piece(self, first: int, last: int) -> Curve:
-        """The samples ``first`` to ``last``, both included."""
+        """Samples ``first`` to ``last``, both included."""
         return Curve(self.xy[first : last + 1], self.heading[first : last + 1])
 
 
 def smooth_step(share: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """From 0 to 1 with no slope and no bend at both ends: ``10 t^3 - 15 t^4 + 6 t^5`` of the clipped share."""
+    """Quintic step from 0 to 1, ``10 t^3 - 15 t^4 + 6 t^5`` of the clipped share: no slope or curvature at its ends."""
     t = np.clip(share, 0.0, 1.0)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
 def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, start: Pose) -> Curve:
-    """Integrates curvature (1/m, one value per sample) to a curve; the midpoint rule, second order in the step."""
+    """Integrate curvature (1/m, one value per sample) to a curve by the midpoint rule."""
     turns = (curvature[1:] + curvature[:-1]) * (step_m / 2)
     heading = start.heading + np.concatenate([[0.0], np.cumsum(turns)])
     middle = (heading[1:] + heading[:-1]) / 2
@@ -114,26 +114,26 @@ def from_curvature(curvature: Float64[np.ndarray, " point"], step_m: float, star
 
 
 def straight(start: Pose, length_m: float) -> Curve:
-    """A straight line."""
+    """Straight line."""
     count = max(2, math.ceil(length_m / STEP_M) + 1)
     at = np.linspace(0.0, length_m, count)
     xy = np.column_stack([start.x + at * math.cos(start.heading), start.y + at * math.sin(start.heading)])
     return Curve(xy, np.full(count, start.heading))
 
 
-def joined(*curves: Curve) -> Curve:
-    """Curves one after the other; each begins where the one before ends, and that point is kept once."""
+def join_curves(*curves: Curve) -> Curve:
+    """Concatenate curves, each of which begins where the previous one ends."""
     xy, heading = [curves[0].xy], [curves[0].heading]
     for curve in curves[1:]:
-        # Headings continue without a jump of 2 pi, so that they can be interpolated.
+        # Unwrap the headings.
         jump = heading[-1][-1] - curve.heading[0]
         xy.append(curve.xy[1:])
         heading.append(curve.heading[1:] + 2 * math.pi * round(jump / (2 * math.pi)))
     return Curve(np.concatenate(xy), np.concatenate(heading))
 
 
-def resampled(curve: Curve, step_m: float) -> Curve:
-    """The curve at equal distances of about ``step_m`` along its chords, both ends kept."""
+def resample(curve: Curve, step_m: float) -> Curve:
+    """Resample a curve at equal distances of about ``step_m`` along its chords; both ends are kept."""
     arc = curve.arc_m
     count = max(2, round(float(arc[-1]) / step_m) + 1)
     at = np.linspace(0.0, arc[-1], count)
@@ -142,16 +142,13 @@ def resampled(curve: Curve, step_m: float) -> Curve:
 
 
 def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Curve:
-    """A bend whose curvature rises, holds and falls linearly (clothoid, arc, clothoid).
+    """Bend of clothoid, arc and clothoid; it ends ``tangent_m`` beyond the corner in the new direction.
 
     Args:
-        start: Where the bend begins.
+        start: First pose.
         angle: Change of heading, rad, positive to the left.
         tangent_m: Distance from the start to the corner where the tangents of both ends meet, m.
         easing: Share of the length in each of the two clothoids.
-
-    Returns:
-        The bend; it ends ``tangent_m`` beyond the corner in the new direction.
     """
 
     def shape(count: int, length_m: float, at: Pose) -> Curve:
@@ -163,14 +160,14 @@ def turn(start: Pose, angle: float, tangent_m: float, easing: float = 0.3) -> Cu
     unit = shape(513, 1.0, Pose(0.0, 0.0, 0.0))
     unit_tangent = math.hypot(*unit.xy[-1]) / 2 / math.cos(angle / 2)
     length = tangent_m / unit_tangent
-    # Integrate eight times finer than kept: the end then meets the tangent point within a millimetre.
+    # Integrate at an eighth of the step: the end meets the tangent point within a millimetre.
     count = 8 * max(4, math.ceil(length / STEP_M))
     fine = shape(count + 1, length, start)
     return Curve(fine.xy[::8], fine.heading[::8])
 
 
 def quintic(start: Pose, end: Pose) -> Curve:
-    """The fifth-order Hermite curve with zero curvature at both poses; for nearly parallel poses."""
+    """Fifth-order Hermite curve between nearly parallel poses, with zero curvature at both."""
     chord = math.hypot(end.x - start.x, end.y - start.y)
     t = np.linspace(0.0, 1.0, max(8, math.ceil(chord / STEP_M) * 4))[:, None]
     p0, p1 = np.array([start.x, start.y]), np.array([end.x, end.y])
@@ -183,11 +180,11 @@ def quintic(start: Pose, end: Pose) -> Curve:
     xy = p0 + (p1 - p0) * step + d0 * first + d1 * last
     rate = (p1 - p0) * step_rate + d0 * first_rate + d1 * last_rate
     heading = start.heading + wrap(np.arctan2(rate[:, 1], rate[:, 0]) - start.heading)
-    return resampled(Curve(xy, heading), STEP_M)
+    return resample(Curve(xy, heading), STEP_M)
 
 
-def connected(start: Pose, end: Pose) -> Curve:
-    """A smooth way from one pose to another: a fillet of the two tangents, or a quintic where they hardly turn.
+def connect_poses(start: Pose, end: Pose) -> Curve:
+    """Smooth curve between poses: a fillet of the two tangents, or a quintic for small changes of heading.
 
     Raises:
         ValueError: When the tangents do not meet ahead of the start and behind the end.
@@ -199,32 +196,32 @@ def connected(start: Pose, end: Pose) -> Curve:
     before = (dx * math.sin(end.heading) - dy * math.cos(end.heading)) / math.sin(angle)
     after = (dy * math.cos(start.heading) - dx * math.sin(start.heading)) / math.sin(angle)
     if min(before, after) < 1.0:
-        raise ValueError("the poses cannot be joined by one bend")
+        raise ValueError("no single bend connects the poses: their tangents do not meet between them")
     tangent = min(before, after)
     parts = [turn(start.ahead(before - tangent), angle, tangent)]
     if before - tangent > _SHORTEST_M:
         parts.insert(0, straight(start, before - tangent))
     if after - tangent > _SHORTEST_M:
         parts.append(straight(parts[-1].end, after - tangent))
-    return resampled(joined(*parts), STEP_M)
+    return resample(join_curves(*parts), STEP_M)
 
 
 def winding(
     rng: np.random.Generator, length_m: float, *, max_curvature: float, max_turn: float, start: Pose
 ) -> Curve:
-    """A road that bends left and right at random: curvature is linear between knots 35 to 90 m apart.
+    """Draw a winding road: curvature is linear between random knots 35 to 90 m apart.
 
     Args:
-        rng: Source of chance.
+        rng: Source of randomness.
         length_m: Length, m.
         max_curvature: Largest curvature, 1/m.
-        max_turn: Largest difference between any two headings, rad; below pi the curve cannot meet itself.
-        start: Where it begins.
+        max_turn: Largest difference of two headings, rad; below pi the curve cannot intersect itself.
+        start: First pose.
     """
     knots, values = [0.0], [0.0]
     while knots[-1] < length_m:
         knots.append(knots[-1] + rng.uniform(35.0, 90.0))
-        # Two knots in three bend the other way than the last one did: S-curves are common.
+        # Two of three knots reverse the curvature: S-curves are common.
         sign = -np.sign(values[-1]) if rng.random() < 2 / 3 and values[-1] else rng.choice([-1.0, 1.0])
         values.append(float(sign) * max_curvature * float(rng.uniform(0.15, 1.0)))
     count = math.ceil(length_m / STEP_M) + 1

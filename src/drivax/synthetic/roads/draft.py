@@ -1,4 +1,4 @@
-"""The table on which a family draws a road network: lanes are added and linked, then frozen."""
+"""Mutable draft of a road network: families add and link lanes, then freeze it."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from drivax.scenario.schema import RoadKind
-from drivax.synthetic.roads.curves import Curve
-from drivax.synthetic.roads.network import Bay, Crossing, Lane, Line, RoadNetwork, Start
+from drivax.synthetic.roads.curves import Curve, Pose
+from drivax.synthetic.roads.network import Bay, Crossing, Lane, Line, RoadNetwork, Start, conflicting
 from drivax.synthetic.roads.signals import SignalPlan
 
 
 @dataclass
 class Draft:
-    """Lanes and lines on their way into a :class:`~drivax.synthetic.roads.network.RoadNetwork`."""
+    """Lanes and lines of a future :class:`~drivax.synthetic.roads.network.RoadNetwork`."""
 
     lanes: list[Lane] = field(default_factory=list)
     edges: list[Line] = field(default_factory=list)
@@ -31,28 +32,36 @@ class Draft:
         return len(self.lanes) - 1
 
     def change(self, lane: int, **attributes: Any) -> None:
-        """Gives a lane other attributes, such as rules that are known once all lanes are there."""
+        """Change attributes of a lane, such as rules that depend on other lanes."""
         self.lanes[lane] = replace(self.lanes[lane], **attributes)
 
     def link(self, before: int, after: int) -> None:
-        """Traffic may go on from lane ``before`` to lane ``after``."""
+        """Make lane ``after`` a successor of lane ``before``."""
         a, b = self.lanes[before], self.lanes[after]
         self.lanes[before] = replace(a, successors=(*a.successors, after))
         self.lanes[after] = replace(b, predecessors=(*b.predecessors, before))
 
-    def beside(self, left: int, right: int) -> None:
-        """The two lanes run side by side in the same direction."""
+    def link_neighbours(self, left: int, right: int) -> None:
+        """Make two lanes of the same direction neighbours."""
         self.lanes[left] = replace(self.lanes[left], right=right)
         self.lanes[right] = replace(self.lanes[right], left=left)
 
     def mark(self, kind: RoadKind, curve: Curve) -> None:
-        """Adds a marking of about 1 m sampling along a curve."""
+        """Add a marking along a curve, sampled at about 1 m."""
         self.markings.append(Line(kind, curve.xy[::2]))
+
+    def crosswalk(self, *corners: Pose) -> None:
+        """Add the outline of a crosswalk."""
+        self.crosswalks.append(Line(RoadKind.CROSSWALK, points(*corners)))
+
+    def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
+        """See :attr:`RoadNetwork.conflicts`, of the lanes so far."""
+        return conflicting(tuple(self.lanes))
 
     def network(
         self, family: str, starts: tuple[Start, ...], signals: SignalPlan | None = None
     ) -> RoadNetwork:
-        """The finished network."""
+        """Return the finished network."""
         return RoadNetwork(
             family=family,
             lanes=tuple(self.lanes),
@@ -67,8 +76,13 @@ class Draft:
         )
 
 
-def ring(*curves: Curve) -> np.ndarray:
-    """The points of curves put one after the other as a closed ring, about 1 m apart, none repeated."""
-    points = np.concatenate([np.concatenate([curve.xy[:-1:2], curve.xy[-1:]]) for curve in curves])
-    far = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > 1e-6
-    return points[far]
+def points(*poses: Pose) -> Float64[np.ndarray, "pose 2"]:
+    """Positions of poses."""
+    return np.array([[pose.x, pose.y] for pose in poses])
+
+
+def ring(*curves: Curve) -> Float64[np.ndarray, "point 2"]:
+    """Closed ring of successive curves, sampled at about 1 m without repeated points."""
+    xy = np.concatenate([np.concatenate([curve.xy[:-1:2], curve.xy[-1:]]) for curve in curves])
+    far = np.hypot(*(xy - np.roll(xy, 1, axis=0)).T) > 1e-6
+    return xy[far]

@@ -1,4 +1,4 @@
-"""What a family of roads builds: lanes with links and rules, closed edges, markings, crosswalks, lights, starts."""
+"""Road networks: lanes with links and rules, closed edges, markings, crosswalks, lights, starts."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from drivax.scenario.schema import RoadKind
 from drivax.synthetic.roads.curves import Curve, Pose
 from drivax.synthetic.roads.signals import SignalPlan
 
-#: Centre lines closer than this belong to movements that cannot be driven at the same time, m.
+#: Connectors whose centre lines come closer than this are in conflict, m.
 CLEARANCE_M = 2.9
-#: Lanes are written with every second sample: about 1 m apart.
+#: Map features have every second sample of a lane, about 1 m apart.
 _STRIDE = 2
 
 
 class Control(enum.IntEnum):
-    """What a driver meets where a lane begins."""
+    """Traffic control at the entry of a lane."""
 
     NONE = 0
     SIGNAL = 1
@@ -32,18 +32,16 @@ class Control(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane; its index is its place in ``RoadNetwork.lanes``, links are indices, -1 is none.
+    """A lane; links are indices into ``RoadNetwork.lanes``, -1 is none.
 
     Attributes:
-        connector: True for a way across a junction: where lanes may cross and where rules hold at the entry.
-        left, right: The neighbour of the same direction whose ends lie beside this lane's ends.
-        control: The rule at the entry of a connector; the stop line is where the lane begins.
-        yields_to: Connectors whose users go first where both would meet: the priority road at a yield or stop sign,
-            the oncoming traffic of a left turn, who circulates in a roundabout. With all-way stops who stood first
-            goes first, and this is empty.
-        ends: The lane ends without a successor although the road goes on: its users must change to a neighbour
-            (lane drops, acceleration lanes).
-        exit_only: The lane leads off the road (a deceleration lane): who goes straight on does not use it.
+        left, right: Neighbours of the same direction.
+        connector: Whether the lane leads across a junction; connectors may cross, and have rules at the entry.
+        control: Rule at the entry of a connector; the stop line is where it begins.
+        yields_to: Connectors with right of way: the priority road at a yield or stop sign, oncoming traffic of a
+            left turn, traffic in a roundabout; empty at all-way stops.
+        ends: The lane ends without a successor while the road continues (lane drops, acceleration lanes).
+        exit_only: The lane leads off the road (deceleration lanes).
         kind: For cars or for bicycles only.
     """
 
@@ -69,7 +67,7 @@ class Lane:
 
 @dataclass(frozen=True)
 class Line:
-    """An edge (closed ring, drivable side on its left), a marking or a crosswalk's outline."""
+    """An edge (closed ring, drivable side on its left), a marking or the outline of a crosswalk."""
 
     kind: RoadKind
     xy: Float64[np.ndarray, "point 2"]
@@ -77,7 +75,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Start:
-    """Where ego may be when the recording begins: a lane and the range of distances along it, m."""
+    """Start of ego: a lane and the range of distances along it, m."""
 
     lane: int
     low_m: float
@@ -86,13 +84,13 @@ class Start:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where people cross: the axis from kerb to kerb, and the crosswalk's width; unmarked ones are not painted.
+    """Place where pedestrians cross.
 
     Attributes:
         axis: Two points, one on each kerb.
         width_m: Width of the crosswalk.
-        lanes: The lanes that it crosses, and where on each (m along its centre) the axis does.
-        marked: Whether there is a crosswalk, so that drivers have to let people cross.
+        lanes: Crossed lanes, each with the distance along it of the axis, m.
+        marked: Whether there is a crosswalk, where drivers yield to pedestrians.
     """
 
     axis: Float64[np.ndarray, "2 2"]
@@ -103,11 +101,11 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Bay:
-    """A place to park beside the lanes, inside the road's edges: its middle, heading and length.
+    """Parking space inside the road's edges: its middle, heading and length.
 
     Attributes:
-        lane: The lane beside it; a car that stands in that lane beside the bay is double-parked.
-        along_m: Where on that lane the middle of the bay is.
+        lane: The adjacent lane, on which cars may be double-parked.
+        along_m: Distance along that lane of the bay's middle.
     """
 
     pose: Pose
@@ -122,14 +120,10 @@ class RoadNetwork:
 
     Attributes:
         family: Name of the family that built it.
-        lanes: All lanes.
         edges: Closed rings without the repeated point: the outer boundary counter-clockwise, islands clockwise.
-        signals: The lights of its junctions, or None.
-        starts: Where ego may begin.
-        crossings: Where people may cross.
-        walks: Sidewalks, outside the edges; people walk along them in both directions.
-        bays: Places where cars may be parked.
-        busy: Lanes on which traffic is denser than elsewhere.
+        starts: Possible starts of ego.
+        walks: Sidewalks outside the edges.
+        busy: Lanes with denser traffic.
     """
 
     family: str
@@ -146,12 +140,12 @@ class RoadNetwork:
 
     @cached_property
     def conflicts(self) -> Bool[np.ndarray, "lane lane"]:
-        """Which connectors come closer than ``CLEARANCE_M`` although they begin at different lanes."""
+        """Pairs of connectors that come closer than ``CLEARANCE_M`` and begin at different lanes."""
         return conflicting(self.lanes)
 
     @cached_property
     def shared_m(self) -> dict[tuple[int, int], float]:
-        """For lanes that leave the same lane: how far along the first both need the same space, m."""
+        """For successors of the same lane: distance along the first one over which both share space, m."""
         result: dict[tuple[int, int], float] = {}
         for lane in self.lanes:
             for a in lane.successors:
@@ -164,15 +158,15 @@ class RoadNetwork:
 def conflicting(lanes: tuple[Lane, ...]) -> Bool[np.ndarray, "lane lane"]:
     """See :attr:`RoadNetwork.conflicts`."""
     result = np.zeros((len(lanes), len(lanes)), bool)
-    ways = [i for i, lane in enumerate(lanes) if lane.connector]
-    low = np.array([lanes[i].curve.xy.min(axis=0) for i in ways]).reshape(-1, 2)
-    high = np.array([lanes[i].curve.xy.max(axis=0) for i in ways]).reshape(-1, 2)
-    # Most pairs of a network with several junctions are far apart: their bounding boxes tell.
+    connectors = [i for i, lane in enumerate(lanes) if lane.connector]
+    low = np.array([lanes[i].curve.xy.min(axis=0) for i in connectors]).reshape(-1, 2)
+    high = np.array([lanes[i].curve.xy.max(axis=0) for i in connectors]).reshape(-1, 2)
+    # Bounding boxes exclude most pairs of a network with several junctions.
     far = ((low[:, None] - high[None]).max(axis=-1) > CLEARANCE_M) | (
         (low[None] - high[:, None]).max(axis=-1) > CLEARANCE_M
     )
-    for place, a in enumerate(ways):
-        for other, b in enumerate(ways[place + 1 :], place + 1):
+    for place, a in enumerate(connectors):
+        for other, b in enumerate(connectors[place + 1 :], place + 1):
             if far[place, other] or set(lanes[a].predecessors) & set(lanes[b].predecessors):
                 continue
             near = _distance(lanes[a].curve.xy[::2], lanes[b].curve.xy[::2]) < CLEARANCE_M
@@ -192,12 +186,12 @@ def _shared_length(a: Curve, b: Curve) -> float:
 
 
 def feature_id(lane: int) -> int:
-    """The map feature id of a lane index."""
+    """Map feature id of a lane."""
     return lane + 1
 
 
 def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
-    """The network as map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
+    """Convert a network to map features: lanes first (ids 1, 2, ...), then edges, markings, crosswalks, stop signs."""
     features = [_lane_feature(index, lane) for index, lane in enumerate(network.lanes)]
     for line in network.edges:
         features.append(_line_feature(len(features) + 1, line.kind, np.concatenate([line.xy, line.xy[:1]])))
@@ -209,7 +203,7 @@ def map_features(network: RoadNetwork) -> tuple[MapFeature, ...]:
 
 
 def _stop_signs(network: RoadNetwork) -> list[MapFeature]:
-    """One sign per lane from which connectors with a stop begin, at the stop line."""
+    """Stop signs at the stop lines, one per lane before connectors with a stop."""
     signs: dict[int, list[int]] = {}
     for index, lane in enumerate(network.lanes):
         if lane.control in (Control.STOP, Control.ALL_WAY_STOP):
@@ -220,9 +214,9 @@ def _stop_signs(network: RoadNetwork) -> list[MapFeature]:
             feature_id=0,
             kind=RoadKind.STOP_SIGN,
             points=_flat(network.lanes[before].curve.xy[-1:]),
-            lanes=tuple(map(feature_id, ways)),
+            lanes=tuple(map(feature_id, connectors)),
         )
-        for before, ways in signs.items()
+        for before, connectors in signs.items()
     ]
 
 

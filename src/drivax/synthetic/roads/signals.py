@@ -1,4 +1,4 @@
-"""Traffic lights: groups of movements, the phases that serve them, and their states over time."""
+"""Traffic lights: groups of movements, phases, and colours over time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivax.scenario.schema import LightState
 
 
 class Colour(enum.IntEnum):
-    """What a driver sees."""
+    """Colour that a driver sees."""
 
     NONE = 0
     GREEN = 1
@@ -22,7 +22,7 @@ class Colour(enum.IntEnum):
 
 @dataclass(frozen=True)
 class LightGroup:
-    """Movements that always show the same colour: indices of connector lanes, and whether lamps are arrows."""
+    """Connector lanes with the same colour at all times, and whether their lights are arrows."""
 
     lanes: tuple[int, ...]
     arrow: bool
@@ -30,17 +30,15 @@ class LightGroup:
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """Fixed-time plans of all junctions of a network: phases in turn, each green, then yellow, then red for everyone.
+    """Fixed-time plan of all junctions of a network: each phase is green, then yellow, then all lights are red.
 
     Attributes:
-        groups: The light groups.
-        phases: Per phase the indices of the groups that are green.
+        phases: Indices of the groups that are green, per phase.
         green_s: Duration of green of each phase, s.
-        yellow_s: Yellow of every phase, s.
-        all_red_s: Red for everyone at the junction after every yellow, s.
+        yellow_s, all_red_s: Duration of yellow and of the red after it, s.
         offset_s: Time at which phase 0 turns green, s.
-        programs: Per junction its phases in turn, each program on its own cycle; empty: one junction with them all.
-        lags_s: Per program the time from ``offset_s`` until its first phase turns green, s; empty: no lags.
+        programs: Phases of each junction in order, each program on its own cycle; empty: one junction with all phases.
+        lags_s: Time from ``offset_s`` until the first phase of each program turns green, s; empty: no lags.
     """
 
     groups: tuple[LightGroup, ...]
@@ -54,7 +52,7 @@ class SignalPlan:
 
     @property
     def starts_s(self) -> tuple[float, ...]:
-        """When each phase turns green, s after ``offset_s``."""
+        """Time at which each phase turns green, s after ``offset_s``."""
         starts = [0.0] * len(self.phases)
         programs = self._programs
         for program, lag in zip(programs, self.lags_s or (0.0,) * len(programs), strict=True):
@@ -66,7 +64,7 @@ class SignalPlan:
 
     @property
     def cycle_s(self) -> float:
-        """Duration of the whole cycle, s; the longest one where junctions have their own."""
+        """Duration of the longest cycle, s."""
         return max(map(self._duration_s, self._programs))
 
     @property
@@ -77,16 +75,12 @@ class SignalPlan:
         return sum(self.green_s[phase] for phase in program) + len(program) * (self.yellow_s + self.all_red_s)
 
     def stretched(self, cycle_s: float) -> SignalPlan:
-        """The plan with a longer green in its first phase, so that a cycle takes this long (one junction only)."""
+        """Lengthen the first green so that the cycle takes ``cycle_s`` (one junction only)."""
         extra = cycle_s - self.cycle_s
         return replace(self, green_s=(self.green_s[0] + extra, *self.green_s[1:]))
 
     def phase_of(self, lane: int) -> int:
-        """The phase that serves a connector lane.
-
-        Raises:
-            KeyError: When no light controls it.
-        """
+        """Phase that serves a connector lane; raises KeyError when no light controls it."""
         for phase, groups in enumerate(self.phases):
             if any(lane in self.groups[group].lanes for group in groups):
                 return phase
@@ -95,15 +89,9 @@ class SignalPlan:
     def colours(
         self, times_s: Float64[np.ndarray, " time"], lanes: int
     ) -> tuple[Int8[np.ndarray, "time lane"], Float64[np.ndarray, "time lane"]]:
-        """What every lane's driver sees.
+        """Colour of each of ``lanes`` lanes at times (NONE without a light), and the seconds from yellow to red.
 
-        Args:
-            times_s: Times, s.
-            lanes: Number of lanes of the network.
-
-        Returns:
-            The :class:`Colour` of each lane (NONE without a light) and, where it is yellow, the seconds until
-            it turns red (0 elsewhere).
+        The seconds are 0 where the light is not yellow.
         """
         colour = np.zeros((len(times_s), lanes), np.int8)
         left = np.zeros((len(times_s), lanes))
@@ -113,7 +101,7 @@ class SignalPlan:
         for program in self._programs:
             cycle = self._duration_s(program)
             for phase in program:
-                # A hair later than the true time: a change that falls on a step shows at that step on every machine.
+                # Slightly late, so that rounding does not shift changes that fall on a step.
                 since = (times_s + 1e-6 - self.offset_s - starts[phase]) % cycle
                 green = since < self.green_s[phase]
                 to_red = self.green_s[phase] + self.yellow_s - since
@@ -126,21 +114,21 @@ class SignalPlan:
 
 
 def yellow_time_s(limit_mps: float) -> float:
-    """How long yellow lasts on an approach: a second to react, then a stop with 3.05 m/s2, at least 3 s.
+    """Duration of yellow on an approach: one second of reaction, then a stop at 3.05 m/s2, at least 3 s.
 
-    The kinematic formula of the Institute of Transportation Engineers (Guidelines for Determining Traffic Signal
-    Change and Clearance Intervals, 2020) on level ground: ``t + v / (2 a)``.
+    Kinematic formula ``t + v / (2 a)`` of the Institute of Transportation Engineers (Guidelines for Determining
+    Traffic Signal Change and Clearance Intervals, 2020) on level ground.
     """
     return max(3.0, 1.0 + limit_mps / (2 * 3.05))
 
 
-def side_by_side(first: SignalPlan, second: SignalPlan, lag_s: float) -> SignalPlan:
-    """One plan of the lights of two junctions, each with its own cycle.
+def combine_plans(first: SignalPlan, second: SignalPlan, lag_s: float) -> SignalPlan:
+    """Combine the plans of two junctions, each with its own cycle.
 
     Args:
-        first: Plan of one junction, without programs; its yellow and all-red hold for both.
-        second: Plan of the other one.
-        lag_s: How long after phase 0 of ``first`` phase 0 of ``second`` turns green, s.
+        first: Plan without programs; its yellow and all-red times hold for both junctions.
+        second: Plan of the other junction.
+        lag_s: Time from green of phase 0 of ``first`` to green of phase 0 of ``second``, s.
     """
     groups, phases = len(first.groups), len(first.phases)
     return SignalPlan(
@@ -170,6 +158,6 @@ _ARROW = {
 
 
 def light_states(colour: Int8[np.ndarray, " time"], arrow: bool) -> Int8[np.ndarray, " time"]:
-    """Colours as the light states of the scenario schema."""
+    """Convert colours to light states of the scenario schema."""
     table: Int64[np.ndarray, " 4"] = np.array([(_ARROW if arrow else _ROUND)[c] for c in Colour])
     return table[colour].astype(np.int8)

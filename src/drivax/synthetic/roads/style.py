@@ -1,4 +1,4 @@
-"""How the roads of a domain look: ranges from which every family draws, so that domains differ in all of them."""
+"""Road styles: the ranges from which all families of a domain draw."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RoadStyle:
-    """Statistics of a domain's roads. Families add their own geometry.
+    """Statistics of a domain's roads.
 
     Attributes:
         width_m: Width of lanes, low and high.
-        limits_mps: Speed limits of streets to choose from.
-        fast_limits_mps: Speed limits of highways and their like.
+        limits_mps: Speed limits of streets.
+        fast_limits_mps: Speed limits of highways.
         shoulder_m: Drivable width beyond the outer lanes, low and high.
         curvature: Factor on the curvature of bends.
         walk_share: Share of streets with sidewalks.
-        parking_share: Share of streets with bays, where a family has room for them.
+        parking_share: Share of streets with bays, in families that have them.
     """
 
     width_m: tuple[float, float] = (3.35, 3.75)

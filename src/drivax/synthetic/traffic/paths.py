@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from drivax.synthetic.roads.curves import STEP_M, Curve, joined, resampled
+from drivax.synthetic.roads.curves import STEP_M, Curve, join_curves, resample
 from drivax.synthetic.roads.network import RoadNetwork
 
 #: Lanes that a vehicle can be on at once: its own, and those that need the same space at this place.
@@ -136,8 +136,8 @@ def lane_path(
             spans.append(LaneSpan(lane, at, 1.0, end_m=at + length))
         pieces.append(curve)
         at += length
-    middle = joined(*pieces) if len(pieces) > 1 else pieces[0]
-    return _finished(network, resampled(sway.applied(middle), STEP_M), at, spans)
+    middle = join_curves(*pieces) if len(pieces) > 1 else pieces[0]
+    return _finished(network, resample(sway.applied(middle), STEP_M), at, spans)
 
 
 def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: float) -> LaneSpan:
@@ -147,7 +147,7 @@ def _span(network: RoadNetwork, lane: int, at: float, length: float, **when: flo
 def _changed(a: Curve, b: Curve, change: LaneChange) -> tuple[Curve, tuple[float, float]]:
     """From curve ``a`` to the parallel ``b`` by a quintic step; also where both lanes begin and cease to matter."""
     count = max(len(a.xy), len(b.xy))
-    a, b = (resampled(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
+    a, b = (resample(c, float(c.arc_m[-1]) / (count - 1)) for c in (a, b))
     arc = a.arc_m
     t = np.clip((arc - change.begin_m) / change.length_m, 0.0, 1.0)[:, None]
     weight = t**3 * (10 - 15 * t + 6 * t**2)

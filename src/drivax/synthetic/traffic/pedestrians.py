@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int8, Int64
 from drivax.geometry.boxes import overlap
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
-from drivax.synthetic.roads.curves import STEP_M, Curve, resampled
+from drivax.synthetic.roads.curves import STEP_M, Curve, resample
 from drivax.synthetic.roads.network import Control, Crossing, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.obstacles import Boxes
@@ -123,7 +123,7 @@ class Walkers:
     ) -> None:
         self._conflicts = _crossing_conflicts(network)
         self._red_left_s = _red_left(network, self._conflicts.red, times_s)
-        curves = [resampled(walker.curve, STEP_M) for walker in walkers]
+        curves = [resample(walker.curve, STEP_M) for walker in walkers]
         self._last = np.array([len(curve.xy) - 1 for curve in curves], int)
         self._table = np.zeros((len(curves), max([*self._last, 0]) + 1, 3))
         self._begin = np.arange(len(curves)) * self._table.shape[1]
@@ -381,4 +381,4 @@ def _polyline(points: Float64[np.ndarray, "point 2"]) -> Curve:
     kept = np.concatenate([[True], np.hypot(*steps.T) > 1e-6])
     points = points[kept]
     angle = np.unwrap(np.arctan2(*np.diff(points, axis=0).T[::-1]))
-    return resampled(Curve(points, np.concatenate([angle, angle[-1:]])), STEP_M)
+    return resample(Curve(points, np.concatenate([angle, angle[-1:]])), STEP_M)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, Int8, Int64
 
 from drivax.geometry.vectors import wrap
 from drivax.scenario.schema import DT_S
-from drivax.synthetic.roads.curves import resampled
+from drivax.synthetic.roads.curves import resample
 from drivax.synthetic.roads.network import CLEARANCE_M, Control, RoadNetwork
 from drivax.synthetic.roads.signals import Colour
 from drivax.synthetic.traffic.drivers import Drivers
@@ -76,7 +76,7 @@ def conflict_zones(
     """
     count = len(network.lanes)
     begin, end = np.full((count, count), np.nan), np.full((count, count), np.nan)
-    points = {i: resampled(lane.curve, 1.0).xy for i, lane in enumerate(network.lanes) if lane.connector}
+    points = {i: resample(lane.curve, 1.0).xy for i, lane in enumerate(network.lanes) if lane.connector}
     box = {i: (xy.min(axis=0), xy.max(axis=0)) for i, xy in points.items()}
     for a, xy_a in points.items():
         origin = set(network.lanes[a].predecessors)

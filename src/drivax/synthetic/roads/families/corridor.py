@@ -1,7 +1,7 @@
-"""A small network: a main road with two junctions in a row, each with lights, two stop signs or a side road.
+"""A main road with two consecutive junctions, each with lights, two stop signs or a side road.
 
-The lanes between the junctions belong to both. Where both have lights these may be coordinated: same cycle, and the
-second turns green when those come who left the first at the beginning of green.
+Both junctions share the lanes between them. Two lights may be coordinated: the same cycle, and the second one turns
+green when vehicles arrive that left the first one at the beginning of green.
 """
 
 from __future__ import annotations
@@ -12,42 +12,45 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivax.synthetic.roads.curves import Curve, Pose, joined, straight, winding
+from drivax.synthetic.roads.curves import Curve, Pose, join_curves, straight, winding
 from drivax.synthetic.roads.draft import Draft
-from drivax.synthetic.roads.families.junction import (
+from drivax.synthetic.roads.families.junction_layout import (
     Approach,
     Arm,
     CrossSection,
     Geometry,
     Reach,
     Site,
+    add_crossings,
     connect,
+    draw_sidewalk_m,
     draw_street,
     lay_lanes,
     open_approach,
+    outline,
+    paint,
     starts,
 )
-from drivax.synthetic.roads.families.roadside import add_crossings, draw_sidewalk_m, outline, paint
 from drivax.synthetic.roads.families.rules import Conflicts, LeftTurns, set_lights, set_priorities
-from drivax.synthetic.roads.network import Control, RoadNetwork, conflicting
-from drivax.synthetic.roads.signals import SignalPlan, side_by_side
+from drivax.synthetic.roads.network import Control, RoadNetwork
+from drivax.synthetic.roads.signals import SignalPlan, combine_plans
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
-#: What a junction may be, with the share of each.
+#: Kinds of junctions and their shares.
 _LIGHTS, _TWO_STOPS, _SIDE_ROAD = "lights", "two_stops", "side_road"
 _KINDS = (_LIGHTS, _TWO_STOPS, _SIDE_ROAD)
 _SHARES = (0.5, 0.25, 0.25)
-#: The main road begins each junction's list of approaches; a start on it counts as much as three on side roads.
+#: Weight of a start on the main road relative to one on a side road.
 _MAIN_WEIGHT = 3
-#: The road between the junctions is straight at both ends, m.
+#: Length of the straight ends of the road between the junctions, m.
 _STRAIGHT_M = 25.0
-#: Platoons travel at this share of the limit.
+#: Speed of platoons as a share of the limit.
 _PLATOON = 0.85
 
 
 @dataclass(frozen=True)
 class _Plot:
-    """A junction before its lanes are laid; arm 0 leads to the other junction."""
+    """A junction without lanes; arm 0 leads to the other junction."""
 
     kind: str
     arms: list[Arm]
@@ -56,7 +59,7 @@ class _Plot:
 
     @property
     def main(self) -> tuple[int, ...]:
-        """The approaches of the main road."""
+        """Approaches of the main road."""
         side = [i for i, arm in enumerate(self.arms) if abs(math.sin(self._angle(arm))) > 0.5]
         return tuple(i for i in range(len(self.arms)) if i not in side)
 
@@ -65,11 +68,11 @@ class _Plot:
 
     @property
     def gate(self) -> Pose:
-        """Where the road to the other junction begins, looking outwards."""
+        """Beginning of the road to the other junction, looking outwards."""
         return self.arms[0].base.ahead(self.mouths[0] + self.arms[0].street.stop_line_m)
 
     def moved(self, gate: Pose) -> _Plot:
-        """The same junction elsewhere, with its gate there."""
+        """Move the junction so that its gate is at a pose."""
         angle = gate.heading - self.gate.heading
         cos, sin = math.cos(angle), math.sin(angle)
         arms = []
@@ -85,12 +88,11 @@ class Corridor:
     """Settings of the family ``corridor``.
 
     Attributes:
-        geometry: Angles, offsets and corners.
-        side_reach: How side roads go on: hardly bent, so that those of both junctions stay apart.
+        side_reach: Shape of side roads: nearly straight, so that those of both junctions stay apart.
         between_m: Length of the road between the stop lines of both junctions, low and high.
         two_lane_share: Share of main roads with two lanes per direction.
-        left_lane_share: Share of these whose left lane, at lights, is for turning left only.
-        protected_share: Share of lights with left-turn lanes that have a phase for them.
+        left_lane_share: Share of left-turn lanes at lights of two-lane roads.
+        protected_share: Share of protected left turns at lights with left-turn lanes.
         coordinated_share: Share of pairs of lights that are coordinated.
         green_s: Green time of a phase, low and high.
     """
@@ -110,7 +112,7 @@ class Corridor:
     name: str = "corridor"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draws a network; ego begins before either junction, most often on the main road."""
+        """Draw a network; ego starts before either junction, most often on the main road."""
         lanes = 2 if rng.random() < self.two_lane_share else 1
         main = draw_street(rng, style, (lanes, lanes), float(rng.choice(style.limits_mps)))
         first = self._plot(rng, style, main).moved(Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))))
@@ -124,7 +126,7 @@ class Corridor:
             for approach in site.approaches[1:]:
                 paint(draft, approach.arm.street, approach.middle)
             add_crossings(draft, site)
-        conflicts = conflicting(tuple(draft.lanes))
+        conflicts = draft.conflicts()
         plans = [self._rules(rng, draft, conflicts, *pair) for pair in zip(plots, sites, strict=True)]
         chosen = [
             lane
@@ -158,14 +160,14 @@ class Corridor:
             max_turn=math.radians(8.0),
             start=near.end,
         )
-        return joined(near, bent, straight(bent.end, _STRAIGHT_M))
+        return join_curves(near, bent, straight(bent.end, _STRAIGHT_M))
 
     def _sites(
         self, rng: np.random.Generator, draft: Draft, plots: tuple[_Plot, _Plot], middle: Curve
     ) -> list[Site]:
-        """Lays the shared road, then the other arms and the connectors of both junctions."""
+        """Add the shared road, then the other arms and the connectors of both junctions."""
         near, far = plots
-        side = joined(
+        side = join_curves(
             straight(near.arms[0].base.ahead(near.mouths[0]), near.arms[0].street.stop_line_m),
             middle,
             straight(middle.end, far.arms[0].street.stop_line_m),
@@ -179,13 +181,10 @@ class Corridor:
         for plot, first in zip(plots, shared, strict=True):
             rest = [
                 open_approach(
-                    rng,
-                    draft,
-                    plot.arms[i],
-                    plot.mouths[i],
-                    self.geometry.reach if i in plot.main else self.side_reach,
+                    rng, draft, arm, mouth, self.geometry.reach if i in plot.main else self.side_reach
                 )
-                for i in range(1, len(plot.arms))
+                for i, (arm, mouth) in enumerate(zip(plot.arms, plot.mouths, strict=True))
+                if i
             ]
             left_only = [plot.left_only and i in plot.main for i in range(len(plot.arms))]
             sites.append(connect(draft, Site((first, *rest)), left_only))
@@ -210,5 +209,5 @@ class Corridor:
             return first or second
         cycle = max(first.cycle_s, second.cycle_s)
         if rng.random() < self.coordinated_share:
-            return side_by_side(first.stretched(cycle), second.stretched(cycle), travel_s)
-        return side_by_side(first, second, float(rng.uniform(0.0, cycle)))
+            return combine_plans(first.stretched(cycle), second.stretched(cycle), travel_s)
+        return combine_plans(first, second, float(rng.uniform(0.0, cycle)))

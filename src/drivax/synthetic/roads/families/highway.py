@@ -1,4 +1,4 @@
-"""A highway with an on-ramp, an off-ramp, or both with a lane between them for weaving."""
+"""Highways with an on-ramp, an off-ramp, or both with a weaving lane between them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from drivax.scenario.schema import RoadKind
-from drivax.synthetic.roads.curves import STEP_M, Curve, Pose, from_curvature, winding
+from drivax.synthetic.roads.curves import STEP_M, Curve, from_curvature
 from drivax.synthetic.roads.draft import Draft, ring
-from drivax.synthetic.roads.families.street import Laid, Street, Strip, cuts, strips
+from drivax.synthetic.roads.families.street_layout import Laid, Street, StreetFamily, Strip, strips
 from drivax.synthetic.roads.network import Line, RoadNetwork, Start
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
-#: A ramp's curvature rises and falls over this length, m.
+#: Length over which a ramp's curvature rises and falls, m.
 _EASING_M = 40.0
 #: Drivable width left of a ramp's lane, m.
 _RAMP_SHOULDER_M = 0.7
@@ -23,11 +23,11 @@ _RAMP_SHOULDER_M = 0.7
 
 @dataclass(frozen=True)
 class _Ramp:
-    """A ramp as traffic drives it, its edges, and the gore's nose, where its left edge meets the highway's right one.
+    """A ramp, its edges, and the nose, where its left edge meets the highway's right edge.
 
     Attributes:
-        left, right: Edges, in the direction of traffic; the left one reaches to the nose only.
-        nose: Sample of the highway's middle line beside the nose.
+        left, right: Edges in the direction of traffic; the left one ends at the nose.
+        nose: Sample of the highway's middle line next to the nose.
     """
 
     lane: int
@@ -37,21 +37,17 @@ class _Ramp:
 
 
 @dataclass(frozen=True)
-class Highway:
+class Highway(StreetFamily):
     """Settings of the family ``highway``.
 
     Attributes:
-        length_m: Length of the reference line; a whole route must fit the grid of a stored scenario.
-        section_m: Lanes are cut into sections of this length.
-        tightest_m: Radius of the tightest bend, drawn per road, low and high.
-        widest_turn: Largest difference of two headings, rad.
         shares: Shares of highways with an on-ramp, with an off-ramp and with both.
-        two_way_share: Share of highways of two or three lanes whose other direction runs beside a median.
+        two_way_share: Share of highways of two or three lanes with the other direction beyond a median.
         median_m: Width of that median, low and high.
         shoulder_m: Drivable width beyond the outer lanes, low and high.
         ramp_m: Length of an on-ramp and of an off-ramp.
-        ramp_radius_m: Radius of a ramp where it bends away, low and high.
-        ramp_turn: By how much a ramp bends away, rad, low and high.
+        ramp_radius_m: Radius of a ramp's bend, low and high.
+        ramp_turn: Angle of a ramp's bend, rad, low and high.
         ramp_limit: Limit on ramps as a share of the highway's, low and high.
     """
 
@@ -70,23 +66,16 @@ class Highway:
     name: str = "highway"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draws a highway; ego begins 25 to 70 m before the section with a ramp, or on the on-ramp."""
-        middle = winding(
-            rng,
-            self.length_m,
-            max_curvature=1 / float(rng.uniform(*self.tightest_m)),
-            max_turn=self.widest_turn,
-            start=Pose(0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),
-        )
-        sections = cuts(self.length_m, self.section_m)
+        """Draw a highway; ego starts 25 to 70 m before the section with a ramp, or on the on-ramp."""
+        middle = self.draw_middle(rng)
         lanes = int(rng.integers(2, 5))
-        # At most five lanes in all: a wider one would not fit the map of a stored scenario.
+        # At most five lanes in total fit the map of a stored scenario.
         back = int(rng.integers(2, 6 - lanes)) if lanes < 4 and rng.random() < self.two_way_share else 0
         extra = self._extra(rng, lanes)
         street = Street(
             middle=middle,
-            cuts=sections,
-            strips=(*strips(lanes, back, len(sections) - 1), extra),
+            cuts=self.cuts,
+            strips=(*strips(lanes, back, len(self.cuts) - 1), extra),
             width_m=max(3.4, float(rng.uniform(*style.width_m))),
             limit_mps=float(rng.choice(style.fast_limits_mps)),
             shoulder_m=float(rng.uniform(*self.shoulder_m)),
@@ -106,25 +95,25 @@ class Highway:
         return draft.network(self.name, tuple(starts))
 
     def _extra(self, rng: np.random.Generator, lanes: int) -> Strip:
-        """The lane beside the main ones: for getting in, for getting out, or for both."""
-        what = rng.choice(3, p=self.shares)
+        """Draw the auxiliary lane: for entering, for leaving, or for both."""
+        purpose = rng.choice(3, p=self.shares)
         place, length = -lanes - 1, int(rng.integers(2, 4))
-        if what == 0:
+        if purpose == 0:
             return Strip(place, True, 3, 3 + length, ends=True)
-        if what == 1:
+        if purpose == 1:
             return Strip(place, True, 4, 3 + length, fork=True, exit_only=True)
         return Strip(place, True, 3, 3 + length, exit_only=True)
 
     def _ramp(
         self, rng: np.random.Generator, draft: Draft, street: Street, laid: Laid, extra: Strip, away: int
     ) -> _Ramp:
-        """Adds a ramp at the beginning of the extra lane (``away`` -1) or at its end (1)."""
+        """Add a ramp at the beginning of the auxiliary lane (``away`` -1) or at its end (1)."""
         section = extra.first if away < 0 else extra.last - 1
         at = street.cuts[extra.first if away < 0 else extra.last]
         length = self.ramp_m[0 if away < 0 else 1]
         line = draft.lanes[laid[extra.place, section]].curve
         gore = line.start.turned() if away < 0 else line.end
-        # As seen from the highway: to the left when looking back along an on-ramp, to the right along an off-ramp.
+        # Seen from the highway, an on-ramp bends to the left and an off-ramp to the right.
         side = np.gradient(street.middle.heading, STEP_M)[at::away][: round(length / STEP_M) + 1] * away
         bend = _bend(length, float(rng.uniform(*self.ramp_radius_m)), float(rng.uniform(*self.ramp_turn)))
         outward = from_curvature(side - away * bend, STEP_M, gore)
@@ -134,14 +123,14 @@ class Highway:
         draft.link(*((lane, laid[extra.place, section]) if away < 0 else (laid[extra.place, section], lane)))
         half = street.width_m / 2
         left, right = curve.shifted(half + _RAMP_SHOULDER_M), curve.shifted(-half - street.shoulder_m)
-        nose, beside = _nose(street, extra, left if away > 0 else left.reversed())
+        nose, neighbour = _nose(street, extra, left if away > 0 else left.reversed())
         last = len(left.xy) - 1
         left = left.piece(nose, last) if away > 0 else left.piece(0, last - nose)
-        return _Ramp(lane, left, right, beside)
+        return _Ramp(lane, left, right, neighbour)
 
 
 def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray, " point"]:
-    """Curvature that rises to 1 / radius, holds until the angle is reached and falls again."""
+    """Curvature that rises to 1 / radius, holds, and falls, and integrates to an angle."""
     hold = max(0.0, angle * radius_m - _EASING_M)
     knots = np.cumsum([0.0, _EASING_M, hold, _EASING_M])
     at = STEP_M * np.arange(round(length_m / STEP_M) + 1)
@@ -150,15 +139,15 @@ def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray,
 
 
 def _main_edge(street: Street, extra: Strip) -> Curve:
-    """The highway's right edge as it is without the extra lane."""
+    """Right edge of the highway without its auxiliary lane."""
     reach = street.reach_m[0] - street.width_m * street.presence(extra) + street.shoulder_m
     return street.middle.displaced(-reach)
 
 
 def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
-    """The first sample of a ramp's left edge, seen from the highway, that is off the highway, and where on it."""
+    """First sample of a ramp's left edge beyond the highway's edge, and the nearest sample of that edge."""
     edge = _main_edge(street, extra)
-    # The nose lies within 150 m of where the ramp leaves the highway.
+    # The nose lies within 150 m of the beginning of the ramp.
     span = round(150.0 / STEP_M)
     gore = int(np.argmin(np.sum((edge.xy - left.xy[0]) ** 2, axis=-1)))
     first, points = max(0, gore - span), left.xy[:span]
@@ -171,7 +160,7 @@ def _nose(street: Street, extra: Strip, left: Curve) -> tuple[int, int]:
 
 
 def _edges(draft: Draft, street: Street, extra: Strip, on: _Ramp | None, off: _Ramp | None) -> None:
-    """One boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
+    """Add the boundary, counter-clockwise: along the right edge with the ramps, and back along the left edge."""
     right, left = street.edge_m
     main, full, last = _main_edge(street, extra), street.middle.displaced(-right), len(right) - 1
     parts, begin = [], 0

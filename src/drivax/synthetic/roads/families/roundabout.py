@@ -1,8 +1,8 @@
-"""A roundabout with three or four arms and one or two lanes; who comes in yields to who goes round.
+"""Roundabouts with three or four arms and one or two lanes; entering traffic yields to circulating traffic.
 
-Traffic goes round counter-clockwise. With two lanes the left lane of an arm leads to the inner circle and the right
-one to the outer circle; from both one leaves into the lane of the same side. Who leaves from the inner circle crosses
-the outer one, and yields to it.
+Traffic circulates counter-clockwise. With two lanes the left lane of an arm leads to the inner circle and the right
+one to the outer circle, and exits lead into the lane of the same side. Exits from the inner circle cross the outer
+one and yield to it.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from drivax.synthetic.roads.curves import (
     STEP_M,
     Curve,
     Pose,
-    connected,
+    connect_poses,
     from_curvature,
-    joined,
+    join_curves,
     smooth_step,
     straight,
     winding,
 )
-from drivax.synthetic.roads.draft import Draft, ring
-from drivax.synthetic.roads.families.street import CROSSWALK_M
-from drivax.synthetic.roads.network import Control, Crossing, Line, RoadNetwork, Start, conflicting
+from drivax.synthetic.roads.draft import Draft, points, ring
+from drivax.synthetic.roads.families.street_layout import CROSSWALK_M
+from drivax.synthetic.roads.network import Control, Crossing, Line, RoadNetwork, Start
 from drivax.synthetic.roads.style import GRID, RoadStyle
 
-#: Radius of the fillet by which one enters and leaves, at least, m.
+#: Least radius of the fillets of entries and exits, m.
 _FILLET_M = 11.5
-#: The splitter keeps its width for the first of these distances from the yield line and is gone at the second, m.
+#: Distances from the yield line at which a splitter island begins to narrow and ends, m.
 _SPLITTER_M = (13.0, 42.0)
-#: From the yield line to the crosswalk's axis: a car's length remains free, m.
+#: Distance from the yield line to the crosswalk's axis, m: room for a car.
 _CROSSING_M = 6.5
-#: Between a kerb and the lane beside it, m.
+#: Distance from a kerb to the adjacent lane, m.
 _KERB_M = 0.4
-#: What is left of a circle between an entry and the next exit, m: who is on one is clear of the other.
+#: Least length of the circle between an entry and the next exit, m: vehicles on them are clear of each other.
 _ARC_M = 3.3
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """The measures that all arms share.
+    """Dimensions of a roundabout.
 
     Attributes:
-        radius_m: Of the circle's lane centres, inner first.
-        join: Angle from an arm to where the lane of that circle joins or leaves it, rad.
-        gap_m: Width between the directions at the yield lines.
+        radius_m: Radii of the circle's lane centres, inner first.
+        join: Angle from an arm to the entry and the exit of each circle, rad.
+        gap_m: Gap between the directions at the yield lines.
         yield_m: Distance of the yield lines from the centre.
         circle_m, width_m: Width of lanes in the circle and on the arms.
     """
@@ -64,18 +64,18 @@ class _Plan:
     limit_mps: float
 
     def aside_m(self, j: int) -> float:
-        """From an arm's middle line to the centre of its lane ``j`` at the yield line."""
+        """Distance from an arm's middle line to the centre of its lane ``j`` at the yield line."""
         return self.gap_m / 2 + (j + 0.5) * self.width_m
 
     def spread_m(self, middle: Curve) -> Float64[np.ndarray, " point"]:
-        """Half the gap between the directions along an arm."""
+        """Half of the gap between the directions along an arm."""
         begin, end = _SPLITTER_M
         return self.gap_m / 2 * (1.0 - smooth_step((middle.arc_m - begin) / (end - begin)))
 
 
 @dataclass(frozen=True)
 class _Arm:
-    """An arm and its part of the circle: lanes by circle, inner first."""
+    """An arm and its lanes by circle, inner first."""
 
     heading: float
     middle: Curve
@@ -88,12 +88,12 @@ class Roundabout:
     """Settings of the family ``roundabout``.
 
     Attributes:
-        arm_m: Length of every arm beyond its yield line.
+        arm_m: Length of arms beyond the yield line.
         radius_m: Radius of the outer circle's lane centre with one lane and with two, low and high.
         two_lane_share: Share of roundabouts with two lanes.
         three_arm_share: Share of roundabouts with three arms.
-        gap_m: Width between the directions at the yield lines, where the splitter islands are.
-        skew: Largest deviation of an arm from an even division, rad, where there is room for it.
+        gap_m: Gap between the directions at the yield lines, low and high.
+        skew: Largest deviation of an arm from an even division, rad, where room permits.
         limit_mps: Highest limit of the arms.
         circle_mps: Limit in the circle.
         marked_share: Share of roundabouts with crosswalks.
@@ -111,7 +111,7 @@ class Roundabout:
     name: str = "roundabout"
 
     def build(self, rng: np.random.Generator, style: RoadStyle = GRID) -> RoadNetwork:
-        """Draws a roundabout; ego may begin on any arm, 12 to 85 m before its yield line."""
+        """Draw a roundabout; ego starts on any arm, 12 to 85 m before its yield line."""
         plan = self._plan(rng, style)
         draft = Draft()
         arms = [self._arm(rng, draft, plan, heading) for heading in self._headings(rng, plan)]
@@ -137,7 +137,7 @@ class Roundabout:
 
     def _plan(self, rng: np.random.Generator, style: RoadStyle) -> _Plan:
         lanes = 2 if rng.random() < self.two_lane_share else 1
-        # Lanes side by side must not count as one another's conflict.
+        # Adjacent lanes must not be in conflict.
         width = max(float(rng.uniform(*style.width_m)), 3.15 if lanes == 2 else 0.0)
         circle, gap = width + float(rng.uniform(0.7, 1.2)), float(rng.uniform(*self.gap_m))
         outer = float(rng.uniform(*self.radius_m[lanes - 1]))
@@ -164,28 +164,28 @@ class Roundabout:
         return [base + 2 * math.pi * i / count + float(rng.uniform(-skew, skew)) for i in range(count)]
 
     def _arm(self, rng: np.random.Generator, draft: Draft, plan: _Plan, heading: float) -> _Arm:
-        """Lays the lanes of one arm: straight near the circle, then bending gently."""
+        """Add the lanes of an arm: straight near the circle, then slightly bent."""
         near = straight(Pose(0.0, 0.0, heading).ahead(plan.yield_m), 50.0)
         far = winding(
             rng, self.arm_m - 50.0, max_curvature=1 / 110, max_turn=math.radians(24.0), start=near.end
         )
-        middle = joined(near, far)
+        middle = join_curves(near, far)
         spread = plan.spread_m(middle)
         inward, outward = [], []
         for j in range(len(plan.radius_m)):
             aside = spread + (j + 0.5) * plan.width_m
             inward.append(draft.lane(middle.displaced(aside).reversed(), plan.width_m, plan.limit_mps))
             outward.append(draft.lane(middle.displaced(-aside), plan.width_m, plan.limit_mps))
-        for way in (inward, outward):
-            if len(way) == 2:
-                draft.beside(*way)
+        for lanes in (inward, outward):
+            if len(lanes) == 2:
+                draft.link_neighbours(*lanes)
         return _Arm(heading, middle, inward, outward)
 
 
 def _join(radius: float, aside: float) -> tuple[float, float]:
-    """Angle from an arm at which its lane meets the circle, and how far from the centre the bend to it begins.
+    """Angle from an arm at which its lane joins the circle, and distance from the centre at which the bend begins.
 
-    The arm's lane (parallel to the arm, ``aside`` beside it) and the circle's tangent at angle d meet at a distance
+    The arm's lane (at a distance ``aside`` from the arm) and the circle's tangent at angle d intersect at a distance
     ``t = (r sin d - aside) / cos d`` from the circle; a fillet with that tangent has the radius ``t / tan(45 - d/2)``.
     """
     angles = np.linspace(math.radians(24.0), math.pi / 4 - _ARC_M / radius / 2, 40)
@@ -204,24 +204,24 @@ def _arc(radius: float, begin: float, end: float) -> Curve:
     length = radius * (end - begin)
     count = max(4, math.ceil(length / STEP_M) + 1)
     chord = 2 * radius * math.sin((end - begin) / (count - 1) / 2)
-    # Steps are chords, so that the samples lie on the circle.
+    # Steps are chords: the samples lie on the circle.
     curvature = np.full(count, (end - begin) / (count - 1) / chord)
     return from_curvature(curvature, chord, _on_circle(radius, begin))
 
 
 def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list[list[Curve]]:
-    """Adds entries, exits and circles; returns the outermost way from every arm to the next one."""
+    """Add entries, exits and circles; return the outermost curves from each arm to the next one."""
     chains: list[list[Curve]] = []
     for j, (radius, join) in enumerate(zip(plan.radius_m, plan.join, strict=True)):
         entries, exits, passes = [], [], []
         for arm in arms:
             a, b = draft.lanes[arm.inward[j]].curve, draft.lanes[arm.outward[j]].curve
-            entry = connected(a.end, _on_circle(radius, arm.heading + join))
-            leave = connected(_on_circle(radius, arm.heading - join), b.start)
+            entry = connect_poses(a.end, _on_circle(radius, arm.heading + join))
+            leave = connect_poses(_on_circle(radius, arm.heading - join), b.start)
             around = _arc(radius, arm.heading - join, arm.heading + join)
-            for way, curve, width in ((entries, entry, plan.width_m), (exits, leave, plan.width_m),
-                                      (passes, around, plan.circle_m)):  # fmt: skip
-                way.append(draft.lane(curve, width, limit, connector=True))
+            for lanes, curve, width in ((entries, entry, plan.width_m), (exits, leave, plan.width_m),
+                                        (passes, around, plan.circle_m)):  # fmt: skip
+                lanes.append(draft.lane(curve, width, limit, connector=True))
             draft.link(arm.inward[j], entries[-1])
             draft.link(exits[-1], arm.outward[j])
         for i, arm in enumerate(arms):
@@ -238,24 +238,23 @@ def _go_round(draft: Draft, plan: _Plan, arms: list[_Arm], limit: float) -> list
 
 
 def _set_priorities(draft: Draft) -> None:
-    """Who goes round has priority over who comes in, and over who leaves across an outer circle."""
-    lanes = tuple(draft.lanes)
-    conflicts = conflicting(lanes)
+    """Give circulating traffic right of way over entries, and over exits across the outer circle."""
+    lanes, conflicts = draft.lanes, draft.conflicts()
     arcs = {i for i, lane in enumerate(lanes) if len(lane.predecessors) == 2}
     passes = {i for i, lane in enumerate(lanes) if {*lane.predecessors, *lane.successors} <= arcs}
     for i in range(len(lanes)):
-        over = tuple(int(k) for k in np.flatnonzero(conflicts[i]) if k in passes)
-        if over and i not in passes:
-            draft.change(i, control=Control.YIELD, yields_to=over)
+        yields_to = tuple(int(k) for k in np.flatnonzero(conflicts[i]) if k in passes)
+        if yields_to and i not in passes:
+            draft.change(i, control=Control.YIELD, yields_to=yields_to)
 
 
 def _edges(
     draft: Draft, plan: _Plan, arms: list[_Arm], chains: list[list[Curve]], walk_m: float | None
 ) -> None:
-    """The outer boundary along the outermost ways, the island in the middle and the splitters on the arms."""
+    """Add the outer boundary, the central island, the splitter islands, and the sidewalks."""
     sides = []
     for chain in chains:
-        line = joined(*chain)
+        line = join_curves(*chain)
         ends = np.cumsum([curve.arc_m[-1] for curve in chain])
         wide = smooth_step((line.arc_m - ends[0]) / (ends[1] - ends[0]))
         wide -= smooth_step((line.arc_m - ends[2]) / (ends[3] - ends[2]))
@@ -288,15 +287,14 @@ def _paint(draft: Draft, plan: _Plan, arm: _Arm) -> None:
 
 
 def _cross(draft: Draft, plan: _Plan, arm: _Arm, marked: bool) -> None:
-    """People cross an arm one car's length before the yield line, by way of the splitter."""
+    """Add the crossing of an arm, a car's length before the yield line."""
     half = plan.gap_m / 2 + len(arm.inward) * plan.width_m + plan.shoulder_m
     here = arm.middle.start
     at = here.ahead(_CROSSING_M)
     lanes = [(lane, draft.lanes[lane].length_m - _CROSSING_M) for lane in arm.inward]
     lanes += [(lane, _CROSSING_M) for lane in arm.outward]
-    axis = np.array([[p.x, p.y] for p in (at.aside(-half), at.aside(half))])
+    axis = points(at.aside(-half), at.aside(half))
     draft.crossings.append(Crossing(axis, CROSSWALK_M, tuple(lanes), marked))
     if marked:
         near, far = (here.ahead(_CROSSING_M + sign * CROSSWALK_M / 2) for sign in (-1.0, 1.0))
-        corners = [near.aside(half), far.aside(half), far.aside(-half), near.aside(-half)]
-        draft.crosswalks.append(Line(RoadKind.CROSSWALK, np.array([[p.x, p.y] for p in corners])))
+        draft.crosswalk(near.aside(half), far.aside(half), far.aside(-half), near.aside(-half))

@@ -1,0 +1,440 @@
+"""Layout of junctions: arms, their lanes, connectors, kerbs, sidewalks, markings and crossings.
+
+A *site* is one junction with approaches in counter-clockwise order: for traffic on approach ``i`` the next one is on
+the right. Outwards from the junction an approach has the mouth, where the corners' kerbs begin, the crosswalk if it is
+marked, and the stop line, where connectors begin and end.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from drivax.geometry.vectors import wrap
+from drivax.scenario.schema import RoadKind
+from drivax.synthetic.roads.curves import (
+    STEP_M,
+    Curve,
+    Pose,
+    connect_poses,
+    join_curves,
+    resample,
+    straight,
+    winding,
+)
+from drivax.synthetic.roads.draft import Draft, points, ring
+from drivax.synthetic.roads.network import Crossing, Line, Start
+from drivax.synthetic.roads.style import RoadStyle
+
+#: Distances from the mouth of the crossing's two sides and of the stop line, with a crosswalk and without, m.
+_CROSSING_M = ((0.8, 4.0), (0.2, 3.0))
+_STOP_LINE_M = (5.5, 3.6)
+#: Least distance of the centres of adjacent and opposing lanes, m; closer lanes count as in conflict.
+_LEAST_PITCH_M = 3.2
+#: Arms that differ less than this from a straight line have no corner, rad.
+_NO_CORNER = math.radians(25.0)
+#: Largest distance of ego's start from the stop line, in seconds at the limit and in m, and the least one, m.
+_EARLIEST_S, _EARLIEST_M, _LATEST_M = 6.0, 85.0, 12.0
+
+
+class Turn(enum.IntEnum):
+    """Turns at a junction; a lower number has right of way over a higher one."""
+
+    STRAIGHT = 0
+    RIGHT = 1
+    LEFT = 2
+
+
+@dataclass(frozen=True)
+class CrossSection:
+    """Cross-section of an arm.
+
+    Attributes:
+        inward, outward: Numbers of lanes towards the junction and away from it.
+        shoulder_m: Drivable width beyond the outer lanes.
+        marked: Whether the mouth has a crosswalk.
+    """
+
+    inward: int
+    outward: int
+    width_m: float
+    shoulder_m: float
+    limit_mps: float
+    marked: bool = True
+
+    @property
+    def gap_m(self) -> float:
+        """Gap between the innermost lanes of both directions."""
+        return max(0.0, _LEAST_PITCH_M - self.width_m)
+
+    @property
+    def left_m(self) -> float:
+        """Distance from the middle line to the left edge, looking outwards."""
+        return self.gap_m / 2 + self.inward * self.width_m + self.shoulder_m
+
+    @property
+    def right_m(self) -> float:
+        """Distance from the middle line to the right edge, looking outwards."""
+        return self.gap_m / 2 + self.outward * self.width_m + self.shoulder_m
+
+    @property
+    def crossing_m(self) -> tuple[float, float]:
+        """Distance from the mouth to the near and the far side of the crossing."""
+        return _CROSSING_M[0 if self.marked else 1]
+
+    @property
+    def stop_line_m(self) -> float:
+        """Distance from the mouth to the stop line."""
+        return _STOP_LINE_M[0 if self.marked else 1]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A street at the junction; ``base`` is where its middle line passes the centre, looking outwards."""
+
+    base: Pose
+    street: CrossSection
+
+
+@dataclass(frozen=True)
+class Approach:
+    """An arm with its lanes.
+
+    Attributes:
+        mouth_m: Distance of the mouth from the arm's base.
+        middle: Middle line from the stop line outwards: the range of the lanes.
+        side: Middle line from the mouth outwards: the range of the edges.
+        inward, outward: Lanes, each from the middle to the edge.
+    """
+
+    arm: Arm
+    mouth_m: float
+    middle: Curve
+    side: Curve
+    inward: tuple[int, ...]
+    outward: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Move:
+    """A connector, its approaches and its turn."""
+
+    lane: int
+    arm: int
+    to: int
+    turn: Turn
+
+
+@dataclass(frozen=True)
+class Site:
+    """A junction with its lanes and connectors."""
+
+    approaches: tuple[Approach, ...]
+    moves: tuple[Move, ...] = ()
+
+    @property
+    def inward(self) -> list[int]:
+        """Inward lanes of all approaches."""
+        return [lane for approach in self.approaches for lane in approach.inward]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Shape of arms beyond the stop line: straight first, then slightly bent.
+
+    Attributes:
+        arm_m: Length.
+        straight_m: Length of the straight part.
+        tightest_m: Radius of the tightest bend.
+        widest_turn: Largest difference of two headings, rad.
+    """
+
+    arm_m: float = 230.0
+    straight_m: float = 30.0
+    tightest_m: float = 120.0
+    widest_turn: float = math.radians(28.0)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Geometry of a junction.
+
+    Attributes:
+        skew: Largest deviation of an arm from its direction, rad.
+        offset_m: Largest lateral offset of an arm from the centre.
+        corner_m: Radius of the corners' kerbs, low and high.
+        walk_m: Distance of sidewalks from the edge, low and high.
+        reach: Shape of the arms.
+    """
+
+    skew: float = math.radians(6.0)
+    offset_m: float = 0.8
+    corner_m: tuple[float, float] = (6.0, 12.0)
+    walk_m: tuple[float, float] = (1.0, 2.5)
+    reach: Reach = field(default_factory=Reach)
+
+    def arms(
+        self, rng: np.random.Generator, headings: Sequence[float], streets: Sequence[CrossSection]
+    ) -> list[Arm]:
+        """Draw arms in about these directions, each centred on its lanes."""
+        arms = []
+        for heading, street in zip(headings, streets, strict=True):
+            at = Pose(0.0, 0.0, heading + float(rng.uniform(-self.skew, self.skew)))
+            centred = (street.outward - street.inward) * street.width_m / 2
+            offset = float(rng.uniform(-self.offset_m, self.offset_m))
+            arms.append(Arm(at.aside(centred + offset), street))
+        return arms
+
+    def mouths(self, rng: np.random.Generator, arms: Sequence[Arm]) -> list[float]:
+        """Draw radii of the corners and return the distance from each arm's base to its mouth.
+
+        A corner of radius r between edges that turn by an angle a begins ``r tan(a / 2)`` from their intersection.
+        """
+        mouths = [0.0] * len(arms)
+        for i, arm in enumerate(arms):
+            k = (i + 1) % len(arms)
+            angle = math.pi - (arms[k].base.heading - arm.base.heading) % (2 * math.pi)
+            radius = float(rng.uniform(*self.corner_m))
+            if abs(angle) < _NO_CORNER:
+                continue
+            tangent = radius * math.tan(angle / 2)
+            mine, theirs = _intersection(arm, arms[k])
+            mouths[i] = max(mouths[i], mine + tangent)
+            mouths[k] = max(mouths[k], theirs + tangent)
+        return mouths
+
+
+def draw_street(
+    rng: np.random.Generator, style: RoadStyle, lanes: tuple[int, int], limit_mps: float, marked: bool = True
+) -> CrossSection:
+    """Draw a street with these numbers of lanes inward and outward."""
+    width = float(rng.uniform(*style.width_m))
+    if max(lanes) > 1:
+        width = max(width, _LEAST_PITCH_M)
+    return CrossSection(*lanes, width, float(rng.uniform(*style.shoulder_m)), limit_mps, marked)
+
+
+def draw_four_headings(rng: np.random.Generator, cross_skew: float) -> list[float]:
+    """Draw directions of the arms where two streets cross."""
+    first = float(rng.uniform(-math.pi, math.pi))
+    second = first + math.pi / 2 + float(rng.uniform(-cross_skew, cross_skew))
+    return [first, second, first + math.pi, second + math.pi]
+
+
+def _intersection(right: Arm, left: Arm) -> tuple[float, float]:
+    """Distances along both middle lines of the intersection of an arm's left edge and the next arm's right edge."""
+    a, b = right.base, left.base
+    sin = math.sin(b.heading - a.heading)
+    start, end = a.aside(right.street.left_m), b.aside(-left.street.right_m)
+    dx, dy = end.x - start.x, end.y - start.y
+    along_a = (dx * math.sin(b.heading) - dy * math.cos(b.heading)) / sin
+    along_b = (dx * math.sin(a.heading) - dy * math.cos(a.heading)) / sin
+    return along_a, along_b
+
+
+def open_approach(rng: np.random.Generator, draft: Draft, arm: Arm, mouth_m: float, reach: Reach) -> Approach:
+    """Add an arm that leads off the map."""
+    near = straight(arm.base.ahead(mouth_m + arm.street.stop_line_m), reach.straight_m)
+    far = winding(
+        rng,
+        reach.arm_m - reach.straight_m,
+        max_curvature=1.0 / reach.tightest_m,
+        max_turn=reach.widest_turn,
+        start=near.end,
+    )
+    middle = join_curves(near, far)
+    side = join_curves(straight(arm.base.ahead(mouth_m), arm.street.stop_line_m), middle)
+    inward, outward = lay_lanes(draft, arm.street, middle)
+    return Approach(arm, mouth_m, middle, side, inward, outward)
+
+
+def lay_lanes(draft: Draft, street: CrossSection, middle: Curve) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Add the lanes of a street, whose middle line leads outwards; return inward and outward lanes."""
+    inward, outward = (
+        [
+            draft.lane(
+                curve if side < 0 else curve.reversed(),
+                street.width_m,
+                street.limit_mps,
+            )
+            for j in range(count)
+            for curve in [middle.shifted(side * (street.gap_m / 2 + (j + 0.5) * street.width_m))]
+        ]
+        for side, count in ((1.0, street.inward), (-1.0, street.outward))
+    )
+    for lanes in (inward, outward):
+        for a, b in pairwise(lanes):
+            draft.link_neighbours(a, b)
+    return tuple(inward), tuple(outward)
+
+
+def open_site(rng: np.random.Generator, draft: Draft, arms: Sequence[Arm], geometry: Geometry) -> Site:
+    """Add all arms of a single junction, without connectors."""
+    mouths = geometry.mouths(rng, arms)
+    return Site(
+        tuple(
+            open_approach(rng, draft, arm, mouth, geometry.reach)
+            for arm, mouth in zip(arms, mouths, strict=True)
+        )
+    )
+
+
+def connect(draft: Draft, site: Site, left_only: Sequence[bool]) -> Site:
+    """Add the connectors.
+
+    Left turns connect innermost lanes, right turns outermost ones, and straight connectors match lanes from the
+    outside. Where fewer lanes leave than arrive, the innermost one is for turning only.
+
+    Args:
+        draft: The draft.
+        site: The junction.
+        left_only: Whether the innermost of several lanes is for left turns only, per approach.
+    """
+    moves = []
+    for i, approach in enumerate(site.approaches):
+        turns = {_turn(approach.arm, site.approaches[k].arm): k for k in _others(i, len(site.approaches))}
+        lanes = approach.inward
+        for turn, k in sorted(turns.items()):
+            out = site.approaches[k].outward
+            if turn == Turn.STRAIGHT:
+                first = 1 if left_only[i] and approach.arm.street.inward > 1 and Turn.LEFT in turns else 0
+                shift = len(out) - len(lanes)
+                pairs = [(lanes[j], out[shift + j]) for j in range(first, len(lanes)) if shift + j >= 0]
+            else:
+                pairs = [(lanes[0], out[0]) if turn == Turn.LEFT else (lanes[-1], out[-1])]
+            ends = (approach.arm.street.stop_line_m, site.approaches[k].arm.street.stop_line_m)
+            moves += [Move(_connector(draft, a, b, ends), i, k, turn) for a, b in pairs]
+    return Site(site.approaches, tuple(moves))
+
+
+def _others(i: int, count: int) -> list[int]:
+    return [(i + step) % count for step in range(1, count)]
+
+
+def _turn(before: Arm, after: Arm) -> Turn:
+    angle = float(wrap(after.base.heading - before.base.heading - math.pi))
+    if abs(angle) < math.pi / 4:
+        return Turn.STRAIGHT
+    return Turn.LEFT if angle > 0 else Turn.RIGHT
+
+
+def _connector(draft: Draft, before: int, after: int, ends_m: tuple[float, float]) -> int:
+    a, b = draft.lanes[before], draft.lanes[after]
+    # The bend lies between the mouths: a turn from the stop line would cut the corner.
+    first = straight(a.curve.end, ends_m[0])
+    last = straight(b.curve.start.ahead(-ends_m[1]), ends_m[1])
+    curve = join_curves(first, connect_poses(first.end, last.start), last)
+    connector = draft.lane(resample(curve, STEP_M), a.width_m, a.limit_mps, connector=True)
+    draft.link(before, connector)
+    draft.link(connector, after)
+    return connector
+
+
+def starts(draft: Draft, lanes: Sequence[int]) -> tuple[Start, ...]:
+    """Starts on inward lanes; a repeated lane is drawn more often."""
+    result = []
+    for index in lanes:
+        lane = draft.lanes[index]
+        earliest = min(_EARLIEST_M, _EARLIEST_S * lane.limit_mps)
+        result.append(Start(index, lane.length_m - earliest, lane.length_m - _LATEST_M))
+    return tuple(result)
+
+
+#: An approach by the number of its site and its own.
+Place = tuple[int, int]
+
+
+def outline(draft: Draft, sites: Sequence[Site], links: dict[Place, Place], walk_m: float | None) -> None:
+    """Add the boundary around all sites, counter-clockwise, and sidewalks along it.
+
+    Args:
+        draft: The draft.
+        sites: The junctions, linked as a tree.
+        links: Pairs of approaches at the two ends of a street, in both directions.
+        walk_m: Distance of the sidewalks from the edge; None: no sidewalks.
+    """
+    first = next((0, i) for i in range(len(sites[0].approaches)) if (0, i) not in links)
+    kerbs, at = [], first
+    while not kerbs or at != first:
+        kerb, at = _kerb_between_ends(sites, links, at)
+        kerbs.append(kerb)
+    draft.edges.append(Line(RoadKind.EDGE_BOUNDARY, ring(*kerbs)))
+    if walk_m is not None:
+        draft.walks += [kerb.shifted(-walk_m) for kerb in kerbs]
+
+
+def _kerb_between_ends(sites: Sequence[Site], links: dict[Place, Place], begin: Place) -> tuple[Curve, Place]:
+    """Edge from one end of the map to the next: in along an arm's left, around the corners, out along a right."""
+
+    def approach(place: Place) -> Approach:
+        return sites[place[0]].approaches[place[1]]
+
+    pieces = [approach(begin).side.shifted(approach(begin).arm.street.left_m).reversed()]
+    here = begin
+    while True:
+        after = (here[0], (here[1] + 1) % len(sites[here[0]].approaches))
+        side = approach(after).side.shifted(-approach(after).arm.street.right_m)
+        pieces += [connect_poses(pieces[-1].end, side.start), side]
+        if after not in links:
+            return join_curves(*pieces), after
+        here = links[after]
+
+
+def paint(draft: Draft, street: CrossSection, middle: Curve) -> None:
+    """Add the markings of a street."""
+    draft.mark(RoadKind.LINE_SOLID_DOUBLE_YELLOW, middle)
+    for side, count in ((1.0, street.inward), (-1.0, street.outward)):
+        for j in range(1, count + 1):
+            kind = RoadKind.LINE_SOLID_SINGLE_WHITE if j == count else RoadKind.LINE_BROKEN_SINGLE_WHITE
+            draft.mark(kind, middle.shifted(side * (street.gap_m / 2 + j * street.width_m)))
+
+
+def add_crossings(draft: Draft, site: Site) -> None:
+    """Add a crossing at the mouth of each approach, with a crosswalk where it is marked."""
+    for i, approach in enumerate(site.approaches):
+        street = approach.arm.street
+        near, far = (approach.arm.base.ahead(approach.mouth_m + metres) for metres in street.crossing_m)
+        if street.marked:
+            left, right = street.left_m, -street.right_m
+            draft.crosswalk(near.aside(left), far.aside(left), far.aside(right), near.aside(right))
+        width = street.crossing_m[1] - street.crossing_m[0]
+        middle = near.ahead(width / 2)
+        axis = points(middle.aside(street.left_m), middle.aside(-street.right_m))
+        draft.crossings.append(Crossing(axis, width, _crossed(draft, site, i), street.marked))
+
+
+def _crossed(draft: Draft, site: Site, i: int) -> tuple[tuple[int, float], ...]:
+    """Connectors that an approach's crossing crosses, and the distance along each, m."""
+    street = site.approaches[i].arm.street
+    inside = street.stop_line_m - sum(street.crossing_m) / 2
+    entering = [(move.lane, inside) for move in site.moves if move.arm == i]
+    leaving = [(move.lane, draft.lanes[move.lane].length_m - inside) for move in site.moves if move.to == i]
+    return (*entering, *leaving)
+
+
+def draw_sidewalk_m(rng: np.random.Generator, style: RoadStyle, geometry: Geometry) -> float | None:
+    """Draw the distance of sidewalks from the edge; None: no sidewalks."""
+    distance = float(rng.uniform(*geometry.walk_m))
+    return distance if rng.random() < style.walk_share else None
+
+
+def finish_site(
+    rng: np.random.Generator,
+    style: RoadStyle,
+    draft: Draft,
+    site: Site,
+    left_only: Sequence[bool],
+    geometry: Geometry,
+) -> Site:
+    """Add connectors, edges, sidewalks, markings and crossings of a single junction."""
+    site = connect(draft, site, left_only)
+    outline(draft, (site,), {}, draw_sidewalk_m(rng, style, geometry))
+    for approach in site.approaches:
+        paint(draft, approach.arm.street, approach.middle)
+    add_crossings(draft, site)
+    return site
