@@ -63,8 +63,8 @@ def keep(study: Path) -> None:
     (KEPT / SCORES).mkdir(exist_ok=True)
     for file in (study / SCORES).glob("*.npz"):
         with np.load(file) as table:
-            wanted = {name: table[name] for name in table if not name.startswith("component_")}
-        np.savez_compressed(KEPT / SCORES / file.name, allow_pickle=False, **wanted)
+            arrays = {name: table[name] for name in table if not name.startswith("component_")}
+        np.savez_compressed(KEPT / SCORES / file.name, allow_pickle=False, **arrays)
 
 
 def restore(study: Path) -> None:

@@ -131,12 +131,12 @@ def test_curation_and_planners_share_the_test_set(stored):
 
 
 def test_kinematic_finds_the_events_that_force_a_reaction(stored):
-    """0.80 is wanted; on scenarios that its weights were not chosen by, and on others that nobody had seen."""
+    """The target is 0.80, on scenarios that neither set its weights nor were looked at before."""
     found = stored("curation")
     tests = found["methods"]["kinematic"]["events"]["forced"], found["checks"]["fresh"]
     assert all(one["auc_interval"][0] > 0.8 for one in tests)
-    lot = found["methods"]["random_matched"]["events"]["forced"]["auc_interval"]
-    assert lot[0] < 0.5 < lot[1]
+    control = found["methods"]["random_matched"]["events"]["forced"]["auc_interval"]
+    assert control[0] < 0.5 < control[1]
 
 
 def test_members_disagree_where_they_err(stored):

@@ -97,14 +97,14 @@ class Truth:
         return found | {kind.name.lower(): self.kind == kind for kind in EventKind if kind}
 
 
-def measured(truth: Truth, wanted: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
+def measured(truth: Truth, events: Any, steps: Any, scenarios: Any) -> dict[str, Any]:
     """How well scores find a group of events among scenarios that have none, at both scales."""
-    rows = wanted | (truth.kind == 0)
-    label = wanted[rows]
+    rows = events | (truth.kind == 0)
+    label = events[rows]
     weight = np.where(label, NATURAL / label.sum(), (1 - NATURAL) / (~label).sum())
     _, precision = bootstrap_intervals(scenarios[rows], label, weight, np.arange(len(label)))
     valid = truth.valid[rows]
-    step_label = (truth.during & wanted[:, None])[rows][valid]
+    step_label = (truth.during & events[:, None])[rows][valid]
     step_weight = np.broadcast_to(weight[:, None], valid.shape)[valid]
     step_scores = steps[rows][valid]
     scenario = np.broadcast_to(np.arange(len(label))[:, None], valid.shape)[valid]
@@ -177,14 +177,14 @@ def checked(paths: list[Path]) -> dict[str, Any]:
     for path in paths:
         data = ScenarioSet.open(path)
         truth, scores = Truth.of([data]), curate("kinematic", Request(data)).scenarios
-        wanted = truth.groups()["forced"]
-        rows = wanted | (truth.kind == 0)
+        events = truth.groups()["forced"]
+        rows = events | (truth.kind == 0)
         found[path.name] = {
             "hash": data.hash,
             "scenarios": int(rows.sum()),
-            "events": int(wanted.sum()),
-            "auc": roc_auc(scores[rows], wanted[rows]),
-            "auc_interval": auc_interval(scores[rows], wanted[rows]),
+            "events": int(events.sum()),
+            "auc": roc_auc(scores[rows], events[rows]),
+            "auc_interval": auc_interval(scores[rows], events[rows]),
         }
     return {"checks": found}
 
@@ -211,8 +211,8 @@ def found_by(truth: Truth, table: ScoreTable) -> dict[str, Any]:
     """What a method finds of every group."""
     return {
         "events": {
-            name: measured(truth, wanted, table.steps, table.scenarios)
-            for name, wanted in truth.groups().items()
+            name: measured(truth, events, table.steps, table.scenarios)
+            for name, events in truth.groups().items()
         }
     }
 

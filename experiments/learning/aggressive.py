@@ -68,7 +68,7 @@ def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -
         "idm": (make_planner("idm"), Task()),
         **{name: load_policy(runs / name, bank) for name in ("clone", "aggressive")},
     }
-    wanted = (*BOLD, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
+    metrics_shown = (*BOLD, "min_ttc", *FAILURES, "off_route", "progress_ratio", "success")
     driven = {
         name: evaluate(planner, bank, names, task=replace(task, metrics=OWN))
         for name, (planner, task) in drivers.items()
@@ -76,16 +76,19 @@ def in_egos_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -
     against = {
         other: {
             metric: paired_differences(driven["aggressive"], driven[other], metric).as_dict()
-            for metric in wanted
+            for metric in metrics_shown
         }
         for other in ("clone", "log")
     }
-    return {"drivers": {name: _summary(found, wanted) for name, found in driven.items()}, "minus": against}
+    return {
+        "drivers": {name: _summary(found, metrics_shown) for name, found in driven.items()},
+        "minus": against,
+    }
 
 
-def _summary(found: EpisodeTable, wanted: tuple[str, ...]) -> dict[str, Any]:
-    metrics = found.summary()["metrics"]
-    return {name: metrics[name] for name in wanted}
+def _summary(episodes: EpisodeTable, names: tuple[str, ...]) -> dict[str, Any]:
+    metrics = episodes.summary()["metrics"]
+    return {name: metrics[name] for name in names}
 
 
 def in_others_place(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> Table:
@@ -135,10 +138,10 @@ def in_traffic(bank: ScenarioBank, names: list[dict[str, str]], runs: Path) -> T
     """What meets a car that follows IDM along its route, by how the others drive."""
     kinds = {name: find_traffic(name) for name in ("log", "idm")}
     kinds |= {name: policy_traffic(runs / name) for name in ("clone", "aggressive")}
-    wanted = ("short_ttc", "min_ttc", "max_braking", "collision", "at_fault_collision", "success")
+    metrics_shown = ("short_ttc", "min_ttc", "max_braking", "collision", "at_fault_collision", "success")
     return {
         name: _summary(
-            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN), traffic=traffic), wanted
+            evaluate(make_planner("idm"), bank, names, task=Task(metrics=OWN), traffic=traffic), metrics_shown
         )
         for name, traffic in kinds.items()
     }

@@ -72,7 +72,7 @@ def measured(data: Path, planners: list[str]) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Beside what each may take."""
+    """Return a Markdown table of times next to their limits."""
     lines = [
         "| planner | `log` (s) | may take (s) | `idm` (s) | `idm` / `log` |",
         "|---|---:|---:|---:|---:|",

@@ -120,7 +120,7 @@ def share(successes: int, trials: int) -> dict[str, Any]:
     return {"share": successes / trials if trials else math.nan, "low": low, "high": high, "n": trials}
 
 
-def against(wanted: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
+def against(configured: float, successes: int, trials: int, comparisons: int) -> dict[str, Any]:
     """A share next to the probability that was configured.
 
     Of many 95 % intervals one in twenty misses the truth, so ``outside`` says whether the configured value is outside
@@ -130,9 +130,9 @@ def against(wanted: float, successes: int, trials: int, comparisons: int) -> dic
     low, high = binomial(successes, trials, 1.0 - 0.05 / comparisons)
     return {
         **found,
-        "wanted": wanted,
-        "outside_95": not found["low"] <= wanted <= found["high"],
-        "outside": not low <= wanted <= high,
+        "configured": configured,
+        "outside_95": not found["low"] <= configured <= found["high"],
+        "outside": not low <= configured <= high,
     }
 
 

@@ -1,4 +1,4 @@
-"""How much the tracks of real logs tremble: the level of the built-in world's perception noise.
+"""Jitter in the tracks of real logs: the level of the built-in world's perception noise.
 
 Tracks of other moving vehicles are smoothed with a Savitzky-Golay filter of 1.1 s and order 3; what is left over is
 noise of the tracker (and the little of a drive's own snap that a cubic cannot follow). Noise that is correlated over

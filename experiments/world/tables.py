@@ -23,13 +23,13 @@ class Target:
 
     Attributes:
         what: In words.
-        wanted: In words.
+        words: The target in words.
         value: The number in a result; a share comes with its interval, as a dictionary.
-        met: Whether a number is as wanted.
+        met: Whether a number is on target.
     """
 
     what: str
-    wanted: str
+    words: str
     value: Callable[[Result], Any]
     met: Callable[[float], bool]
 
@@ -138,7 +138,7 @@ def _coverage(result: Result) -> list[tuple[str, str]]:
     found = []
     for name, one in shares:
         mark = "  OUTSIDE" if one["outside"] else "  (outside its 95 % interval)" if one["outside_95"] else ""
-        found.append((f"{name} (configured {one['wanted']:.3f})", text(one) + mark))
+        found.append((f"{name} (configured {one['configured']:.3f})", text(one) + mark))
     count = f"{sum(one['outside_95'] for _, one in shares)} of {len(shares)}; expected by chance"
     found.append(("outside their 95 % intervals", f"{count} {0.05 * len(shares):.1f}"))
     found.append(("outside Bonferroni's intervals", f"{_outside(result)} of {len(shares)}"))
@@ -158,7 +158,7 @@ def _generation(result: Result) -> list[tuple[str, str]]:
 
 
 def markdown(results: dict[str, Result]) -> str:
-    """Targets in rows, domains in columns; what is not as wanted is in bold."""
+    """Targets in rows, domains in columns; what is not on target is in bold."""
     head = "".join(
         f" {name}: {result['scenarios']:,} + {result['rare_scenarios']:,} rare |"
         for name, result in results.items()
@@ -174,7 +174,7 @@ def markdown(results: dict[str, Result]) -> str:
             else:
                 cell = str(number) if isinstance(number, int) else f"{number:.1f}"
             cells.append(cell if target.met(number) else f"**{cell}**")
-        rows.append(f"| {target.what} | {target.wanted} | {' | '.join(cells)} |")
+        rows.append(f"| {target.what} | {target.words} | {' | '.join(cells)} |")
     return "\n".join(rows) + "\n"
 
 

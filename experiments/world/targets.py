@@ -122,9 +122,9 @@ def _chunk(scenarios: list[Scenario], planners: tuple[str, ...]) -> list[dict[st
     ]
     for planner in ("expert", *planners):
         metrics = evaluate(DRIVERS.get(planner, planner), loaded).metrics
-        wanted = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
+        names = EXPERT_METRICS if planner == "expert" else ("success", "accuracy")
         for i, row in enumerate(rows):
-            row |= {f"{planner}.{name}": float(metrics[name][i]) for name in wanted}
+            row |= {f"{planner}.{name}": float(metrics[name][i]) for name in names}
     return rows
 
 
@@ -160,13 +160,13 @@ def coverage(rows: list[dict[str, Any]], rare: list[dict[str, Any]], world: Worl
     table: dict[str, Counter[str]] = {}
     for row in labelled:
         table.setdefault(row["event"], Counter())[row["family"]] += 1
-    wanted = {family.name: p for family, p in DOMAINS[world.domain].families}
+    expected = {family.name: p for family, p in DOMAINS[world.domain].families}
     kinds = [kind.name.lower() for kind in EventKind if kind]
-    count = len(wanted) + len(kinds) + 1
+    count = len(expected) + len(kinds) + 1
     staged = sum(row["event"] is not None for row in rows)
     return {
         "families": {
-            name: against(p, families[name], len(maps), count) for name, p in sorted(wanted.items())
+            name: against(p, families[name], len(maps), count) for name, p in sorted(expected.items())
         },
         "rare_rate": against(world.rare_rate, staged, len(rows), count),
         "events": {name: against(1 / len(kinds), events[name], len(labelled), count) for name in kinds},
