@@ -13,7 +13,7 @@ from drivax.geometry.vectors import wrap
 
 #: Distance between the samples of a curve, m: chords stay within 3 mm of an arc of 10 m radius.
 STEP_M = 0.5
-#: Poses with a smaller change of heading are join_curves by a quintic, others by a fillet.
+#: Poses with a smaller change of heading are joined by a quintic, others by a fillet.
 _FILLET_ANGLE = math.radians(25.0)
 #: Shorter straight remainders are left out, m.
 _SHORTEST_M = 1e-3
