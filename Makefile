@@ -57,7 +57,7 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
-	$(BIN)/python -m pytest -q -p no:cacheprovider tests/test_architecture.py -k "machine or large or lock or names"
+	$(BIN)/python -m pytest -q -p no:cacheprovider tests/test_architecture.py tests/test_wording.py -k "machine or large or lock or names or words"
 
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock

@@ -24,7 +24,7 @@ CURRENT = FIRST + 10
 
 
 def drivers(count):
-    """Everybody the same."""
+    """Equal drivers."""
     values = {f.name: np.full(count, 1.5) for f in dataclasses.fields(Drivers)}
     values["size_m"] = np.tile([4.8, 2.0, 1.6], (count, 1))
     if "kind" in values:
@@ -79,7 +79,7 @@ def road(lanes=2, ends=False, limit=14.0):
 
 
 def junction(turning):
-    """Ego goes east through a junction at 160 to 190 m; somebody crosses from the south or turns left."""
+    """Ego goes east through a junction at 160 to 190 m; a vehicle crosses from the south or turns left."""
     draft = Draft()
     control = Control.NONE if turning else Control.SIGNAL
     arm = draft.lane(straight(Pose(0.0, 0.0, 0.0), 160.0), 3.5, 14.0)

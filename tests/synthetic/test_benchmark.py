@@ -20,7 +20,7 @@ def small(tmp_path_factory):
     return path, made, progress
 
 
-def test_sizes_are_those_of_the_table_or_in_proportion():
+def test_sizes_follow_the_table_or_scale():
     assert sizes() == {"train": 4096, "validation": 512, "test": 1024, "test-rare": 512}
     assert sizes(64) == {"train": 64, "validation": 8, "test": 16, "test-rare": 8}
     assert sizes(1) == {"train": 1, "validation": 1, "test": 1, "test-rare": 1}
@@ -49,7 +49,7 @@ def test_four_sets_that_share_no_map(small):
 
 
 @pytest.mark.slow
-def test_a_smaller_benchmark_is_the_beginning_of_the_full_one(small, tmp_path):
+def test_smaller_benchmark_is_a_prefix_of_the_full_one(small, tmp_path):
     path, *_ = small
     generate_benchmark(tmp_path / "less", Generation(), train=1)
     for name in SPLITS:
@@ -58,7 +58,7 @@ def test_a_smaller_benchmark_is_the_beginning_of_the_full_one(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_names_benchmark_and_world(tmp_path, capsys):
+def test_command_names_benchmark_and_world(tmp_path, capsys):
     out = tmp_path / "sets"
     assert run(Generate(out, benchmark=True, scenarios=1, workers=1)) == 0
     printed = capsys.readouterr().out

@@ -8,13 +8,13 @@ from drivax.synthetic.expert.comfort import LIMITS, broken_limits, discomfort, q
 
 
 @pytest.mark.parametrize(("window", "order", "derivative"), [(8, 2, 0), (15, 2, 1), (15, 3, 2), (7, 3, 1)])
-def test_the_smoother_is_scipys(window, order, derivative):
+def test_smoothing_equals_scipy(window, order, derivative):
     values = np.random.default_rng(0).normal(size=40)
     expected = savgol_filter(values, window, order, deriv=derivative)
     assert np.allclose(smoother(40, window, order, derivative) @ values, expected, atol=1e-10)
 
 
-def test_quantities_are_nuplans():
+def test_quantities_equal_nuplan():
     """The definitions of the decision record, computed with SciPy."""
     rng = np.random.default_rng(1)
     speed = 8.0 + np.cumsum(rng.normal(size=91)) * 0.1
@@ -39,7 +39,7 @@ def test_quantities_are_nuplans():
         assert np.allclose(got[name], values, atol=1e-8), name
 
 
-def test_discomfort_names_what_is_too_much():
+def test_discomfort_names_exceeded_limits():
     step = np.arange(91) * 0.1
     assert discomfort(np.zeros(91), np.full(91, 10.0)) == ""
     assert discomfort(np.zeros(91), 50.0 - 4.0 * step) == ""
@@ -51,7 +51,7 @@ def test_discomfort_names_what_is_too_much():
     assert discomfort(np.zeros(91), np.where(step < 4.0, 10.0, 12.5 - 3.0 * (step - 4.0))) != ""
 
 
-def test_all_broken_limits_are_named_in_order():
+def test_exceeded_limits_are_named_in_order():
     """Braking at 5 m/s2 from 50 m/s while turning at 1 rad/s: up to 50 m/s2 to the side, which fall by 5 m/s3."""
     step = np.arange(91) * 0.1
     assert broken_limits(np.zeros(91), np.full(91, 10.0)) == ()

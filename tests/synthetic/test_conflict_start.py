@@ -37,7 +37,7 @@ def critical(network, motion, colour, steps=(0,)):
     return critical_steps(network, motion, colour, np.array(steps)).tolist()
 
 
-def test_who_crosses_at_the_same_time_is_hit_and_who_has_long_passed_is_not():
+def test_simultaneous_crossing_is_critical_and_earlier_one_is_not():
     # Ego reaches the middle 5 s after the start, so do others who are as far away and as fast.
     together = moved((60.0, 60.0))
     assert critical(*together) == [True]
@@ -45,19 +45,19 @@ def test_who_crosses_at_the_same_time_is_hit_and_who_has_long_passed_is_not():
     assert critical(*passed) == [False]
 
 
-def test_steps_are_told_apart():
-    # Ego and the other cross 5 s after the start: whoever takes over 4 s before that meets it, and who does so when
-    # both have crossed does not.
+def test_steps_are_evaluated_independently():
+    # Ego and the other vehicle cross after 5 s: a driver that takes over 4 s before collides, one that takes over
+    # after the crossing does not.
     network, motion, colour = moved((60.0, 60.0))
     assert critical(network, motion, colour, (0, 70 - CURRENT_STEP)) == [True, False]
 
 
-def test_a_leader_is_followed_and_not_hit():
+def test_reference_driver_follows_its_leader():
     leader = moved((30.0, 50.0), (SPEED, 3.0), (EAST, EAST))
     assert critical(*leader) == [False]
 
 
-def test_who_comes_from_behind_does_not_count():
+def test_collisions_from_behind_do_not_count():
     tail = moved((40.0, 20.0), (2.0, 14.0), (EAST, EAST))
     assert critical(*tail) == [False]
 
@@ -65,13 +65,13 @@ def test_who_comes_from_behind_does_not_count():
 @pytest.mark.parametrize(
     ("shown", "hit"), [(Colour.RED, False), (Colour.YELLOW, False), (Colour.GREEN, True)]
 )
-def test_it_stops_for_lights(shown, hit):
+def test_reference_driver_stops_for_red_and_yellow(shown, hit):
     network, motion, colour = moved((60.0, 60.0))
     network = crossroads(control=[Control.SIGNAL, Control.SIGNAL])
     colour[:, EAST[1]] = shown
     assert critical(network, motion, colour) == [hit]
 
 
-def test_an_empty_road_is_never_critical():
+def test_empty_road_is_not_critical():
     network, motion, colour = moved((60.0,), (SPEED,), (EAST,))
     assert critical(network, motion, colour, (0, 10, 20)) == [False, False, False]

@@ -36,7 +36,7 @@ def test_constant_curvature_is_a_circle():
 
 
 @pytest.mark.parametrize("angle", [-2.0, -math.pi / 2, -0.5, 0.4, 1.2, math.pi / 2, 1.9])
-def test_a_turn_ends_one_tangent_beyond_the_corner(angle):
+def test_turn_ends_one_tangent_beyond_the_corner(angle):
     start = Pose(1.0, 2.0, 0.3)
     curve = turn(start, angle, 12.0)
     corner = start.ahead(12.0)
@@ -49,7 +49,7 @@ def test_a_turn_ends_one_tangent_beyond_the_corner(angle):
 
 
 @pytest.mark.parametrize("end", [Pose(30.0, 12.0, 1.3), Pose(14.0, -25.0, -1.7), Pose(40.0, 2.0, 0.2)])
-def test_connected_poses_meet_and_bend_smoothly(end):
+def test_connecting_curves_meet_their_poses_smoothly(end):
     curve = connect_poses(Pose(0.0, 0.0, 0.0), end)
     assert np.hypot(*curve.xy[0]) < 1e-6
     assert np.hypot(curve.end.x - end.x, curve.end.y - end.y) < 0.01
@@ -59,12 +59,12 @@ def test_connected_poses_meet_and_bend_smoothly(end):
     assert np.abs(np.diff(curve.heading)).max() < STEP_M / 6
 
 
-def test_poses_that_one_bend_cannot_join_are_refused():
+def test_poses_without_a_single_bend_are_refused():
     with pytest.raises(ValueError, match="no single bend"):
         connect_poses(Pose(0.0, 0.0, 0.0), Pose(-10.0, 5.0, math.pi / 2))
 
 
-def test_a_quintic_begins_and_ends_straight():
+def test_quintic_has_zero_curvature_at_its_ends():
     curve = quintic(Pose(0.0, 0.0, 0.0), Pose(60.0, 3.5, 0.0))
     lateral = curve.xy[:, 1]
     t = curve.xy[:, 0] / 60
@@ -75,7 +75,7 @@ def test_a_quintic_begins_and_ends_straight():
     assert np.abs(curvature).max() == pytest.approx(10 / math.sqrt(3) * 3.5 / 3600, rel=0.05)
 
 
-def test_joining_keeps_one_point_per_joint_and_unwraps():
+def test_joined_curves_share_points_and_unwrap_headings():
     a = straight(Pose(0.0, 0.0, 3.1), 5.0)
     b = straight(Pose(a.end.x, a.end.y, 3.1 - 2 * math.pi), 5.0)
     both = join_curves(a, b)
@@ -84,7 +84,7 @@ def test_joining_keeps_one_point_per_joint_and_unwraps():
     assert both.arc_m[-1] == pytest.approx(10.0)
 
 
-def test_shifting_and_reversing():
+def test_shifted_and_reversed_curves():
     curve = from_curvature(np.full(101, 0.02), 0.5, Pose(0.0, 0.0, 0.0))
     left = curve.shifted(3.0)
     assert np.hypot(*(left.xy - curve.xy).T) == pytest.approx(3.0)
@@ -94,14 +94,14 @@ def test_shifting_and_reversing():
     assert math.cos(back.heading[0] - left.heading[-1]) == pytest.approx(-1.0)
 
 
-def test_resampling_keeps_ends_and_spacing():
+def test_resampled_curves_keep_ends_and_spacing():
     curve = resample(from_curvature(np.full(77, 0.03), 0.33, Pose(0.0, 0.0, 1.0)), 0.5)
     steps = np.diff(curve.arc_m)
     assert np.ptp(steps) < 1e-3 and abs(steps.mean() - 0.5) < 0.01
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_winding_roads_respect_their_limits(seed):
+def test_winding_roads_keep_curvature_and_turn_limits(seed):
     rng = np.random.default_rng(seed)
     curve = winding(rng, 400.0, max_curvature=1 / 35, max_turn=2.0, start=Pose(0.0, 0.0, 0.0))
     assert np.ptp(curve.heading) <= 2.0 + 1e-9
@@ -111,7 +111,7 @@ def test_winding_roads_respect_their_limits(seed):
     assert np.abs(np.diff(curve.heading, 2)).max() < STEP_M**2 * (2 / 35) / 35 * 1.01
 
 
-def test_a_displaced_curve_keeps_its_distance_and_its_tangent():
+def test_displaced_curve_has_exact_distance_and_tangent():
     # On a circle of radius 40 m a displacement of 3 m to the left of a left turn gives a circle of 37 m.
     angle = np.linspace(0.0, 1.5, 241)
     circle = Curve(40.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1), angle + math.pi / 2)
@@ -126,7 +126,7 @@ def test_a_displaced_curve_keeps_its_distance_and_its_tangent():
     assert np.hypot(*bent.xy[-1]) == pytest.approx(36.5)
 
 
-def test_the_smooth_step_has_no_slope_and_no_bend_at_its_ends():
+def test_smooth_step_has_no_slope_or_curvature_at_its_ends():
     share = np.array([-1.0, 0.0, 0.5, 1.0, 2.0])
     assert smooth_step(share) == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
     h = 1e-3
@@ -135,7 +135,7 @@ def test_the_smooth_step_has_no_slope_and_no_bend_at_its_ends():
     assert near == pytest.approx([10 * h**3, 80 * h**3, 1 - 10 * h**3, 1 - 80 * h**3], abs=2e-10 * 8)
 
 
-def test_poses_are_moved_ahead_aside_and_turned():
+def test_poses_move_ahead_and_aside_and_turn():
     pose = Pose(1.0, 2.0, math.pi / 2)
     assert pose.ahead(3.0).y == pytest.approx(5.0) and pose.ahead(3.0).x == pytest.approx(1.0)
     assert pose.aside(3.0).x == pytest.approx(-2.0) and pose.aside(3.0).y == pytest.approx(2.0)

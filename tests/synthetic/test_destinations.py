@@ -38,7 +38,7 @@ def chain(lengths, control=Control.NONE):
     return RoadNetwork("test", tuple(draft.lanes), ())
 
 
-def test_ego_starts_as_far_back_as_it_drives_in_the_time():
+def test_start_distance_matches_the_arrival_time():
     network = chain([100.0, 80.0, 20.0, 120.0], Control.SIGNAL)
     way = route_past(network, Destination(2, (0.0, 0.0), (5.0, 5.0)), np.random.default_rng(0))
     assert way is not None and way.lanes == (0, 1, 2, 3) and way.lanes[way.place] == 2
@@ -49,7 +49,7 @@ def test_ego_starts_as_far_back_as_it_drives_in_the_time():
     assert further.start.low_m == pytest.approx(100.0 + 80.0 + 10.0 - 110.0)
 
 
-def test_no_way_where_the_map_begins_too_late_or_a_rule_comes_before():
+def test_no_route_beyond_the_map_or_through_controlled_junctions():
     network = chain([100.0, 80.0, 20.0, 120.0], Control.STOP)
     rng = np.random.default_rng(0)
     assert route_past(network, Destination(1, (10.0, 10.0), (20.0, 20.0)), rng) is None
@@ -64,7 +64,7 @@ def test_no_way_where_the_map_begins_too_late_or_a_rule_comes_before():
 
 
 @pytest.mark.parametrize("green_s", [7.0, 20.0])
-def test_the_light_is_green_when_ego_comes(green_s):
+def test_light_is_green_on_arrival(green_s):
     plan = SignalPlan(
         (LightGroup((0,), False), LightGroup((1,), False)), ((0,), (1,)), (30.0, green_s), offset_s=3.0
     )
@@ -72,7 +72,7 @@ def test_the_light_is_green_when_ego_comes(green_s):
     assert np.all(colour[:, 1] == Colour.GREEN)
 
 
-def test_the_road_ahead_is_free_and_somebody_follows():
+def test_rearranged_traffic_is_clear_ahead_with_a_follower():
     way = DestinationRoute(Start(1, 40.0, 40.0), (0, 1, 2, 3, 4), 2, alone=True, followed=True)
     others = Placement((1, 1, 2, 3, 4, 7), (60.0, 5.0, 3.0, 30.0, 10.0, 50.0))
     rng = np.random.default_rng(0)
@@ -85,7 +85,7 @@ def test_the_road_ahead_is_free_and_somebody_follows():
     assert rearrange(others, plain, (1, 40.0), rng) == others
 
 
-def test_open_road():
+def test_open_road_excludes_lane_ends_and_slow_lanes():
     network = chain([100.0, 80.0, 20.0, 50.0])
     assert [place.lane for place in open_road(network)] == [0, 1]
     assert open_road(network, lowest_limit_mps=12.0) == () and open_road(network, has_neighbour=True) == ()

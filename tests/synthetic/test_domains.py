@@ -11,7 +11,7 @@ from drivax.synthetic.roads.families import FAMILIES
 NAMES = {family.name for family in FAMILIES}
 
 
-def test_every_family_belongs_to_a_domain_and_every_share_to_a_family():
+def test_domain_shares_cover_all_families():
     assert len(NAMES) == len(FAMILIES) >= 10
     named = [{name for name, _ in domain.shares} for domain in DOMAINS.values()]
     assert set.union(*named) == NAMES
@@ -21,7 +21,7 @@ def test_every_family_belongs_to_a_domain_and_every_share_to_a_family():
         assert sum(share for _, share in domain.shares) == pytest.approx(1.0)
 
 
-def test_families_come_up_as_often_as_their_shares_say():
+def test_families_are_drawn_by_their_shares():
     rng = np.random.default_rng(0)
     for domain in DOMAINS.values():
         found = Counter(domain.draw_family(rng).name for _ in range(4000))

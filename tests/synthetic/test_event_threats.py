@@ -43,7 +43,7 @@ def brute(speed, blocked, times):
 
 
 @pytest.mark.parametrize("speed", [4.0, 9.0, 15.0])
-def test_required_deceleration_is_the_least_that_keeps_behind(speed):
+def test_required_deceleration_is_the_least_that_avoids_overlap(speed):
     rng = np.random.default_rng(0)
     for _ in range(10):
         times = np.sort(rng.uniform(0.2, 5.0, 4))
@@ -66,7 +66,7 @@ def test_rooms_and_gaps_by_hand():
     assert cut_in_gap(12.0, 10.0, 4.0, 3.0, 3.2) == pytest.approx(4.0)
 
 
-def test_what_roads_must_have():
+def test_events_need_features_of_the_road():
     plain, ending, (lights, _), (yielding, _) = (
         road(lanes=1),
         road(ends=True),
@@ -83,7 +83,7 @@ def test_what_roads_must_have():
     assert all(possible(kind, plain) for kind in (EventKind.LEAD_BRAKES, EventKind.LANE_BLOCKED))
 
 
-def test_where_ego_should_be():
+def test_destinations_by_hand():
     (end,) = destinations_for(EventKind.LATE_MERGE, road(ends=True))
     assert end.lane == 0 and end.along_m == (250.0, 250.0) and end.alone
     network, (_, way, _) = junction(True)
@@ -101,7 +101,7 @@ def test_where_ego_should_be():
 
 
 def crossed(side_m, speed=10.0):
-    """Ego at 10 m/s towards a car that stands 40 m ahead, this far to the left of its way; somebody staged it."""
+    """Ego at 10 m/s towards a car that stands 40 m ahead, ``side_m`` to the left of its path; the car is the actor."""
     roles, motion = scene(road(), [(0,), (0,)], [60.0, 60.0 + (FIRST + 20) + 40.0], [10.0, 0.0])
     motion = dataclasses.replace(motion, xy=motion.xy + np.array([[[0.0, 0.0]], [[0.0, side_m]]]))
     staged = StagedEvent(EventKind.STALLED_VEHICLE, Staging(), (1,), FIRST + 20, FIRST + 70, 3.0)
@@ -109,7 +109,7 @@ def crossed(side_m, speed=10.0):
     return EgoView(roles, motion, FIRST), slower, staged
 
 
-def test_an_event_counts_when_who_keeps_its_speed_would_collide():
+def test_events_endanger_an_ego_that_keeps_its_speed():
     assert endangers_ego(*crossed(0.0)) and endangers_ego(*crossed(1.5))
     # Boxes are 2 m wide: at 2.1 m they pass, and at 1.9 m they only graze each other.
     assert not endangers_ego(*crossed(2.1)) and not endangers_ego(*crossed(1.9))
@@ -117,7 +117,7 @@ def test_an_event_counts_when_who_keeps_its_speed_would_collide():
     assert not endangers_ego(*crossed(0.0, 4.4)) and endangers_ego(*crossed(0.0, 5.2))
 
 
-def test_who_would_hit_somebody_that_crosses_is_known():
+def test_vehicles_that_would_hit_a_crossing_actor_are_found():
     roles, motion = scene(road(), [(0,), (1,), (1,), (0,)], [60.0, 40.0, 200.0, 20.0], [10.0] * 4)
     t = np.arange(STEPS) * 0.1
     # Somebody walks over the road at x = 160 from 8 s on: the first car on lane 1 (y = 3.5) is there after 12 s.

@@ -26,7 +26,7 @@ from .event_scenes import FIRST, STEPS, junction, occasion, road, scene
 
 
 def predicted(motion, staged):
-    """How the actor goes: as told, or braking from the given step on along its way."""
+    """Motion of the actor: as scripted, or braking along its path from the given step on."""
     if staged.staging.extras:
         return staged.staging.extras[0]
     (override,) = staged.staging.overrides
@@ -86,7 +86,7 @@ def followed(actor, start, speed, until):
 
 
 @pytest.mark.parametrize("kind", sorted(SCRIPTS))
-def test_an_ego_that_keeps_its_speed_meets_the_actor_and_one_that_brakes_as_required_does_not(kind):
+def test_required_braking_avoids_the_actor_and_constant_speed_does_not(kind):
     staged_count, close, severities = 0, 0, []
     for seed in range(14):
         rng = np.random.default_rng([int(kind), seed])
@@ -157,19 +157,19 @@ def test_actors_are_plausible(kind):
         EventKind.FROM_BEHIND_PARKED, EventKind.TAILGATER,
     ],
 )  # fmt: skip
-def test_without_occasion_there_is_no_event(kind):
+def test_unsuitable_scenarios_have_no_event(kind):
     # One lane, nobody else, no junction, no parked cars.
     roles, motion = scene(road(lanes=1), [(0,)], [60.0], [11.0])
     assert stage(kind, EgoView(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
 @pytest.mark.parametrize("kind", sorted(SCRIPTS))
-def test_who_stands_meets_nobody(kind):
+def test_standing_ego_has_no_event(kind):
     roles, motion = scene(road(), [(0,), (0,)], [60.0, 75.0], [0.0, 0.0])
     assert stage(kind, EgoView(roles, motion, FIRST), 3.0, np.random.default_rng(0)) is None
 
 
-def test_a_runner_enters_at_red():
+def test_red_light_runner_enters_at_red():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         roles, motion = occasion(EventKind.RED_LIGHT_RUNNER, rng)
@@ -183,7 +183,7 @@ def test_a_runner_enters_at_red():
             assert extra.speed[passes] > 8.0
 
 
-def test_the_queue_at_the_runners_light_is_not_there():
+def test_queue_before_the_red_light_runner_is_removed():
     network, route = junction(False)
     cross = (3, 4, 5)
     staged = None
@@ -199,12 +199,12 @@ def test_the_queue_at_the_runners_light_is_not_there():
     assert went.valid[0].all() and not went.valid[1:].any()
 
 
-def test_numbers_of_kinds_are_stored_and_stay():
+def test_event_kinds_keep_their_stored_numbers():
     assert [kind.value for kind in EventKind] == list(range(13)) and EventKind.LEAD_BRAKES == 1
     assert set(SCRIPTS) == set(EventKind) - {EventKind.NONE}
 
 
-def test_a_tailgater_keeps_its_short_gap():
+def test_tailgater_keeps_a_short_gap():
     table = draw_drivers(2, Density(), np.random.default_rng(0))
     paths = [lane_path(road(lanes=1), (0,), Sway()) for _ in range(2)]
     at, speed = np.array([70.0, 40.0]), np.array([10.0, 10.0])

@@ -33,14 +33,14 @@ class Runs:
         return motion if self.reaction is None else self.reaction(motion, len(self.plans))
 
 
-def test_a_good_drive_is_not_planned():
+def test_good_drive_is_kept():
     roles, motion = scene(road(), 12.0)
     runs = Runs(motion)
     got, cause = drive_ego(roles, TIMES, Staging(), 0, runs)
     assert (got, cause, runs.plans) == (motion, "", [])
 
 
-def test_a_collision_is_planned_away():
+def test_planning_avoids_a_collision():
     roles, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
     runs = Runs(motion)
     got, cause = drive_ego(roles, TIMES, EVENT, 10, runs)
@@ -52,7 +52,7 @@ def test_a_collision_is_planned_away():
 
 
 @pytest.mark.parametrize(("aware", "begins"), [(15, [15]), (32, [32, 16])])
-def test_ego_acts_late_if_that_is_early_enough(aware, begins):
+def test_ego_reacts_late_where_possible(aware, begins):
     # 12 m/s: bumpers meet during the 38th step; from 3.2 s on no braking helps.
     roles, motion = scene(road((1,)), 12.0, [user((80.0, 0.0))])
     runs = Runs(motion)
@@ -77,14 +77,14 @@ def test_common_driving_must_not_brake_hard():
 
 
 @pytest.mark.parametrize(("staging", "cause", "plans"), [(Staging(), "ego_hardly_moves", 0), (EVENT, "", 1)])
-def test_who_stands_all_the_time_is_planned_only_where_something_is_staged(staging, cause, plans):
+def test_standing_ego_is_planned_only_for_staged_events(staging, cause, plans):
     roles, motion = scene(road(), 0.0)
     runs = Runs(motion)
     assert drive_ego(roles, TIMES, staging, 0, runs)[1] == cause
     assert len(runs.plans) == plans
 
 
-def test_others_who_react_are_planned_for_again():
+def test_plans_repeat_after_reactions_of_others():
     """The standing car rolls back by 8 m as soon as ego has a plan."""
     roles, motion = scene(road((1,)), 12.0, [user((85.0, 0.0))])
 
@@ -100,7 +100,7 @@ def test_others_who_react_are_planned_for_again():
     assert got.xy[0, -1, 0] < 77.0 - CAR[0]
 
 
-def test_a_rough_drive_is_smoothed_or_kept():
+def test_rough_drive_is_smoothed_or_kept():
     roles, motion = scene(road((1,)), 12.0)
     speed = motion.speed.copy()
     speed[0] = 12.0 - 0.5 * np.sin(2 * np.pi * TIMES / 0.9)
@@ -111,7 +111,7 @@ def test_a_rough_drive_is_smoothed_or_kept():
     assert np.abs(np.diff(got.speed[0])).max() < np.abs(np.diff(speed[0])).max() / 3
 
 
-def test_the_plan_begins_where_ego_stood_at_a_stop_sign():
+def test_plan_starts_at_the_stop_sign():
     roles, motion = scene(crossed(100.0, Control.STOP), 10.0, [user((140.0, 0.0))], lanes=(0, 1, 2))
     falling = 10.0 - 0.25 * np.arange(41)
     speed = np.concatenate([falling, np.zeros(5), 0.2 * np.arange(1, 46)])

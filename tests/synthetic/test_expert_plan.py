@@ -40,7 +40,7 @@ def walker(ahead_m, side_m, speed, from_s=0.0):
     return user((x, side_m), np.pi / 2, PERSON, AgentKind.PEDESTRIAN, (0.0, speed), from_s)
 
 
-def test_a_free_road_is_driven_at_constant_speed():
+def test_free_road_is_driven_at_constant_speed():
     plan, cause = planned(road(), 12.0)
     assert cause == ""
     assert np.allclose(plan.speed, 12.0, atol=0.01)
@@ -58,7 +58,7 @@ def test_positions_are_the_integral_of_speed_along_the_heading():
     assert np.abs(np.diff(plan.xy, axis=0) - step).max() < 0.01
 
 
-def test_a_standing_car_is_passed_where_a_lane_is_free():
+def test_standing_car_is_passed_in_a_free_lane():
     plan, cause = planned(road(), 12.0, [user((80.0, 0.0))])
     assert cause == ""
     assert plan.speed.min() > 9.0
@@ -68,7 +68,7 @@ def test_a_standing_car_is_passed_where_a_lane_is_free():
     assert abs(plan.xy[-1, 1]) < 0.1
 
 
-def test_ego_stops_behind_a_standing_car_where_nothing_is_free():
+def test_ego_stops_behind_a_standing_car_without_a_free_lane():
     plan, cause = planned(road((1,)), 12.0, [user((80.0, 0.0))])
     assert cause == ""
     assert np.abs(plan.xy[:, 1]).max() < 0.01
@@ -77,7 +77,7 @@ def test_ego_stops_behind_a_standing_car_where_nothing_is_free():
     assert discomfort(plan.heading, plan.speed) == ""
 
 
-def test_the_oncoming_lane_is_used_only_when_it_is_free():
+def test_oncoming_lane_is_used_only_when_free():
     ahead = user((80.0, 0.0))
     oncoming = [user((x, WIDTH), np.pi, velocity=(-12.0, 0.0)) for x in (150.0, 172.0, 195.0, 218.0)]
     plan, cause = planned(road((1, -1)), 12.0, [ahead])
@@ -88,7 +88,7 @@ def test_the_oncoming_lane_is_used_only_when_it_is_free():
     assert plan.xy[TIMES < 6.0, 1].max() < 1.0
 
 
-def test_a_cut_in_costs_some_braking():
+def test_cut_in_requires_some_braking():
     other = user((44.0, WIDTH), -0.12, velocity=(9.0, -1.0))
     plan, cause = planned(road((1, 1)), 13.0, [other])
     assert cause == ""
@@ -104,7 +104,7 @@ def test_ego_lets_a_pedestrian_cross(ahead_m):
 
 
 @pytest.mark.parametrize(("needed", "solved"), [(3.0, True), (5.0, True), (9.0, False)])
-def test_the_limit_of_braking(needed, solved):
+def test_braking_limit(needed, solved):
     """A barrier across the whole road: v^2 / (2 a) metres ahead of the bumper, and 1 m more for reserve."""
     ahead = 12.0**2 / (2 * needed) + 1.0
     barrier = user((30.0 + CAR[0] / 2 + ahead + 0.5, 0.0), size=BARRIER)
@@ -120,7 +120,7 @@ def with_lights(green_s, offset_s):
 
 
 @pytest.mark.parametrize("turns_red_s", np.arange(1.0, 9.0, 0.5))
-def test_red_lights_are_kept(turns_red_s):
+def test_ego_stops_at_red(turns_red_s):
     # 20 s green, 3 s yellow, 1.5 s red: short, so that anticipation pays; then 24.5 s again.
     network = with_lights(20.0, turns_red_s - 23.0)
     plan, cause = planned(network, 12.0, lanes=(0, 1, 2))
@@ -128,7 +128,7 @@ def test_red_lights_are_kept(turns_red_s):
     assert braking(plan) < 4.0
 
 
-def test_a_long_red_is_waited_for():
+def test_ego_waits_at_a_long_red():
     network = with_lights(5.0, -6.0)
     network = replace(network, signals=replace(network.signals, all_red_s=30.0))
     plan, cause = planned(network, 12.0, lanes=(0, 1, 2))
@@ -174,7 +174,7 @@ def test_followers_are_expected_to_brake_unless_they_ran_into_ego():
     assert wary.xy[-1, 0] < 80.0 - 2.3 - 0.5
 
 
-def test_a_plan_begins_with_the_pose_of_its_first_step():
+def test_plan_starts_with_the_pose_of_its_first_step():
     roles, motion = scene(road(), 12.0, [user((120.0, 0.0))])
     plan = plan_ego(roles, motion, TIMES, 30)
     assert plan.first_step == 30

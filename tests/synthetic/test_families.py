@@ -67,7 +67,7 @@ def test_headings_are_tangents(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_neighbours_run_beside_each_other(family, seed):
+def test_neighbours_are_parallel(family, seed):
     network = built(family, seed)
     for index, lane in enumerate(network.lanes):
         if lane.left >= 0:
@@ -81,7 +81,7 @@ def test_neighbours_run_beside_each_other(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_lanes_lie_inside_the_edges_and_clear_of_them(family, seed):
+def test_lanes_keep_clear_of_edges(family, seed):
     network, inside = built(family, seed), ground(family, seed)
     for lane in network.lanes:
         assert drivable(lane.curve.xy[len(lane.curve.xy) // 2], network)
@@ -115,7 +115,7 @@ def test_edges_are_closed_simple_rings_with_the_road_on_their_left(family, seed)
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_there_is_road_ahead_of_every_start(family, seed):
+def test_starts_have_road_ahead(family, seed):
     network = built(family, seed)
     assert network.starts
     for start in network.starts:
@@ -124,7 +124,7 @@ def test_there_is_road_ahead_of_every_start(family, seed):
         room, at, seen = lane.length_m - start.high_m, lane, {start.lane}
         while ahead := [k for k in at.successors if k not in seen] or (at.ends and [max(at.left, at.right)]):
             seen.add(ahead[0])
-            # Who has to change lanes goes on beside the lane that ends: it brings no distance.
+            # A change to the neighbour of a lane that ends adds no distance.
             room += network.lanes[ahead[0]].length_m if at.successors else 0.0
             at = network.lanes[ahead[0]]
         # Nine seconds at the limit, and the 50 m of route beyond the goal.
@@ -134,7 +134,7 @@ def test_there_is_road_ahead_of_every_start(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_map_features_tell_the_whole_network(family, seed):
+def test_map_features_describe_the_whole_network(family, seed):
     network = built(family, seed)
     features = {f.feature_id: f for f in map_features(network)}
     signs = [f for f in features.values() if f.kind == RoadKind.STOP_SIGN]
@@ -168,7 +168,7 @@ def place(lane, along_m):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_crossings_lead_from_kerb_to_kerb_over_their_lanes(family, seed):
+def test_crossings_span_the_road_over_their_lanes(family, seed):
     network, inside = built(family, seed), ground(family, seed)
     for crossing in network.crossings:
         axis = shapely.LineString(crossing.axis)
@@ -186,7 +186,7 @@ def test_crossings_lead_from_kerb_to_kerb_over_their_lanes(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_sidewalks_lie_beside_the_road(family, seed):
+def test_sidewalks_are_outside_the_road(family, seed):
     inside = ground(family, seed)
     whole = shapely.Polygon(inside.exterior)
     for walk in built(family, seed).walks:
@@ -194,7 +194,7 @@ def test_sidewalks_lie_beside_the_road(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_bays_lie_inside_the_road_beside_their_lane(family, seed):
+def test_bays_are_inside_the_road_next_to_their_lane(family, seed):
     network, inside = built(family, seed), ground(family, seed)
     boxes = []
     for bay in network.bays:
@@ -219,7 +219,7 @@ def test_bays_lie_inside_the_road_beside_their_lane(family, seed):
         for s in range(1, 13)
     ],
 )
-def test_every_route_can_be_driven_by_pure_pursuit(family, seed):
+def test_pure_pursuit_drives_all_routes(family, seed):
     network, inside = built(family, seed), ground(family, seed)
     routes = covering_routes(network)
     assert {lane for route in routes for lane in route} == set(range(len(network.lanes)))
@@ -229,7 +229,7 @@ def test_every_route_can_be_driven_by_pure_pursuit(family, seed):
 
 
 @pytest.mark.parametrize(("family", "seed"), CASES)
-def test_ways_by_chance_end_at_the_end_of_a_lane_and_never_repeat_one(family, seed):
+def test_random_routes_end_at_lane_ends_and_repeat_no_lane(family, seed):
     network, rng = built(family, seed), np.random.default_rng(seed)
     used = set()
     for first, lane in enumerate(network.lanes):
@@ -246,7 +246,7 @@ def test_ways_by_chance_end_at_the_end_of_a_lane_and_never_repeat_one(family, se
 
 
 @pytest.mark.slow
-def test_chance_draws_many_roads():
+def test_families_draw_varied_roads():
     for family in FAMILIES:
         layouts = {len(built(family, seed).lanes) for seed in range(10)}
         assert len(layouts) >= (1 if family.name == "all_way_stop" else 2), family.name
@@ -258,7 +258,7 @@ def test_chance_draws_many_roads():
     assert max(turned["curved_road"]) > 0.3 > max(turned["straight_road"])
 
 
-def test_lanes_are_lost_left_and_right_and_gained():
+def test_lane_drops_lose_lanes_on_both_sides_and_gain_lanes():
     found = set()
     for seed in range(30):
         network = built(NAMED["lane_drop"], seed)
@@ -289,7 +289,7 @@ def test_highways_have_ramps():
     assert found == {(True, 1, 0), (False, 0, 1), (False, 1, 1)}
 
 
-def test_who_enters_a_roundabout_yields_to_who_goes_round():
+def test_roundabout_entries_yield_to_circulating_traffic():
     lanes_per_arm = set()
     for seed in range(12):
         network = built(NAMED["roundabout"], seed)
@@ -309,7 +309,7 @@ def test_who_enters_a_roundabout_yields_to_who_goes_round():
     assert {arms for arms, _ in lanes_per_arm} == {3, 4} and {count for _, count in lanes_per_arm} == {1, 2}
 
 
-def test_streets_have_what_their_names_say():
+def test_streets_have_the_features_of_their_family():
     for seed in range(8):
         parked, midblock = built(NAMED["parked_street"], seed), built(NAMED["midblock_crosswalk"], seed)
         assert len(parked.bays) > 20 and len(parked.walks) == 2

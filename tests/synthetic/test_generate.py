@@ -42,7 +42,7 @@ def one_worker(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_any_number_of_workers_writes_the_same_bytes(one_worker, tmp_path):
+def test_worker_count_does_not_change_the_bytes(one_worker, tmp_path):
     path, result, _ = one_worker
     two = generate(tmp_path / "two", SCENARIOS, 5, Generation(workers=2))
     files = sorted(file.name for file in path.iterdir())
@@ -97,7 +97,7 @@ def test_workers_compute_as_the_oldest_processor_does(tmp_path, monkeypatch):
 
 
 def test_workers_inherit_disabled_features(monkeypatch):
-    """What it was told to leave alone it lacks; a worker that was not told would have it."""
+    """A worker lacks the processor features that its parent disabled."""
     has = {"A": True, "B": False, "C": False}
     monkeypatch.setattr(portable, "_umath", SimpleNamespace(__cpu_dispatch__=[*has], __cpu_features__=has))
     monkeypatch.setenv("NPY_DISABLE_CPU_FEATURES", "B")
@@ -114,7 +114,7 @@ def test_counts_and_progress(one_worker):
     assert FamilyCount(0, {}, unsuited=7).rejection_rate == 0.0
 
 
-def test_a_rejected_draw_counts_for_its_own_family(tmp_path, monkeypatch):
+def test_rejected_draws_count_for_their_family(tmp_path, monkeypatch):
     drawn = []
 
     def one(seed, index, config):
@@ -134,7 +134,7 @@ def test_a_rejected_draw_counts_for_its_own_family(tmp_path, monkeypatch):
     assert [made.families[name].rejection_rate for name in drawn] == [0.0, 0.0]
 
 
-def test_the_set_is_what_was_asked_for(one_worker):
+def test_set_matches_the_request(one_worker):
     path, result, _ = one_worker
     scenarios = ScenarioSet.open(path)
     assert len(scenarios) == SCENARIOS
@@ -161,7 +161,7 @@ def test_the_set_is_what_was_asked_for(one_worker):
         assert n - 1 >= scenario.log_progress[-1] + 49.0
 
 
-def test_a_longer_set_begins_like_a_shorter_one(one_worker, tmp_path):
+def test_longer_set_extends_a_shorter_one(one_worker, tmp_path):
     path, *_ = one_worker
     generate(tmp_path / "three", 3, 5)
     long, short = ScenarioSet.open(path), ScenarioSet.open(tmp_path / "three")
@@ -184,7 +184,7 @@ def test_audit_findings_are_stored(tmp_path):
         assert entry["audit"]["agents"] == int(scenarios[index].agent_valid[10].sum())
 
 
-def test_what_cannot_be_meant_is_refused(tmp_path):
+def test_invalid_requests_are_refused(tmp_path):
     for arguments, text in (
         ((0, 0), "scenarios is 0; use 1 or more"),
         ((1, -1), "seed is -1; use 0 to 999999999"),
@@ -199,7 +199,7 @@ def test_what_cannot_be_meant_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_left_behind_when_it_fails_half_way(tmp_path):
+def test_failed_generation_leaves_no_files(tmp_path):
     def broken(scenarios):
         raise RuntimeError("audit broke")
 
@@ -209,7 +209,7 @@ def test_nothing_is_left_behind_when_it_fails_half_way(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_prints_rate_and_rejections(tmp_path, capsys):
+def test_command_prints_rate_and_rejections(tmp_path, capsys):
     out = tmp_path / "set"
     assert run(Generate(out, scenarios=2, seed=2, workers=1)) == 0
     printed = capsys.readouterr().out.splitlines()
@@ -221,7 +221,7 @@ def test_the_command_prints_rate_and_rejections(tmp_path, capsys):
     assert len(ScenarioSet.open(out)) == 1
 
 
-def test_the_summary_by_hand(tmp_path):
+def test_summary_by_hand(tmp_path):
     counts = {"curved_road": FamilyCount(30, {"ego_collides": 2}), "x": FamilyCount(10, {}, 1200)}
     text = summary(GeneratedSet(tmp_path, 40, 4.0, counts))
     assert text.splitlines() == [
@@ -231,7 +231,7 @@ def test_the_summary_by_hand(tmp_path):
     ]
 
 
-def test_the_summary_tells_which_event_came_up_where(tmp_path):
+def test_summary_lists_events_by_family(tmp_path):
     counts = {
         "curved_road": FamilyCount(30, {}, 0, {"cut_in": 2, "lead_brakes": 1}),
         "x": FamilyCount(10, {}, 0, {"cut_in": 4}),
@@ -244,7 +244,7 @@ def test_the_summary_tells_which_event_came_up_where(tmp_path):
     ]
 
 
-def test_segments_are_maps_and_the_manifest_tells_the_world(one_worker):
+def test_segments_are_maps_and_the_manifest_describes_the_world(one_worker):
     path, result, _ = one_worker
     scenarios = ScenarioSet.open(path)
     segments = [entry["segment"] for entry in scenarios.entries]

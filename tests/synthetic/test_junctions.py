@@ -62,7 +62,7 @@ def go(network):
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)
-def test_who_goes_first_is_settled_in_exactly_one_way_wherever_two_could_meet(family, style, seed):
+def test_each_conflict_has_exactly_one_right_of_way(family, style, seed):
     network = built(family, style, seed)
     lanes = network.lanes
     moving = go(network)
@@ -86,7 +86,7 @@ def test_who_goes_first_is_settled_in_exactly_one_way_wherever_two_could_meet(fa
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)
-def test_every_approach_leads_to_every_other_arm(family, style, seed):
+def test_approaches_connect_to_all_other_arms(family, style, seed):
     network = built(family, style, seed)
     lanes = network.lanes
     for lane in lanes:
@@ -98,7 +98,7 @@ def test_every_approach_leads_to_every_other_arm(family, style, seed):
             assert all(lanes[i].connector for i in (*lane.successors, *lane.predecessors))
 
     def road(lane):
-        """All lanes beside a lane."""
+        """All neighbours of a lane."""
         row = {lane}
         for side in ("left", "right"):
             at = getattr(lanes[lane], side)
@@ -118,7 +118,7 @@ def test_every_approach_leads_to_every_other_arm(family, style, seed):
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)
-def test_crossings_lead_from_kerb_to_kerb_and_know_every_lane_they_cross(family, style, seed):
+def test_crossings_span_the_road_and_list_crossed_lanes(family, style, seed):
     network = built(family, style, seed)
     ring = np.concatenate([network.edges[0].xy, network.edges[0].xy[:1]])
     arms = 3 if family.name == "t_junction" else 4
@@ -154,7 +154,7 @@ def _crossed_at(axis, curve):
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)
-def test_sidewalks_run_beside_the_road_and_never_on_it(family, style, seed):
+def test_sidewalks_follow_the_edge_outside_the_road(family, style, seed):
     network = built(family, style, seed)
     ring = np.concatenate([network.edges[0].xy, network.edges[0].xy[:1]])
     for walk in network.walks:
@@ -172,7 +172,7 @@ def test_most_streets_have_sidewalks_and_some_have_none(style):
 
 
 @pytest.mark.parametrize(("family", "style", "seed"), CASES)
-def test_the_rules_fit_into_a_scenario(family, style, seed):
+def test_rules_fit_the_limits_of_a_scenario(family, style, seed):
     network = built(family, style, seed)
     controlled = [i for i in connectors(network) if network.lanes[i].control == Control.SIGNAL]
     assert len(controlled) <= Capacity().lights
@@ -216,7 +216,7 @@ def test_left_turns_at_lights_are_protected_permissive_or_split(style):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_stem_of_a_t_gives_way_and_so_does_the_left_turn_into_it(seed):
+def test_t_junction_stem_and_left_turns_yield(seed):
     network = built(JUNCTIONS[1], "grid", seed)
     lanes = network.lanes
     signs = {Control.STOP, Control.YIELD}
@@ -226,7 +226,7 @@ def test_the_stem_of_a_t_gives_way_and_so_does_the_left_turn_into_it(seed):
         lane
         for lane in entries
         if not any(abs(turned(lanes[i])) < math.pi / 4 for i in lanes[lane].successors)
-        and not any(abs(turned(lanes[i])) < math.pi / 4 for i in _beside(lanes, lane))
+        and not any(abs(turned(lanes[i])) < math.pi / 4 for i in _neighbours(lanes, lane))
     }
     left_only = {lane for lane in signed - stem if all(turned(lanes[i]) > 1 for i in lanes[lane].successors)}
     assert stem and signed == stem | left_only
@@ -242,13 +242,13 @@ def test_the_stem_of_a_t_gives_way_and_so_does_the_left_turn_into_it(seed):
             assert all(lanes[j].predecessors[0] not in stem for j in lanes[i].yields_to)
 
 
-def _beside(lanes, lane):
-    """The connectors that begin at the lanes beside this one."""
+def _neighbours(lanes, lane):
+    """The connectors that begin at the neighbours of this lane."""
     return [i for side in (lanes[lane].left, lanes[lane].right) if side >= 0 for i in lanes[side].successors]
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_ego_mostly_begins_where_a_left_turn_gives_way(style):
+def test_unprotected_left_starts_mostly_in_left_turn_lanes(style):
     for seed in range(8):
         network = built(JUNCTIONS[3], style, seed)
         lanes = network.lanes
@@ -265,7 +265,7 @@ def test_ego_mostly_begins_where_a_left_turn_gives_way(style):
         assert not any(turned(lanes[i]) > 1.0 for lane in network.busy for i in lanes[lane].successors)
 
 
-def test_more_vehicles_are_placed_on_busy_lanes():
+def test_busy_lanes_have_more_vehicles():
     network = built(JUNCTIONS[3], "grid", 0)
     quiet = [i for i, lane in enumerate(network.lanes) if not lane.connector and i not in network.busy]
     counts = np.zeros(len(network.lanes))
@@ -278,7 +278,7 @@ def test_more_vehicles_are_placed_on_busy_lanes():
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_a_corridor_leads_through_two_junctions(style):
+def test_corridors_pass_two_junctions(style):
     kinds = set()
     for seed in range(12):
         network = built(JUNCTIONS[4], style, seed)
@@ -308,7 +308,7 @@ def test_mouths_by_hand():
     # Narrow lanes keep 3.2 m between opposing centres.
     assert narrow.left_m == narrow.right_m == pytest.approx(3.6)
     arms = geometry.arms(rng, [k * math.pi / 2 for k in range(4)], [wide, narrow] * 2)
-    # The wide street is centred: its middle line lies half a lane beside the axis, on the right of who looks out.
+    # The wide street is centred: its middle line is half a lane to the right of the axis, looking outwards.
     assert arms[0].base.y == pytest.approx(-1.75) and arms[2].base.y == pytest.approx(1.75)
     assert arms[1].base.x == arms[3].base.x == 0.0
     # At right angles a corner of 8 m begins 8 m from where the edges meet.
@@ -321,7 +321,7 @@ def test_mouths_by_hand():
     assert geometry.mouths(rng, arms) == pytest.approx([expected] * 4)
 
 
-def test_coordinated_lights_turn_green_when_the_platoon_comes():
+def test_coordinated_lights_turn_green_when_the_platoon_arrives():
     waves = 0
     for seed in range(16):
         network = built(JUNCTIONS[4], "grid", seed)
@@ -345,7 +345,7 @@ def test_coordinated_lights_turn_green_when_the_platoon_comes():
 
 
 @pytest.mark.parametrize("family", JUNCTIONS[1:], ids=lambda f: f.name)
-def test_who_has_priority_need_not_slow_down_for_the_shape_of_the_junction(family):
+def test_priority_roads_keep_their_speed_through_the_junction(family):
     for seed in range(10):
         for lane in built(family, "grid", seed).lanes:
             if lane.connector and lane.control == Control.NONE and abs(turned(lane)) < math.pi / 4:

@@ -77,7 +77,7 @@ def test_lane_changes_are_those_of_the_published_rule(behind, ahead, politeness)
 
 
 @pytest.mark.parametrize("politeness", [0.0, 0.5, 1.0])
-def test_the_polite_make_way_for_who_follows_and_the_impolite_do_not(politeness):
+def test_only_polite_drivers_make_way_for_followers(politeness):
     # Row 1 at 9 m/s behind a leader at 8.5 m/s gains a little on the left; row 3 at 13 m/s is held up behind it.
     at, ways = [20.0, 300.0, 330.0, 275.0, 330.0], [(1,), (1,), (1,), (1,), (0,)]
     speed = [9.0, 9.0, 8.5, 13.0, 8.5]
@@ -95,7 +95,7 @@ def test_no_lane_change_without_incentive_or_next_to_a_vehicle():
     assert decisions([(1,), (1,), (1,), (0,)], [20.0, 300.0, 315.0, 302.0], [10.0, 12.0, 5.0, 12.0])[0] == []
 
 
-def test_of_two_who_go_for_one_gap_one_goes():
+def test_only_one_vehicle_takes_a_contested_gap():
     ways = [(1,), (1,), (1,), (1,), (0,)]
     changes, _ = decisions(
         ways, [20.0, 300.0, 318.0, 340.0, 500.0], [10.0, 12.0, 9.0, 5.0, 14.0], movers=(1, 2, 3)
@@ -103,7 +103,7 @@ def test_of_two_who_go_for_one_gap_one_goes():
     assert len(changes) == 1
 
 
-def test_chains_go_over_sections_and_end_at_forks():
+def test_chains_span_sections_and_end_at_forks():
     network, columns = road(lanes=2, sections=3)
     chains = LaneChains(network)
     assert [chains.offset_m[k] for k in columns[0]] == pytest.approx([0.0, 200.0, 400.0])
@@ -156,7 +156,7 @@ def test_vehicles_without_room_wait_before_the_end_of_the_lane():
     count = 24
     table = drivers(count, 1, speed_factor=0.9, politeness=0.0)
     ways = [(0, 1, 2, 3, 4, 5)] * (count - 1) + [(6, 7, 8)]
-    # A standing column of cars beside the whole lane.
+    # A standing column of cars next to the whole lane.
     at = [270.0 - 9.0 * k + 20.0 for k in range(count - 1)] + [180.0]
     hold = Staging(overrides=tuple(Override(k, 0, 400, -3.0) for k in range(count - 1)))
     motion = run(network, ways, table, at, [0.0] * (count - 1) + [10.0], 25.0, hold)
@@ -164,7 +164,7 @@ def test_vehicles_without_room_wait_before_the_end_of_the_lane():
     assert 265.0 < motion.xy[-1, -1, 0] < 297.0
 
 
-def test_a_change_is_smooth_and_takes_up_both_lanes():
+def test_lane_change_is_smooth_and_occupies_both_lanes():
     network, columns = road(lanes=2)
     table = drivers(4, 0, speed_factor=0.95, politeness=0.0)
     # Row 1 comes up behind a slow one and passes; row 3 follows far behind on the left.

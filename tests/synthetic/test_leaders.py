@@ -21,7 +21,7 @@ def leaders(ways, at, table, active=None, **roads):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_leader_is_the_nearest_ahead_on_the_own_lanes(seed):
+def test_leader_is_the_nearest_vehicle_ahead_on_the_path(seed):
     # Three lanes in three sections of 100 m: lane 3k + j is the j-th section of the k-th column.
     rng = np.random.default_rng(seed)
     column, at, there = rng.integers(0, 3, 14), rng.uniform(5.0, 290.0, 14), rng.random(14) < 0.8
@@ -42,7 +42,7 @@ def test_the_leader_is_the_nearest_ahead_on_the_own_lanes(seed):
 
 
 @pytest.mark.parametrize(("width", "follows"), [(3.5, True), (7.0, False)])
-def test_a_cyclist_is_followed_only_where_the_lane_is_too_narrow_to_pass(width, follows):
+def test_cyclists_are_leaders_only_on_narrow_lanes(width, follows):
     # A car of 2 m needs 1 m of half the lane; 2.4 m are the cyclist's.
     table = drivers(2)
     size = np.array([[4.6, 2.0, 1.5], [1.8, 0.7, 1.7]])
@@ -53,6 +53,6 @@ def test_a_cyclist_is_followed_only_where_the_lane_is_too_narrow_to_pass(width, 
     assert gap[0] == (pytest.approx(20.0 - 3.2, abs=1e-6) if follows else np.inf)
 
 
-def test_an_empty_road_has_no_leaders():
+def test_empty_road_has_no_leaders():
     gap, _ = leaders([(0,), (0,)], [20.0, 40.0], drivers(2), [False, False])
     assert np.all(gap == np.inf)

@@ -67,16 +67,14 @@ def test_extents_are_those_of_the_corners(turned):
     )
 
 
-def test_what_is_far_from_a_path_is_not_seen():
+def test_distant_agents_have_no_extent():
     path = lane_path(road(100.0)[0], (0,), Sway())
     boxes = Boxes(np.array([[40.0, 30.0]]), np.zeros(1), np.zeros(1), np.array([[4.0, 1.8]]))
     assert not len(extents(path, boxes)[1])
 
 
 @pytest.mark.parametrize(("high", "passes"), [(6.0, True), (2.2, False)])
-def test_a_double_parked_car_is_passed_where_there_is_room_and_waited_behind_where_there_is_none(
-    high, passes
-):
+def test_double_parked_car_is_passed_only_where_room_permits(high, passes):
     table = drivers(1, speed_factor=0.8)
     motion = run(street(high), [(0,)], table, [20.0], [10.0], 30.0, parked=(parked(150.0, -0.4, 300),))
     assert not touches(motion, 0, 1)
@@ -90,7 +88,7 @@ def test_a_double_parked_car_is_passed_where_there_is_room_and_waited_behind_whe
         assert 150.0 - 2.3 - motion.size_m[0, 0] / 2 - x.max() == pytest.approx(5.0, abs=1.5)
 
 
-def test_oncoming_traffic_is_let_pass_first():
+def test_detours_yield_to_oncoming_traffic():
     table = drivers(2, speed_factor=0.8)
     network = street()
     motion = run(
@@ -113,7 +111,7 @@ def test_oncoming_traffic_is_let_pass_first():
     (69.0, 0.0, True),
     (20.0, 0.0, False),  # passed: its rear is more than half a metre behind the front
 ])  # fmt: skip
-def test_what_stands_in_a_band_ahead_is_met(x, y, meets):
+def test_obstacles_in_the_band_ahead_are_detected(x, y, meets):
     path = lane_path(street(), (0,), Sway())
     tables = PathTables(street(), [path], drivers(1))
     standing = Standing(boxes_at((parked(x, y, 1),), 0), tables, np.array([1.9]))
@@ -147,7 +145,7 @@ def test_vehicles_brake_for_a_pedestrian_in_the_lane():
     assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.PEDESTRIAN]
 
 
-def test_the_quintic_leaves_with_value_and_slope_and_ends_level():
+def test_quintic_starts_with_value_and_slope_and_ends_level():
     at = np.linspace(0.0, 60.0, 6001)
     d = quintic_step(at, (10.0, 1.5, 0.1), 40.0)
     step = at[1]
@@ -158,7 +156,7 @@ def test_the_quintic_leaves_with_value_and_slope_and_ends_level():
     assert np.abs(np.gradient(slope, step)[(at > 10.1) & (at < 60)]).max() < 0.02
 
 
-def test_a_displaced_path_keeps_its_offset():
+def test_displaced_path_keeps_its_offset():
     network, _ = road(200.0)
     path = lane_path(network, (0,), Sway())
     shifted = around(path, (40.0, 60.0, 90.0, 115.0), 2.0)
@@ -177,7 +175,7 @@ def test_a_displaced_path_keeps_its_offset():
     )
 
 
-def test_a_change_begins_exactly_where_the_vehicle_is():
+def test_lane_change_starts_at_the_vehicle():
     network, columns = road(300.0, lanes=2)
     here, there = (lane_path(network, (column[0],), Sway((0.2,), (0.05,), (0.3,))) for column in columns)
     path, at = change_onto(there, here, 80.3, 50.0)

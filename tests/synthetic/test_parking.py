@@ -23,7 +23,7 @@ def street(width=3.5, oncoming=True):
     return RoadNetwork("test", tuple(draft.lanes), (), bays=bays)
 
 
-def test_bays_are_taken_at_their_share_and_cars_stay_inside():
+def test_bays_are_occupied_at_their_share_and_contain_their_cars():
     count = 0
     for seed in range(30):
         cars = parked_cars(street(), 0.6, 0.0, np.random.default_rng(seed), 20)
@@ -40,7 +40,7 @@ def test_bays_are_taken_at_their_share_and_cars_stay_inside():
     assert count / 600 == pytest.approx(0.6, abs=0.06)
 
 
-def test_double_parked_cars_leave_a_way_past_them():
+def test_double_parked_cars_leave_room_to_pass():
     count = 0
     for seed in range(40):
         cars = parked_cars(street(), 0.0, 0.3, np.random.default_rng(seed), 5)
@@ -50,14 +50,14 @@ def test_double_parked_cars_leave_a_way_past_them():
             # In the lane, on the side of the bay.
             assert car.xy[0, 1] - car.size_m[1] / 2 > -3.5 / 2 and car.xy[0, 1] < 0
     assert 5 <= count <= 20
-    # A lane of 3.5 m and nothing beside it: nobody could pass.
+    # A lane of 3.5 m without a neighbour leaves no room to pass.
     for seed in range(20):
         assert parked_cars(street(oncoming=False), 0.0, 1.0, np.random.default_rng(seed), 5) == ()
     # 5 m are enough for both.
     assert parked_cars(street(5.0, oncoming=False), 0.0, 1.0, np.random.default_rng(0), 5)
 
 
-def test_a_neighbour_lane_is_a_way_past_and_ends_of_lanes_stay_free():
+def test_double_parking_uses_neighbour_lanes_away_from_lane_ends():
     network = street(oncoming=False)
     lane = dataclasses.replace(network.lanes[0], left=0)
     beside = dataclasses.replace(network, lanes=(lane,))
@@ -68,6 +68,6 @@ def test_a_neighbour_lane_is_a_way_past_and_ends_of_lanes_stay_free():
     assert parked_cars(junction, 0.0, 1.0, np.random.default_rng(0), 5) == ()
 
 
-def test_the_same_draws_give_the_same_cars():
+def test_equal_seeds_park_equal_cars():
     one, other = (parked_cars(street(), 0.5, 0.1, np.random.default_rng(4), 5) for _ in range(2))
     assert all(np.array_equal(a.xy, b.xy) for a, b in zip(one, other, strict=True)) and len(one) == len(other)

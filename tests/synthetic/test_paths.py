@@ -20,7 +20,7 @@ def tangent_error(path) -> float:
 
 
 @pytest.mark.parametrize("family", [CurvedRoad(), SignalisedJunction()])
-def test_a_path_follows_its_lanes(family):
+def test_path_follows_its_lanes(family):
     rng = np.random.default_rng(5)
     network = family.build(rng)
     lanes = random_lanes(network, network.starts[0].lane, rng)
@@ -39,7 +39,7 @@ def test_a_path_follows_its_lanes(family):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_straying_stays_small_and_true_to_its_heading(seed):
+def test_sway_is_small_and_consistent_with_heading(seed):
     rng = np.random.default_rng(seed)
     network = CurvedRoad().build(rng)
     lanes = random_lanes(network, 0, rng)
@@ -62,7 +62,7 @@ def two_lane_road():
     raise AssertionError("no road with two lanes in fifty")
 
 
-def test_a_lane_change_leads_smoothly_from_one_centre_to_the_next():
+def test_lane_change_is_smooth_between_lane_centres():
     network = two_lane_road()
     beside = network.lanes[2].right
     change = LaneChange(section=2, begin_m=8.0, length_m=56.0)
@@ -88,7 +88,7 @@ def test_a_lane_change_leads_smoothly_from_one_centre_to_the_next():
     assert np.abs(path.curvature).max() < np.abs(calm.curvature).max() * 1.15 + 5.8 * width / 56.0**2 + 0.002
 
 
-def test_who_has_just_turned_off_is_still_on_the_way_of_who_goes_straight():
+def test_turning_vehicle_occupies_the_straight_path_until_clear():
     network = SignalisedJunction().build(np.random.default_rng(0))
     first = network.starts[0].lane
     turning = next(

@@ -18,7 +18,7 @@ CAR = np.array([[4.6, 1.9, 1.6]])
 
 
 def street(marked=True, green_s=None):
-    """One lane each way along x, 3.5 m wide, crossed at x = 50; sidewalks 2 m beside the kerbs; maybe lights."""
+    """One lane each way along x, 3.5 m wide, crossed at x = 50; sidewalks 2 m from the kerbs; maybe lights."""
     draft = Draft()
     lanes = []
     for start in (Pose(0.0, -1.75, 0.0), Pose(100.0, 1.75, math.pi)):
@@ -62,7 +62,7 @@ def car_at(x0, speed):
     return lambda t: (np.array([[x0 + speed * t * 0.1, -1.75]]), np.zeros(1), np.array([float(speed)]))
 
 
-def test_on_a_free_road_people_walk_on_at_their_speed():
+def test_pedestrians_cross_a_free_road_at_their_speed():
     xy, heading, speed, claims = play(street(), (over(),))
     y = -10.0 + 1.4 * 0.1 * np.arange(len(xy))
     assert xy[:, 0, 1] == pytest.approx(np.minimum(y, 10.0), abs=0.35)
@@ -76,7 +76,7 @@ def test_on_a_free_road_people_walk_on_at_their_speed():
 
 
 @pytest.mark.parametrize("marked", [True, False])
-def test_who_cannot_stop_any_more_is_waited_for(marked):
+def test_pedestrians_wait_for_cars_that_cannot_stop(marked):
     # The walker reaches the kerb after 4.3 s; the car is then 9 m before the crossing at 10 m/s.
     xy, _, speed, claims = play(street(marked), (over(),), car_at(-2.0, 10.0))
     car = -2.0 + np.arange(len(xy))
@@ -89,7 +89,7 @@ def test_who_cannot_stop_any_more_is_waited_for(marked):
     assert np.any(claims[passing]) == marked
 
 
-def test_where_drivers_must_yield_people_go_before_a_car_that_can_stop_and_else_they_do_not():
+def test_pedestrians_take_priority_only_at_marked_crossings():
     # 40 m away at 10 m/s: 1.3 m/s2 are enough to stop; the car would come after 4 s, crossing takes 6 s.
     def braking(t):
         since = max(0.0, 0.1 * t - 4.0)
@@ -103,7 +103,7 @@ def test_where_drivers_must_yield_people_go_before_a_car_that_can_stop_and_else_
     assert unmarked[0][75, 0, 1] < -4.0
 
 
-def test_at_a_light_people_wait_for_red_and_for_enough_of_it():
+def test_pedestrians_wait_for_enough_red_at_lights():
     # Green from step 0 to 5.4 s, yellow 3 s, then red for 24.5 s.
     network = street(green_s=5.4)
     xy, _, _, claims = play(network, (over(),))
@@ -130,7 +130,7 @@ def test_no_walker_enters_a_standing_queue():
     assert xy[:, 0, 1].max() < -1.75 - 0.95
 
 
-def test_many_walkers_move_as_each_would_alone():
+def test_walkers_move_independently():
     people = (over(1.1), over(1.7, before=3.0), Walker(straight(Pose(0.0, -6.0, 0.0), 100.0), 5.0, 1.3))
     together = play(street(), people, car_at(-20.0, 8.0))
     for i, one in enumerate(people):
@@ -167,7 +167,7 @@ def test_placed_walkers_are_on_their_paths_and_some_cross_during_the_recording()
     assert [(w.start_m, w.speed_mps) for w in again] == [(w.start_m, w.speed_mps) for w in same]
 
 
-def test_without_walkers_or_crossings_nothing_happens():
+def test_no_walkers_without_crossings():
     network = RoadNetwork("test", street().lanes, ())
     xy, _, _, claims = play(network, ())
     assert xy.shape == (151, 0, 2) and claims.shape == (151, 0)

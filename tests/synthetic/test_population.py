@@ -49,7 +49,7 @@ def test_no_vehicle_begins_in_or_behind_an_obstacle_or_at_a_lane_end():
     assert max(along for lane, along in found if lane == 1) <= 525.0
 
 
-def test_shares_of_types_are_those_asked_for():
+def test_vehicle_types_match_their_shares():
     density = Density(van_share=0.2, truck_share=0.1, bus_share=0.05, cyclist_share=0.15)
     table = draw_drivers(20000, density, np.random.default_rng(0))
     length, cyclist = table.size_m[:, 0], table.cyclist

@@ -93,7 +93,7 @@ def test_red_lights_close_the_stop_line_and_late_yellow_is_avoided():
     assert stop_lines(network, roles.paths[0], (98.0, 2.3), TIMES, 98.0 + TIMES, {}) == []
 
 
-def test_stop_signs_open_when_ego_went_and_yields_when_others_have_gone():
+def test_stop_signs_open_after_stopping_and_yield_signs_after_traffic():
     network = crossed(100.0, Control.STOP)
     roles, _ = scene(network, 10.0, lanes=(0, 1, 2))
     (wall,) = stop_lines(network, roles.paths[0], (30.0, 2.3), TIMES, 30.0 + 10.0 * TIMES, {})

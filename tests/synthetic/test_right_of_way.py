@@ -27,7 +27,7 @@ def test_conflict_zones_are_where_connectors_are_near():
 @pytest.mark.parametrize(
     ("distance", "speed"), [(0.0, 3.0), (5.0, 0.0), (12.0, 2.0), (80.0, 4.0), (-3.0, 4.0)]
 )
-def test_the_time_to_cover_a_distance_is_that_of_marching(distance, speed):
+def test_travel_time_agrees_with_simulation(distance, speed):
     at, v, t = 0.0, speed, 0.0
     while at < distance:
         at, v, t = at + v * 1e-4, min(v + 1.5e-4, 9.0), t + 1e-4
@@ -35,7 +35,7 @@ def test_the_time_to_cover_a_distance_is_that_of_marching(distance, speed):
 
 
 def yielding(seconds_away, control=Control.YIELD, speed=10.0):
-    """Row 1 comes to give way; row 0 with priority would be at the crossing so many seconds later than it asks."""
+    """Row 1 must yield; row 0 with priority arrives the given seconds after the request of row 1."""
     network = crossroads(2, control=[Control.NONE, control], yields_to=[(), (1,)])
     table = drivers(2, speed_factor=0.7, critical_gap_s=4.5, acceleration_mps2=1.5)
     # Row 1 stands 2 m before its line.
@@ -48,7 +48,7 @@ def yielding(seconds_away, control=Control.YIELD, speed=10.0):
     )
 
 
-def test_who_must_give_way_waits_for_a_car_three_seconds_away_and_goes_before_one_at_eight():
+def test_yielding_vehicle_accepts_an_eight_second_gap_and_rejects_three():
     mine, theirs, _ = yielding(3.0)
     assert theirs < 40 and mine > theirs
     mine, theirs, motion = yielding(8.0)
@@ -76,7 +76,7 @@ def test_all_vehicles_stand_at_a_stop_sign():
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 0, 3, 1)])
-def test_the_first_to_stop_at_an_all_way_stop_goes_first(order):
+def test_all_way_stop_serves_in_order_of_arrival(order):
     network = crossroads(4, control=[Control.ALL_WAY_STOP] * 4)
     table = twins(4, speed_factor=0.6)
     # Each comes 12 m (more than a second) behind the one before.
@@ -89,7 +89,7 @@ def test_the_first_to_stop_at_an_all_way_stop_goes_first(order):
     assert max(lines) < 400
 
 
-def test_of_two_who_come_together_the_one_to_the_right_goes_first():
+def test_right_hand_vehicle_goes_first_on_simultaneous_arrival():
     network = crossroads(2, control=[Control.ALL_WAY_STOP] * 2)
     table = twins(2, speed_factor=0.6)
     half = table.size_m[:, 0] / 2
@@ -111,7 +111,7 @@ def test_no_vehicle_enters_a_junction_that_cannot_be_cleared():
     assert motion.distance_m[2, -1] > 120.0
 
 
-def test_ways_from_one_lane_do_not_conflict_and_oncoming_traffic_goes_together():
+def test_connectors_of_one_lane_and_oncoming_traffic_do_not_conflict():
     network = crossroads(4)
     begin, _ = conflict_zones(network)
     assert math.isnan(begin[1, 7]) and not math.isnan(begin[1, 10])

@@ -39,7 +39,7 @@ def test_vans_occlude_pedestrians_and_pedestrians_occlude_no_agent():
     assert look([EGO, van, (15.0, 3.0, 0.0, 0.6, 0.6)], [1.5, 2.4, 1.75]) == [True, True, True]
 
 
-def test_over_a_low_roof_by_hand():
+def test_view_over_a_low_roof_by_hand():
     """The eye is 1.7 m up; the ray to half a truck's height (1.75 m) rises, so a roof of 1.5 m is below it."""
     car, truck = (10.0, 0.0, 0.0, 4.6, 1.9), (40.0, 0.0, 0.0, 8.0, 1.9)
     assert look([EGO, car, truck], [1.5, 1.5, 3.5]) == [True, True, True]
@@ -112,7 +112,7 @@ def tracks(count=400, steps=91, speed=10.0):
     )
 
 
-def test_noise_has_the_size_and_the_memory_that_were_asked_for():
+def test_noise_has_the_requested_size_and_correlation():
     plain = tracks()
     config = NoiseConfig()
     result = noisy(plain, 0, np.random.default_rng(1), config)
@@ -135,7 +135,7 @@ def test_noise_has_the_size_and_the_memory_that_were_asked_for():
         assert np.abs(values).max() <= 3.0001 * sigma
 
 
-def test_ego_sizes_and_what_is_not_valid_stay_as_they_are():
+def test_noise_keeps_ego_sizes_and_invalid_states():
     plain = tracks(5)
     result = noisy(plain, 2, np.random.default_rng(1), NoiseConfig())
     for name in ("xy", "heading", "velocity"):
@@ -197,7 +197,7 @@ def test_no_corner_moves_farther_than_the_bound(length, width):
 
 @pytest.mark.parametrize(("length", "width"), LARGEST)
 def test_noise_never_makes_a_user_overlap_a_free_ego(length, width):
-    """Whoever just passes the test for overlap with its skin is still clear of ego after the largest errors."""
+    """A user just clear of the enlarged ego is still clear of ego after the largest errors."""
     rng = np.random.default_rng(5)
     count = 100
     bearing, heading = rng.uniform(-np.pi, np.pi, (2, count))

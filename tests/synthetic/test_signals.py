@@ -24,7 +24,7 @@ PLAN = SignalPlan(
 )
 
 
-def test_a_cycle_by_hand():
+def test_signal_cycle_by_hand():
     assert PLAN.cycle_s == 22.0
     assert PLAN.starts_s == (0.0, 9.5)
     times = np.array([1.9, 2.0, 6.9, 7.0, 9.9, 10.0, 11.4, 11.5, 19.4, 19.5, 22.4, 22.5, 23.9, 24.0])
@@ -38,7 +38,7 @@ def test_a_cycle_by_hand():
     assert left[5:, 0] == pytest.approx(0.0)
 
 
-def test_states_of_arrows_and_round_lamps():
+def test_light_states_of_arrows_and_round_lights():
     colours = np.array([Colour.NONE, Colour.GREEN, Colour.YELLOW, Colour.RED], np.int8)
     assert light_states(colours, True).tolist() == [
         -1,
@@ -49,19 +49,19 @@ def test_states_of_arrows_and_round_lamps():
     assert light_states(colours, False).tolist() == [-1, LightState.GO, LightState.CAUTION, LightState.STOP]
 
 
-def test_the_phase_of_a_lane():
+def test_phase_of_a_lane():
     assert [PLAN.phase_of(lane) for lane in range(3)] == [0, 1, 1]
     with pytest.raises(KeyError):
         PLAN.phase_of(3)
 
 
-def test_yellow_lasts_as_long_as_it_takes_to_react_and_stop():
+def test_yellow_time_follows_the_ite_formula():
     # 17.9 m/s: one second, then 17.9 / (2 x 3.05) s of braking to a stop or of driving through.
     assert yellow_time_s(17.9) == pytest.approx(3.934, abs=1e-3)
     assert yellow_time_s(8.3) == 3.0
 
 
-def test_two_junctions_keep_their_own_cycles():
+def test_combined_plans_keep_their_own_cycles():
     second = SignalPlan((LightGroup((4, 5), False), LightGroup((6,), False)), ((0,), (1,)), (4.0, 6.0))
     both = combine_plans(PLAN, second, 1.0)
     assert both.cycle_s == 22.0
@@ -78,13 +78,13 @@ def test_two_junctions_keep_their_own_cycles():
     assert left[72, 4] == pytest.approx(2.8, abs=1e-4)
 
 
-def test_a_longer_cycle_is_a_longer_first_green():
+def test_stretching_a_cycle_lengthens_the_first_green():
     longer = PLAN.stretched(30.0)
     assert longer.cycle_s == 30.0
     assert longer.green_s == (13.0, 8.0)
 
 
-def test_between_phases_everybody_has_red():
+def test_all_lights_are_red_between_phases():
     network = SignalisedJunction().build(np.random.default_rng(3))
     plan = network.signals
     times = np.arange(0.0, plan.cycle_s, 0.05)

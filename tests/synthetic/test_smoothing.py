@@ -17,7 +17,7 @@ def braking(steps=40):
     return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) * 0.05)]), speed
 
 
-def test_constant_speed_stays_as_it_is():
+def test_constant_speed_is_unchanged():
     at, speed = np.arange(51) * 1.0, np.full(51, 10.0)
     drive = smoothed(at, speed, 0.0, bounds(50))
     assert drive.excess <= 0.0
@@ -27,7 +27,7 @@ def test_constant_speed_stays_as_it_is():
 
 @pytest.mark.filterwarnings("ignore:delta_grad")
 @pytest.mark.parametrize("high", [np.inf, 20.5])
-def test_it_is_the_solution_of_the_quadratic_programme(high):
+def test_smoothing_solves_the_quadratic_programme(high):
     """The same problem by a general solver (trust-region interior point); acceleration is linear between knots."""
     steps = 21
     at, speed = braking(steps)

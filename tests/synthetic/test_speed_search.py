@@ -21,7 +21,7 @@ def run(occupied, speed, liked=12.0, bound=30.0):
     return search(occupied, np.full(places, liked), np.full(places, bound), speed)
 
 
-def test_nothing_in_the_way_costs_nothing():
+def test_free_path_has_no_cost():
     plan = run(occupancy(), 12.0)
     assert np.allclose(plan.speed, 12.0)
     assert plan.cost == pytest.approx(0.0, abs=1e-3)
@@ -31,7 +31,7 @@ def test_nothing_in_the_way_costs_nothing():
 
 
 @pytest.mark.parametrize("speed", [3.0, 5.2])
-def test_it_is_the_best_of_all_speeds(speed):
+def test_search_finds_the_best_speeds(speed):
     """Brute force over every sequence of accelerations, costs written out again."""
     occupied = occupancy(steps=4 * COARSE, length_m=40.0)
     occupied.hard[:, 18:22] = True
@@ -71,7 +71,7 @@ def _cost(occupied, v, sequence, liked, top):
     return total
 
 
-def test_it_stops_before_a_wall_and_goes_when_it_opens():
+def test_search_stops_before_a_wall_until_it_opens():
     occupied = occupancy(steps=80)
     occupied.hard[:50, 60:64] = True  # at 30 m until 5 s
     plan = run(occupied, 12.0)
@@ -83,7 +83,7 @@ def test_it_stops_before_a_wall_and_goes_when_it_opens():
 
 
 @pytest.mark.parametrize(("wall_m", "possible"), [(18.0, True), (10.0, False)])
-def test_the_limit_of_braking(wall_m, possible):
+def test_braking_limit(wall_m, possible):
     """From 12 m/s a stop takes 12 m with 6 m/s2, and 14.4 m with 5 m/s2."""
     occupied = occupancy()
     occupied.hard[:, int(wall_m / 0.5) :] = True
@@ -103,7 +103,7 @@ def test_bends_bound_the_speed():
     assert speed[at > 41.0].max() <= 6.2
 
 
-def test_a_standing_ego_can_start():
+def test_standing_ego_can_start():
     plan = run(occupancy(), 0.0)
     assert plan.speed[0] == 0.0
     assert np.diff(plan.speed)[:4].min() > 0.0

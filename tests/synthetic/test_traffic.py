@@ -44,7 +44,7 @@ def run(network, table, at, speed, seconds, overrides=()):
     return traffic_scenes.run(network, ways, table, at, speed, seconds, Staging(overrides=overrides))
 
 
-def test_the_speed_profile_is_the_slowest_that_is_needed():
+def test_speed_profile_by_hand():
     network = CurvedRoad().build(np.random.default_rng(3))
     path = lane_path(network, random_lanes(network, 0, np.random.default_rng(0)), Sway())
     got = speed_profile(path, 0.9, 2.0, 1.4)
@@ -55,7 +55,7 @@ def test_the_speed_profile_is_the_slowest_that_is_needed():
     assert got.min() < top.max()
 
 
-def test_a_free_driver_reaches_and_holds_the_preferred_speed():
+def test_free_driver_reaches_and_holds_the_preferred_speed():
     motion = run(line_with_light(), drivers(1, speed_factor=0.9), [10.0], [5.0], 20.0)
     assert motion.speed[0, -1] == pytest.approx(0.9 * 15.0, rel=0.02)
     assert motion.speed[0].max() <= 0.9 * 15.0 + 0.05
@@ -76,7 +76,7 @@ def test_all_vehicles_stop_behind_the_line_at_red(speed, seed):
     assert motion.acceleration.min() > -4.5
 
 
-def test_green_is_driven_through_and_red_is_left_when_it_turns_green():
+def test_vehicles_pass_green_and_start_when_red_turns_green():
     through = run(line_with_light(light(30.0)), drivers(1), [150.0], [12.0], 10.0)
     assert through.distance_m[0, -1] > 230.0
     table = drivers(1)
@@ -87,7 +87,7 @@ def test_green_is_driven_through_and_red_is_left_when_it_turns_green():
 
 
 @pytest.mark.parametrize("at", range(120, 196, 5))
-def test_yellow_is_stopped_for_or_passed_but_red_never_run(at):
+def test_yellow_never_leads_to_running_red(at):
     table = drivers(1, seed=at)
     motion = run(line_with_light(light(1.0)), table, [float(at)], [13.0], 15.0)
     front = motion.distance_m[0] + table.size_m[0, 0] / 2
@@ -147,7 +147,7 @@ def test_vehicles_leave_at_the_end_of_the_map():
     assert np.all(np.diff(motion.valid[0].astype(int)) <= 0)
 
 
-def test_a_platoon_settles_at_the_gap_of_the_closed_form():
+def test_platoon_reaches_the_equilibrium_gap():
     # In equilibrium 1 - (v / v0)^4 = ((s0 + v T) / s)^2 (Treiber, Hennecke and Helbing 2000).
     network, _ = road(3000.0)
     table = drivers(4, 3, speed_factor=0.9)
@@ -196,7 +196,7 @@ def test_cyclists_are_followed_on_narrow_lanes_and_passed_on_wide_ones():
         assert motion.kind.tolist() == [AgentKind.VEHICLE, AgentKind.CYCLIST]
 
 
-def test_a_planned_ego_is_where_its_plan_says_and_others_react():
+def test_planned_ego_follows_its_plan_and_others_react():
     network, _ = road(1000.0)
     table = drivers(2, speed_factor=0.8)
     first, steps = 20, 100
@@ -215,7 +215,7 @@ def test_a_planned_ego_is_where_its_plan_says_and_others_react():
     assert gap.min() > 0.5 and motion.speed[1, -1] < 0.5
 
 
-def test_walkers_on_a_crossing_stop_the_cars():
+def test_cars_stop_for_walkers_on_a_crossing():
     network, _ = road(400.0)
     axis = np.array([[200.0, -2.5], [200.0, 2.5]])
     network = RoadNetwork("test", network.lanes, (), crossings=(Crossing(axis, 3.0, ((0, 200.0),)),))
@@ -232,7 +232,7 @@ def test_walkers_on_a_crossing_stop_the_cars():
     assert motion.xy[0, -1, 0] > 230.0 and motion.acceleration.min() > -5.0
 
 
-def test_the_order_of_users_and_the_same_run_twice():
+def test_order_of_users_and_repeated_runs():
     network, _ = road(400.0)
     steps = 50
     stands = Scripted.standing(AgentKind.VEHICLE, (4.5, 1.8, 1.5), Pose(50.0, -6.0, 0.0), steps)

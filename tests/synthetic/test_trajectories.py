@@ -26,7 +26,7 @@ def bend():
     "shift", [Shift(), Shift(3.0, 5.0, 25.0, 40.0, 60.0), Shift(-1.0, 0.0, 12.0, 30.0, 50.0)]
 )
 @pytest.mark.parametrize("pose", [Pose(30.0, 0.0, 0.0), Pose(31.3, 0.8, 0.06), Pose(29.0, -1.1, -0.1)])
-def test_a_candidate_begins_at_ego_and_its_heading_is_its_tangent(shift, pose):
+def test_candidate_starts_at_ego_with_tangent_headings(shift, pose):
     roles, _ = scene(road(turn=bend()), 8.0)
     way = shifted_path(roles.paths[0], roles.drivers, pose, (30.0, 110.0), shift)
     assert np.hypot(*(way.xy[0] - [pose.x, pose.y])) < 0.03
@@ -38,7 +38,7 @@ def test_a_candidate_begins_at_ego_and_its_heading_is_its_tangent(shift, pose):
     assert np.abs((turned + np.pi) % (2 * np.pi) - np.pi).max() < 0.01
 
 
-def test_a_shifted_candidate_has_its_offset_and_returns():
+def test_shifted_candidate_has_its_offset_and_returns():
     roles, _ = scene(road(turn=bend()), 8.0)
     shift = Shift(3.0, 5.0, 25.0, 40.0, 60.0)
     way = shifted_path(roles.paths[0], roles.drivers, Pose(30.0, 0.0, 0.0), (30.0, 110.0), shift)

@@ -86,7 +86,7 @@ def test_touching_agrees_with_clipped_polygons():
     assert 0 < (got < 3).sum() < 12 * 11
 
 
-def test_a_box_that_cuts_the_kerb_leaves_the_road():
+def test_box_across_the_kerb_leaves_the_road():
     roles, motion = scene(road(), 12.0)
     box = user_boxes(motion)[0]
     assert not leaves_road(roles.network, box)
@@ -98,7 +98,7 @@ def test_a_box_that_cuts_the_kerb_leaves_the_road():
         assert leaves_road(roles.network, moved) == out
 
 
-def test_a_line_is_passed_once_and_only_in_its_direction():
+def test_lines_are_passed_once_in_their_direction():
     lane = crossed(100.0, Control.SIGNAL).lanes[1]
     front = np.stack([np.arange(95.0, 105.0), np.zeros(10)], axis=-1)
     forward, back = np.zeros(10), np.full(10, np.pi)
@@ -107,7 +107,7 @@ def test_a_line_is_passed_once_and_only_in_its_direction():
     assert not passes(lane, front + np.array([0.0, 3.0]), forward).any()
 
 
-def test_running_red_means_red_before_and_after():
+def test_running_red_requires_red_before_and_after():
     network = SignalisedJunction().build(np.random.default_rng(0), GRID)
     first = network.starts[0].lane
     way = network.lanes[first].successors[0]
@@ -197,7 +197,7 @@ def test_wrong_way_is_more_than_two_metres_in_a_second():
         assert goes_against_traffic(network, xy, heading) == wrong
 
 
-def test_lights_of_one_lane_do_not_hold_for_another():
+def test_lights_apply_to_their_own_lane():
     network = replace(
         crossed(100.0, Control.SIGNAL),
         signals=SignalPlan((LightGroup((1,), False),), ((0,),), (5.0,), offset_s=-40.0),
@@ -211,7 +211,7 @@ def test_lights_of_one_lane_do_not_hold_for_another():
 @pytest.mark.parametrize(
     ("aside_m", "counts"), [(0.0, False), (1.8, False), (2.5, True), (WIDTH, True), (6.0, False)]
 )
-def test_the_light_of_another_lane_counts_off_the_route(aside_m, counts):
+def test_lights_of_other_lanes_apply_off_the_route(aside_m, counts):
     # Two lanes side by side, lights only for the left one; ego goes along the right one, or aside of it.
     one = crossed(100.0, Control.SIGNAL).lanes
     beside = [

@@ -44,7 +44,7 @@ def fields_of(recording):
     return [recording.scenario_id, tracks, lights, features, recording.route_lanes, recording.events]
 
 
-def test_a_seed_and_an_index_are_a_recording():
+def test_seed_and_index_determine_a_recording():
     again = generate_recording(SEED, 1, EXACT)
     assert fields_of(again) == fields_of(drawn(1).recording)
     assert fields_of(generate_recording(4, 1, EXACT)) != fields_of(again)
@@ -68,7 +68,7 @@ def test_no_users_overlap(index):
 
 
 @pytest.mark.parametrize("index", range(COUNT))
-def test_the_expert_stays_on_the_road(index):
+def test_expert_stays_on_the_road(index):
     recording = drawn(index).recording
     tracks = recording.tracks
     rings = [f.points[:-1, :2] for f in recording.features if f.kind in EDGE_KINDS]
@@ -114,7 +114,7 @@ def test_motion_is_that_of_a_bicycle_at_the_box_centre(index):
         assert np.all(turned <= 0.3 * np.maximum(d, 0.0) + 1e-3)
 
 
-def test_the_expert_drives_gently_and_makes_way():
+def test_expert_is_comfortable_and_yields():
     hardest, turning, moved = [], [], []
     for index in range(COUNT):
         tracks = drawn(index).recording.tracks
@@ -130,8 +130,8 @@ def test_the_expert_drives_gently_and_makes_way():
     assert np.median(moved) > 40.0
 
 
-def test_driving_on_as_before_is_not_enough():
-    """Constant speed and heading leaves the road or meets somebody in three of ten scenarios, lights left out."""
+def test_constant_velocity_fails_often():
+    """Constant velocity leaves the road or collides in three of ten scenarios, lights ignored."""
     failed = 0
     for index in range(COUNT):
         recording = drawn(index).recording
@@ -199,7 +199,7 @@ def test_rare_scenarios_have_one_labelled_event():
 
 
 @pytest.mark.slow
-def test_the_domain_decides_about_roads():
+def test_domains_determine_roads():
     ring = dataclasses.replace(EXACT, domain="ring")
     widths = {
         config.domain: np.mean(
@@ -217,7 +217,7 @@ def test_negative_seeds_are_refused():
         generate_recording(-1, 0)
 
 
-def test_the_world_needs_no_jax():
+def test_world_needs_no_jax():
     code = (
         "import sys, drivax.synthetic.generate as g;"
         "g.generate_one(0, 0, g.WorldConfig()); print('jax' in sys.modules)"
@@ -226,8 +226,8 @@ def test_the_world_needs_no_jax():
     assert result.stdout.strip() == "False"
 
 
-def test_the_others_are_recorded_with_errors_and_ego_and_the_mask_are_exact():
-    """Noise moves nobody by more than decimetres and changes neither ego, nor who is there, nor what is seen."""
+def test_noise_changes_other_agents_only():
+    """Noise moves other agents by decimetres at most, and changes neither ego nor validity nor visibility."""
     exact, noisy = drawn(1).recording, generate_recording(SEED, 1)
     assert np.array_equal(exact.tracks.valid, noisy.tracks.valid) and np.array_equal(exact.seen, noisy.seen)
     assert np.array_equal(exact.tracks.xy[0], noisy.tracks.xy[0])
@@ -263,7 +263,7 @@ def test_invalid_settings_are_refused(settings, message):
 
 
 @pytest.mark.slow
-def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
+def test_another_kind_replaces_an_event_that_cannot_be_staged(monkeypatch):
     tried = []
 
     def refused(kind, scene, severity, rng):
@@ -279,7 +279,7 @@ def test_a_kind_that_finds_no_occasion_gives_way_to_another(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_recording_that_begins_at_a_critical_moment_is_that_part_of_the_traffic(monkeypatch):
+def test_critical_recording_is_a_window_of_the_traffic(monkeypatch):
     """Lights, poses and the begin are those of the traffic from the step on that was found critical."""
     kept = {}
 

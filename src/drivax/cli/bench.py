@@ -109,7 +109,7 @@ def _encoders(result: dict[str, Any]) -> str:
         f"  {'encoder':<30} {'computes in':<11} {'parameters':>10} {'width':>5}{heads} {'backward':>10}",
     ]
     for row in result["rows"]:
-        times = "".join(f" {one:10.1f}" for one in (*row["forward_us"].values(), row["gradient_us"]))
+        times = "".join(f" {time_us:10.1f}" for time_us in (*row["forward_us"].values(), row["gradient_us"]))
         lines.append(
             f"  {row['encoder']:<30} {row['dtype']:<11} {row['parameters']:>10,} {row['width']:>5}{times}"
         )

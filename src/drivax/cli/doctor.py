@@ -58,9 +58,9 @@ def run(args: Doctor) -> int:
     if args.path is None:
         console.print(_table(machine()))
         return 0
-    found = diagnose(args.path)
-    console.print(_table(findings(found)))
-    return 0 if found.convertible else 1
+    diagnosis = diagnose(args.path)
+    console.print(_table(findings(diagnosis)))
+    return 0 if diagnosis.convertible else 1
 
 
 def machine() -> Iterator[tuple[str, str]]:
@@ -93,43 +93,43 @@ def devices(timeout_s: float = 60.0) -> str:
             [sys.executable, "-c", _ASK_JAX], capture_output=True, text=True, timeout=timeout_s, check=False
         )
         if done.returncode == 0:
-            found = json.loads(done.stdout.splitlines()[-1])
-            return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in found)
+            kinds = json.loads(done.stdout.splitlines()[-1])
+            return ", ".join(kind if kind == platform else f"{platform}: {kind}" for platform, kind in kinds)
     except (subprocess.TimeoutExpired, ValueError, IndexError):
         return f"JAX does not answer (within {timeout_s:.0f} s); check the driver, or set JAX_PLATFORMS=cpu"
     last = (done.stderr.strip() or "no message").splitlines()[-1]
     return f"JAX does not start: {last}"
 
 
-def findings(found: Diagnosis) -> Iterator[tuple[str, str]]:
+def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     """A diagnosis as (name, value)."""
-    yield "path", str(found.path)
-    for part in found.parts:
-        yield from _described(part, found.files[part.format])
-    yield from (("shards", sentence) for sentence in found.shards)
-    if found.parts:
+    yield "path", str(diagnosis.path)
+    for part in diagnosis.parts:
+        yield from _described(part, diagnosis.files[part.format])
+    yield from (("shards", sentence) for sentence in diagnosis.shards)
+    if diagnosis.parts:
         others = []
-        if found.companions:
-            others.append(f"{found.companions:,} read along (maps, poses, tables)")
-        if found.ignored:
-            others.append(f"{found.ignored:,} of no known format, ignored")
+        if diagnosis.companions:
+            others.append(f"{diagnosis.companions:,} read along (maps, poses, tables)")
+        if diagnosis.ignored:
+            others.append(f"{diagnosis.ignored:,} of no known format, ignored")
         if others:
             yield "other files", ", ".join(others)
-        yield "input", gigabytes(found.input_bytes)
-    for problem in found.problems:
+        yield "input", gigabytes(diagnosis.input_bytes)
+    for problem in diagnosis.problems:
         # The path stands above; a file inside it is named.
-        file = None if problem.file == found.path else problem.file
+        file = None if problem.file == diagnosis.path else problem.file
         place = f"{file}: " if file is not None else ""
         yield "problem", f"{place}{problem.problem}"
         if problem.cure:
             yield "instead", problem.cure
-    if found.convertible:
+    if diagnosis.convertible:
         yield (
             "after convert",
-            f"about {counted(found.scenarios, 'scenario')}, {gigabytes(found.set_bytes)}"
-            f" ({gigabytes(found.free_bytes)} free)",
+            f"about {counted(diagnosis.scenarios, 'scenario')}, {gigabytes(diagnosis.set_bytes)}"
+            f" ({gigabytes(diagnosis.free_bytes)} free)",
         )
-        yield "next", f"drivax convert {found.path} OUT"
+        yield "next", f"drivax convert {diagnosis.path} OUT"
     else:
         yield "verdict", "cannot be converted"
 

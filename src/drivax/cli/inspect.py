@@ -72,9 +72,9 @@ def run(args: Inspect) -> int:
     if args.observations:
         _observe(args, opened[0])
     elif args.json:
-        found = [{"scenarios": [described(entry) for entry in one.entries]} for one in opened]
-        named = [{"set": str(path), **one} for path, one in zip(args.sets, found, strict=True)]
-        json.dump(found[0] if len(found) == 1 else named, sys.stdout, indent=1)
+        sets = [{"scenarios": [described(entry) for entry in inspection.entries]} for inspection in opened]
+        named = [{"set": str(path), **content} for path, content in zip(args.sets, sets, strict=True)]
+        json.dump(sets[0] if len(sets) == 1 else named, sys.stdout, indent=1)
         print()
     elif args.html is not None:
         from drivax.report.pages.inspection import write_histograms
@@ -95,15 +95,15 @@ def _print(opened: list[Inspection]) -> None:
             console.print(table.rich())
             console.print()
         return
-    (one,) = opened
-    console.print(tables.overview(one).rich())
+    (inspection,) = opened
+    console.print(tables.overview(inspection).rich())
     console.print()
-    audit = tables.audit_table(one)
+    audit = tables.audit_table(inspection)
     console.print("audit: not done" if audit is None else audit.rich())
     console.print()
-    console.print(tables.listing(one).rich())
-    if len(one) > tables.LISTED:
-        console.print(f"{len(one) - tables.LISTED:,} more; --json lists all")
+    console.print(tables.listing(inspection).rich())
+    if len(inspection) > tables.LISTED:
+        console.print(f"{len(inspection) - tables.LISTED:,} more; --json lists all")
 
 
 def _console() -> Console:
@@ -149,22 +149,22 @@ def _observe(args: Inspect, inspection: Inspection) -> None:
     if args.planner is None:
         planner = Expert(actions=task.actions)
     traffic = find_traffic(args.traffic or "log")
-    found = observation_statistics(planner, bank, task, permute=not planner.replays, traffic=traffic)
+    statistics = observation_statistics(planner, bank, task, permute=not planner.replays, traffic=traffic)
     if args.json:
-        json.dump(found.as_dict(), sys.stdout, indent=1)
+        json.dump(statistics.as_dict(), sys.stdout, indent=1)
         print()
     else:
-        _print_observations(found)
+        _print_observations(statistics)
     if args.draw is not None:
         title = f"{scenarios[0].id}, step {int(scenarios[0].current_step)}"
         draw_log_observation(task, bank, title).savefig(args.draw)
         print(args.draw, file=sys.stderr if args.json else sys.stdout)
 
 
-def _print_observations(found: ObservationStatistics) -> None:
+def _print_observations(statistics: ObservationStatistics) -> None:
     from drivax.report import inspection_tables as tables
 
     console = _console()
-    console.print(tables.observation_overview(found))
+    console.print(tables.observation_overview(statistics))
     console.print()
-    console.print(tables.observation_table(found).rich())
+    console.print(tables.observation_table(statistics).rich())

@@ -61,8 +61,8 @@ def run(args: Study, overrides: Sequence[str] = ()) -> int:
         anyway=args.anyway,
         log=lambda line: print(line, file=sys.stderr),
     )
-    for one in results["claims"]:
-        needed = f" ({one['needed']})" if one["needed"] else ""
-        print(f"{one['verdict']:<12} {one['claim']['words']}{needed}")
+    for claim in results["claims"]:
+        needed = f" ({claim['needed']})" if claim["needed"] else ""
+        print(f"{claim['verdict']:<12} {claim['claim']['words']}{needed}")
     print(f"{args.out / 'report.html'}")
     return 0

@@ -258,8 +258,8 @@ def _ensemble(request: Request) -> ScoreTable:
 
 
 def _uniform(request: Request) -> ScoreTable:
-    ones = np.ones((len(request.data), request.data.capacity.steps))
-    return make_table("uniform", None, request.data, {"all": ones})
+    scores = np.ones((len(request.data), request.data.capacity.steps))
+    return make_table("uniform", None, request.data, {"all": scores})
 
 
 def _oracle(request: Request) -> ScoreTable:

@@ -267,8 +267,8 @@ class Mixture:
 
     def log_prob(self, choice: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
         """Log of the weighted sum of the parts' densities."""
-        shares, one = jax.nn.log_softmax(self.logits), choice[..., None, :]
-        each = jnp.broadcast_to(one, jnp.broadcast_shapes(one.shape, self.parts.loc.shape))
+        shares, sample = jax.nn.log_softmax(self.logits), choice[..., None, :]
+        each = jnp.broadcast_to(sample, jnp.broadcast_shapes(sample.shape, self.parts.loc.shape))
         return jax.nn.logsumexp(shares + self.parts.log_prob(each), axis=-1)
 
     def action(self, choice: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
@@ -333,7 +333,7 @@ def first_parameters(
     if kind == "gaussian":
         return np.repeat(np.array([0.0, spread], np.float32), actions.size)
     if kind == "mixture":
-        # Parts that begin alike would stay alike; the one around zero begins as the largest.
+        # Equal parts would stay equal; the part around zero starts as the largest.
         means = np.linspace(-scale, scale, _PARTS)
         parts = [np.repeat([mean, spread], actions.size) for mean in means]
         return np.concatenate([(means == 0.0).astype(float), *parts]).astype(np.float32)

@@ -32,7 +32,7 @@ PIECES, RECTANGLES = 12, 3
 _BULGE_M = 0.5
 #: Reach behind the vehicle, m, for vehicles that wait to appear.
 BEHIND_M = 1.0
-#: Look-ahead: a constant, the distance in so many seconds, and the braking distance at 3 m/s2; capped, m.
+#: Look-ahead: a constant, the distance within a time in s, and the braking distance at 3 m/s2; capped, m.
 _LOOK_M, _LOOK_S, _LOOK_MPS2, _LOOK_MOST_M = 20.0, 1.5, 3.0, 120.0
 #: Gap of a free road, m; a number, so that gradients stay finite.
 FREE_M = 1e4

@@ -123,10 +123,10 @@ class Highway(StreetFamily):
         draft.link(*((lane, laid[extra.place, section]) if away < 0 else (laid[extra.place, section], lane)))
         half = street.width_m / 2
         left, right = curve.shifted(half + _RAMP_SHOULDER_M), curve.shifted(-half - street.shoulder_m)
-        nose, beside = _nose(street, extra, left if away > 0 else left.reversed())
+        nose, sample = _nose(street, extra, left if away > 0 else left.reversed())
         last = len(left.xy) - 1
         left = left.piece(nose, last) if away > 0 else left.piece(0, last - nose)
-        return _Ramp(lane, left, right, beside)
+        return _Ramp(lane, left, right, sample)
 
 
 def _bend(length_m: float, radius_m: float, angle: float) -> Float64[np.ndarray, " point"]:

@@ -1,0 +1,14 @@
+from .adversary import endangers_ego as endangers_ego
+from .choosing import SCRIPTS as SCRIPTS
+from .choosing import destinations_for as destinations_for
+from .choosing import draw_severity as draw_severity
+from .choosing import possible as possible
+from .choosing import stage as stage
+from .conflict_start import critical_steps as critical_steps
+from .destinations import Destination as Destination
+from .ego_view import EgoView as EgoView
+from .kinds import SEVERITY_MPS2 as SEVERITY_MPS2
+from .kinds import EventKind as EventKind
+from .kinds import EventScript as EventScript
+from .kinds import Proposal as Proposal
+from .kinds import StagedEvent as StagedEvent
