@@ -19,6 +19,7 @@ from drivax.scenario.store import ScenarioSet
 from drivax.simulator.starts import LogStart, NoisyStart
 from drivax.simulator.traffic.catalogue import make_traffic
 from drivax.simulator.types import Traffic
+from drivax.table import Cell, Column, Table
 from drivax.tasks.task import Task
 from drivax.tracking.progress import Progress
 from drivax.tracking.run_folder import RunFolder, learned_from
@@ -123,32 +124,34 @@ def with_metrics(task: Task, more: tuple[str, ...]) -> Task:
 
 
 def format_summary(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Planners and their headline metrics as a table of at most 100 columns; empty cells where undefined."""
-    width = max(len("planner"), *(len(summary["planner"]) for summary in summaries))
-    lines = ["  ".join([f"{'planner':<{width}}", *(f"{short:>9}" for short in HEADLINE.values())])]
-    for summary in summaries:
-        means = [summary["metrics"][name]["mean"] for name in HEADLINE]
-        cells = [f"{'' if mean is None else f'{mean:.3f}':>9}" for mean in means]
-        lines.append("  ".join([f"{summary['planner']:<{width}}", *cells]))
-    return "\n".join(lines)
+    """Format headline metrics of planners as a table of at most 100 columns; undefined means are empty."""
+    means = [[summary["metrics"][name]["mean"] for name in HEADLINE] for summary in summaries]
+    rows = [
+        (Cell(summary["planner"]), *(Cell("" if mean is None else f"{mean:.3f}") for mean in row))
+        for summary, row in zip(summaries, means, strict=True)
+    ]
+    columns = (Column("planner", label=True), *map(Column, HEADLINE.values()))
+    return Table("summary", columns, tuple(rows)).text()
 
 
 def format_metrics(summary: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    """Metrics of one planner as a table: mean, 95 % interval and n.
+    """Format metrics of one planner as a table: mean, 95 % interval and n.
 
     Args:
         summary: Summary of an evaluation.
         names: Metric sets, metrics and user-defined metrics (``metrics.selection``).
     """
-    metrics = summary["metrics"]
-    rows = {name: metrics[name] for name in select_metrics(names).names if name in metrics}
-    width = max(map(len, ("metric", *rows)))
-    lines = [f"{'metric':<{width}}  {'mean':>9}  {'95 % interval':>20}  {'n':>7}"]
-    for name, row in rows.items():
-        mean, low, high = ("" if row[key] is None else f"{row[key]:.4g}" for key in ("mean", "low", "high"))
-        interval = f"{low} to {high}" if low else ""
-        lines.append(f"{name:<{width}}  {mean:>9}  {interval:>20}  {row['n']:>7,}")
-    return "\n".join(lines)
+    rows = []
+    for name in select_metrics(names).names:
+        if (metric := summary["metrics"].get(name)) is not None:
+            mean, low, high = (
+                "" if metric[key] is None else f"{metric[key]:.4g}" for key in ("mean", "low", "high")
+            )
+            rows.append(
+                (Cell(name), Cell(mean), Cell(f"{low} to {high}" if low else ""), Cell(f"{metric['n']:,}"))
+            )
+    columns = (Column("metric", label=True), *map(Column, ("mean", "95 % interval", "n")))
+    return Table("metrics", columns, tuple(rows)).text()
 
 
 def format_crashes(table: EpisodeTable) -> str:

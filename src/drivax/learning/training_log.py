@@ -22,7 +22,7 @@ from drivax.simulator.types import Traffic
 from drivax.tasks.task import Task
 from drivax.tracking.checkpoints import Checkpoints
 from drivax.tracking.run_folder import RunFolder
-from drivax.tracking.sinks import MetricLog, read_rows
+from drivax.tracking.sinks import MetricLog
 
 #: ``score``: the V-Max score. ``lexicographic``: fewest failures, then progress, then comfort. ``fitted_q``: the return
 #: that fitted-Q evaluation expects of the policy on held-out steps.
@@ -178,7 +178,7 @@ class TrainingLog:
 
     def _read_ranks(self, step: int) -> None:
         """Read the ranks of the validations up to a step."""
-        rows = [row for row in read_rows(self.folder.metrics) if row["step"] <= step]
+        rows = [row for row in self.folder.read_metrics() if row["step"] <= step]
         ranks = [rank(self._rule, row) for row in rows]
         self._ranks = [values for values in ranks if values is not None]
 

@@ -17,7 +17,6 @@ from drivax.evaluation.pairing import comparable
 from drivax.evaluation.traffic_trajectories import unpacked
 from drivax.report.charts.motion import COMMANDED
 from drivax.report.pictures.drawing import Rollout
-from drivax.report.runs import Evaluation
 from drivax.scenario.schema import Scenario
 from drivax.scenario.store import ScenarioSet
 
@@ -67,7 +66,7 @@ def outcome(run: EpisodeTable, row: int) -> str:
     return "success" if defined else "unjudged"
 
 
-def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]:
+def worst_first(run: EpisodeTable, others: Sequence[EpisodeTable] = ()) -> list[int]:
     """Return the rows of a run, worst episode first: by failure, then by score.
 
     Among equals those come first that more of the other runs completed without failure, then by scenario id.
@@ -89,7 +88,7 @@ def worst_first(run: Evaluation, others: Sequence[Evaluation] = ()) -> list[int]
     return sorted(range(len(run)), key=key)
 
 
-def choose(runs: Sequence[Evaluation], count: int) -> list[EpisodeGroup]:
+def choose(runs: Sequence[EpisodeTable], count: int) -> list[EpisodeGroup]:
     """Return episodes of the last run: failures of every kind in turn, worst score first, and some successes.
 
     Among equal failures those come first that another planner completed; among successes those where others failed.
@@ -111,13 +110,13 @@ def _in_turn(kinds: list[list[EpisodeGroup]]) -> list[EpisodeGroup]:
     return [groups[place] for place in range(longest) for groups in kinds if place < len(groups)]
 
 
-def _completed(runs: Sequence[Evaluation], group: EpisodeGroup) -> int:
+def _completed(runs: Sequence[EpisodeTable], group: EpisodeGroup) -> int:
     """Return the number of runs without a failure."""
     rows = zip(runs, group.rows, strict=True)
     return sum(outcome(run, row) == "success" for run, row in rows if row is not None)
 
 
-def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
+def ranked(runs: Sequence[EpisodeTable]) -> list[EpisodeGroup]:
     """Return all scenarios of the last run with a stored trajectory, worst first."""
     policy = runs[-1]
     others = [_first_rows(run) if comparable(policy, run) else {} for run in runs[:-1]]
@@ -128,7 +127,7 @@ def ranked(runs: Sequence[Evaluation]) -> list[EpisodeGroup]:
     return [groups[row] for row in worst_first(policy, runs[:-1]) if row in groups]
 
 
-def _first_rows(run: Evaluation) -> dict[ScenarioKey, int]:
+def _first_rows(run: EpisodeTable) -> dict[ScenarioKey, int]:
     """Return the first episode of each scenario."""
     rows: dict[ScenarioKey, int] = {}
     for row, key in enumerate(run.scenarios):
@@ -152,7 +151,7 @@ class EvaluatedSet:
         DataError: The set is missing, or has another hash.
     """
 
-    def __init__(self, run: Evaluation, data: Path | None = None) -> None:
+    def __init__(self, run: EpisodeTable, data: Path | None = None) -> None:
         self.scenarios: ScenarioSet = run.open_set(data)
         self._rows = {
             (entry["dataset"], entry["scenario_id"]): row for row, entry in enumerate(self.scenarios.entries)
@@ -179,13 +178,13 @@ class EvaluatedSet:
         return {key: self.scenarios.entries[row]["tags"] for key, row in self._rows.items()}
 
 
-def rollouts_of(runs: Sequence[Evaluation], group: EpisodeGroup, scenario: Scenario) -> list[Rollout]:
+def rollouts_of(runs: Sequence[EpisodeTable], group: EpisodeGroup, scenario: Scenario) -> list[Rollout]:
     """Return the rollout of each run that has an episode in the group."""
     rows = zip(runs, group.rows, strict=True)
     return [_rollout(run, row, scenario) for run, row in rows if row is not None]
 
 
-def _rollout(run: Evaluation, row: int, scenario: Scenario) -> Rollout:
+def _rollout(run: EpisodeTable, row: int, scenario: Scenario) -> Rollout:
     stored = run.trajectories
     steps, start = int(scenario.steps), int(stored.start[row])
     ego = np.full((steps, 4), np.nan)

@@ -16,19 +16,11 @@ from drivax.evaluation.episode_table import EpisodeTable
 from drivax.tracking.run_folder import RunFolder, seed_folders
 
 Array = np.ndarray[Any, Any]
-Evaluation = EpisodeTable
 
 
 @dataclass(frozen=True)
 class Training:
-    """The log of one training run.
-
-    Attributes:
-        folder: The run folder.
-        name: The run's name in charts.
-        info: ``run.json``.
-        curves: Quantity -> points (environment steps, value).
-    """
+    """Learning curves of one training run: points (environment steps, value) by quantity; ``info`` is ``run.json``."""
 
     folder: Path
     name: str
@@ -36,15 +28,8 @@ class Training:
     curves: Mapping[str, Float[Array, "point 2"]]
 
 
-def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]]:
-    """Read run folders of either kind; repeated names get the folder's name as a suffix.
-
-    A folder with one run per seed stands for all of them.
-
-    Raises:
-        DataError: A folder or file is missing or damaged, or is no run.
-        UsageError: No folder was given, or one was given twice.
-    """
+def read_runs(folders: Sequence[Path]) -> tuple[list[EpisodeTable], list[Training]]:
+    """Read run folders of either kind, every seed of a run with several; a repeated name gets its folder as suffix."""
     folders = [inside for folder in folders for inside in seed_folders(folder)]
     resolved = [folder.resolve() for folder in folders]
     if not folders or len(set(resolved)) < len(resolved):
@@ -71,7 +56,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[Training]
     return evaluations, trainings
 
 
-def read_evaluations(folders: Sequence[Path]) -> list[Evaluation]:
+def read_evaluations(folders: Sequence[Path]) -> list[EpisodeTable]:
     """Read run folders, at least one of them an evaluation; see :func:`read_runs`."""
     evaluations, _ = read_runs(folders)
     if not evaluations:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from drivax.errors import UsageError, did_you_mean
-from drivax.evaluation.episode_table import ADDED, ScenarioKey
+from drivax.evaluation.episode_table import ADDED, EpisodeTable, ScenarioKey
 from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import (
     STRATA,
@@ -24,7 +24,7 @@ from drivax.evaluation.tables import (
 from drivax.files import check_output, write_text
 from drivax.metrics.catalogue import METRICS, SETS
 from drivax.report.episodes import EvaluatedSet
-from drivax.report.runs import Evaluation, read_evaluations
+from drivax.report.runs import read_evaluations
 from drivax.table import Table
 
 #: Columns of a breakdown: what tells planners apart, few enough for a page.
@@ -71,7 +71,7 @@ def write_tables(
     return [out / name for name in texts]
 
 
-def exported_metrics(runs: Sequence[Evaluation], more: Sequence[str] = ()) -> list[str]:
+def exported_metrics(runs: Sequence[EpisodeTable], more: Sequence[str] = ()) -> list[str]:
     """Return the metrics of the files: the headline, progress in metres, the user's own, and ``more``.
 
     Raises:
@@ -88,7 +88,7 @@ def exported_metrics(runs: Sequence[Evaluation], more: Sequence[str] = ()) -> li
     return [*first, *(name for name in rest if name not in first)] or names
 
 
-def _tables(runs: Sequence[Evaluation], data: Path | None, more: Sequence[str]) -> list[Table]:
+def _tables(runs: Sequence[EpisodeTable], data: Path | None, more: Sequence[str]) -> list[Table]:
     usual, metrics = exported_metrics(runs), exported_metrics(runs, more)
     tables = [results_table(runs, metrics)]
     if len(runs) > 1:
@@ -101,7 +101,7 @@ def _tables(runs: Sequence[Evaluation], data: Path | None, more: Sequence[str]) 
     return tables + transfer_tables(runs)
 
 
-def strata_tables(runs: Sequence[Evaluation], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
+def strata_tables(runs: Sequence[EpisodeTable], tags: Tags, more: Sequence[str] = ()) -> list[Table]:
     """Return a table for each tag of the scenarios, over the runs on these scenarios; with ``more`` metrics."""
     evaluated = [run for run in runs if any(key in tags for key in run.scenarios)]
     known = {name for values in tags.values() for name in values}
@@ -110,7 +110,7 @@ def strata_tables(runs: Sequence[Evaluation], tags: Tags, more: Sequence[str] = 
     return [strata_table(evaluated, tags, tag, metrics) for tag in STRATA if tag in known]
 
 
-def transfer_tables(runs: Sequence[Evaluation]) -> list[Table]:
+def transfer_tables(runs: Sequence[EpisodeTable]) -> list[Table]:
     """Return a matrix of training and evaluation data for each metric; none where all runs share one set."""
     if len({set_key(run.data) for run in runs}) < 2:
         return []

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.evaluation.tables import metric_label
 from drivax.report.charts.curves import Axes, chart, compact, series_legend, ticks
 from drivax.report.pictures.palette import Stroke, stroke
-from drivax.report.runs import Evaluation
 
 Values = Float[np.ndarray[Any, Any], "_"]
 #: Metrics with a chart, in order.
@@ -27,7 +27,7 @@ _LEVELS = 75
 BINS = 24
 
 
-def distribution_charts(runs: Sequence[Evaluation]) -> str:
+def distribution_charts(runs: Sequence[EpisodeTable]) -> str:
     """Return a chart for each metric of :data:`SPREAD` that differs between episodes; empty without any."""
     styles = {run.name: stroke(place) for place, run in enumerate(runs)}
     charts = []

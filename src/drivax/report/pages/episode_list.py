@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from drivax.evaluation.episode_table import RATES, ScenarioKey
+from drivax.evaluation.episode_table import RATES, EpisodeTable, ScenarioKey
 from drivax.evaluation.pairing import comparable
 from drivax.evaluation.tables import CODES, UNKNOWN, metric_label, metric_names, ordered
 from drivax.report.episodes import outcome, worst_first
 from drivax.report.pages.page import data_element
-from drivax.report.runs import Evaluation
 from drivax.report.table_files import Tags
 
 #: Tags with more values than this (ids, places) are not offered as a choice.
@@ -38,7 +37,7 @@ EPISODE_LIST = """<form class=filters id=filters onsubmit="return false">
 </tr></thead><tbody id=rows></tbody></table></div><button type=button id=more hidden>more</button>"""
 
 
-def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
+def episode_data(runs: Sequence[EpisodeTable], tags: Tags, played: Mapping[ScenarioKey, int]) -> str:
     """Return the data of the list as a script element.
 
     ``metrics`` says how each is shown and which value of a rate is a failure; ``runs[].values`` holds one column per
@@ -68,14 +67,14 @@ def episode_data(runs: Sequence[Evaluation], tags: Tags, played: Mapping[Scenari
     )
 
 
-def _metric(name: str, runs: Sequence[Evaluation]) -> dict[str, Any]:
+def _metric(name: str, runs: Sequence[EpisodeTable]) -> dict[str, Any]:
     label = metric_label(name, runs)
     bad = {"high": 0, "low": 1, "-": None}[label.better] if name in RATES else None
     return {"name": name, "label": label.text, "better": label.better, "unit": label.unit, "bad": bad}
 
 
 def _run(
-    run: Evaluation, runs: Sequence[Evaluation], names: Sequence[str], place: Mapping[ScenarioKey, int]
+    run: EpisodeTable, runs: Sequence[EpisodeTable], names: Sequence[str], place: Mapping[ScenarioKey, int]
 ) -> dict[str, Any]:
     rows = worst_first(run, [other for other in runs if other is not run])
     outcomes = [outcome(run, row) for row in rows]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError
-from drivax.evaluation.episode_table import ScenarioKey
+from drivax.evaluation.episode_table import EpisodeTable, ScenarioKey
 from drivax.evaluation.pairing import comparable, mismatch
 from drivax.evaluation.tables import (
     COLLISION_KINDS,
@@ -33,7 +33,7 @@ from drivax.report.episodes import EpisodeGroup, EvaluatedSet, choose, rollouts_
 from drivax.report.pages.episode_list import EPISODE_LIST, episode_data
 from drivax.report.pages.page import asset, facts_html, page, player_data, player_html, player_scripts
 from drivax.report.pictures.player_data import pack_episode
-from drivax.report.runs import Evaluation, Training, read_runs
+from drivax.report.runs import Training, read_runs
 from drivax.report.table_files import Tags, strata_tables, transfer_tables
 from drivax.table import bounds, number, suffix
 
@@ -74,7 +74,7 @@ def write_report(
     return out
 
 
-def _from_set(runs: Sequence[Evaluation], data: Path | None, count: int) -> tuple[Packed, Tags]:
+def _from_set(runs: Sequence[EpisodeTable], data: Path | None, count: int) -> tuple[Packed, Tags]:
     """Return the selected episodes with their data for the player, and the tags of all scenarios."""
     scenarios = EvaluatedSet(runs[-1], data)
     packed = []
@@ -85,7 +85,7 @@ def _from_set(runs: Sequence[Evaluation], data: Path | None, count: int) -> tupl
     return packed, scenarios.tags()
 
 
-def _page(runs: Sequence[Evaluation], trainings: Sequence[Training], packed: Packed, tags: Tags) -> str:
+def _page(runs: Sequence[EpisodeTable], trainings: Sequence[Training], packed: Packed, tags: Tags) -> str:
     sections, data, scripts = [], [], []
     if runs:
         sections = [
@@ -105,7 +105,7 @@ def _page(runs: Sequence[Evaluation], trainings: Sequence[Training], packed: Pac
     return page(title, _lead(runs), sections, data=data, scripts=scripts)
 
 
-def _lead(runs: Sequence[Evaluation]) -> str:
+def _lead(runs: Sequence[EpisodeTable]) -> str:
     if not runs:
         return "<p class=lead>Training runs only; evaluate a policy to see how it drives.</p>"
     policy = runs[-1]
@@ -122,7 +122,7 @@ def _lead(runs: Sequence[Evaluation]) -> str:
     return f"<p class=lead><b>{name}</b>: {len(policy)} episodes of {where}.</p>"
 
 
-def _results(runs: Sequence[Evaluation]) -> str:
+def _results(runs: Sequence[EpisodeTable]) -> str:
     names = metric_names(runs)
     first = _first(runs, names)
     rest = [name for name in ordered(names) if name not in first]
@@ -141,13 +141,13 @@ def _results(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def _first(runs: Sequence[Evaluation], names: Sequence[str]) -> list[str]:
+def _first(runs: Sequence[EpisodeTable], names: Sequence[str]) -> list[str]:
     """Return the metrics of the first table: the headline, after crashes where there were any."""
     crashed = any((run.metrics.get("crashed", np.zeros(1)) > 0).any() for run in runs)
     return [*(["crashed"] if crashed and "crashed" in names else []), *headline(names)]
 
 
-def _warning(runs: Sequence[Evaluation]) -> str:
+def _warning(runs: Sequence[EpisodeTable]) -> str:
     """Return which rows cannot be compared with the policy's, and why; empty where all can."""
     policy = runs[-1]
     reasons = []
@@ -162,7 +162,7 @@ def _warning(runs: Sequence[Evaluation]) -> str:
     return f"<p><b>Not all rows are comparable:</b> {words}.</p>" if words else ""
 
 
-def _differences(runs: Sequence[Evaluation]) -> str:
+def _differences(runs: Sequence[EpisodeTable]) -> str:
     policy, others = runs[-1], runs[:-1]
     names = _first(runs, list(policy.metrics)) or ordered(list(policy.metrics))
     if not others or not names:
@@ -177,7 +177,7 @@ def _differences(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def _transfer(runs: Sequence[Evaluation]) -> str:
+def _transfer(runs: Sequence[EpisodeTable]) -> str:
     """Return the results by training and evaluation data; empty where all runs share one set."""
     tables = "".join(
         f"<h3>{escape(metric_label(table.name.removeprefix('transfer-'), runs).text)}</h3>{table.html()}"
@@ -192,7 +192,7 @@ def _transfer(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def _collisions(runs: Sequence[Evaluation]) -> str:
+def _collisions(runs: Sequence[EpisodeTable]) -> str:
     """Return the kinds of the first collision with their meanings; empty without collisions of a known kind."""
     table = collisions_table(runs)
     if not any(cell.interval and cell.interval.mean for row in table.rows for cell in row):
@@ -212,7 +212,7 @@ def _collisions(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def _strata(runs: Sequence[Evaluation], tags: Tags) -> str:
+def _strata(runs: Sequence[EpisodeTable], tags: Tags) -> str:
     """Return the results by kind of scenario; empty without tags."""
     tables = "".join(
         f"<details{'' if place else ' open'}><summary>{escape(table.name.replace('-', ' '))}</summary>"
@@ -227,7 +227,7 @@ def _strata(runs: Sequence[Evaluation], tags: Tags) -> str:
     )
 
 
-def _distributions(runs: Sequence[Evaluation]) -> str:
+def _distributions(runs: Sequence[EpisodeTable]) -> str:
     charts = distribution_charts(runs)
     return (
         f"<section><h2>Distributions</h2>{charts}<p><small>The height of a line at a value is the share of episodes at "
@@ -237,7 +237,7 @@ def _distributions(runs: Sequence[Evaluation]) -> str:
     )
 
 
-def _episodes(runs: Sequence[Evaluation], packed: Packed) -> str:
+def _episodes(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     note = "▶ marks those that play below." if packed else "Rollouts and tags were left out of this page."
     return (
         f"<section id=episodes><h2>Episodes</h2><p>All episodes, worst first: the gravest kind of failure, then the "
@@ -246,7 +246,7 @@ def _episodes(runs: Sequence[Evaluation], packed: Packed) -> str:
     )
 
 
-def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
+def _player(runs: Sequence[EpisodeTable], packed: Packed) -> str:
     if not packed:
         return ""
     buttons = "".join(
@@ -270,13 +270,13 @@ def _player(runs: Sequence[Evaluation], packed: Packed) -> str:
     )
 
 
-def _meaning(runs: Sequence[Evaluation]) -> str:
+def _meaning(runs: Sequence[EpisodeTable]) -> str:
     return (
         f"<section><h2>What the metrics mean</h2>{explanations(ordered(metric_names(runs)), runs)}</section>"
     )
 
 
-def explanations(metrics: Sequence[str], runs: Sequence[Evaluation]) -> str:
+def explanations(metrics: Sequence[str], runs: Sequence[EpisodeTable]) -> str:
     """Return a list that explains each known metric in one line."""
     labels = [label for metric in metrics if (label := metric_label(metric, runs)).explanation]
     items = "".join(
@@ -285,11 +285,11 @@ def explanations(metrics: Sequence[str], runs: Sequence[Evaluation]) -> str:
     return f"<dl class=metrics>{items}</dl>"
 
 
-def _origin(runs: Sequence[Evaluation | Training]) -> str:
+def _origin(runs: Sequence[EpisodeTable | Training]) -> str:
     """Return where the numbers come from: commands, data, versions and every ``run.json``."""
     rows = []
     for run in runs:
-        data = run.data if isinstance(run, Evaluation) else {}
+        data = run.data if isinstance(run, EpisodeTable) else {}
         command, versions = run.info.get("command"), run.info.get("versions")
         texts = (
             " ".join(map(str, command)) if isinstance(command, list) else str(command or ""),

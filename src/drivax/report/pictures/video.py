@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from drivax.errors import UsageError, did_you_mean, missing_package
+from drivax.evaluation.episode_table import EpisodeTable
 from drivax.files import atomic_write, check_output
 from drivax.report.episodes import EpisodeGroup, EvaluatedSet, ranked, rollouts_of
 from drivax.report.pictures.drawing import Rollout, with_traffic_of
 from drivax.report.pictures.frames import Canvas, Picture, Scenery, draw_frame, legend_strip
 from drivax.report.pictures.palette import THEMES, rgb
-from drivax.report.runs import Evaluation, read_evaluations
+from drivax.report.runs import read_evaluations
 from drivax.scenario.schema import Scenario
 
 #: Side of a picture in pixels: of one planner alone, of several side by side.
@@ -69,7 +70,7 @@ def write_videos(
     return files
 
 
-def _selected(runs: Sequence[Evaluation], which: str) -> list[EpisodeGroup]:
+def _selected(runs: Sequence[EpisodeTable], which: str) -> list[EpisodeGroup]:
     """Return the requested episodes, worst first."""
     groups = ranked(runs)
     if which == "all":
