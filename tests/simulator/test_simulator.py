@@ -174,11 +174,11 @@ def test_order_and_padding_of_agents_change_nothing(simulator):
 
 
 @pytest.mark.slow
-def test_step_or_begin_is_step_or_reset(single, world):
+def test_step_or_reset_equals_step_and_reset(single, world):
     simulator, reset, step = single
     either = jax.jit(simulator.step_or_reset)
     rows = jnp.arange(4)
-    state, another = reset(world, rows[1]), jax.jit(simulator.beginning)(world, rows[3])
+    state, another = reset(world, rows[1]), jax.jit(simulator.new_episode)(world, rows[3])
     action = jnp.array([0.2, 0.05])
     plain, _ = step(world, state, action)
     same, _ = either(world, state, action, jnp.asarray(False), another)
