@@ -19,128 +19,113 @@ import json
 import re
 import shutil
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from drivax.curation.arms import ClaimGroup
 from drivax.evaluation.episode_table import EpisodeTable
-from drivax.studies import longtail_page
-from drivax.studies.longtail_drives import (
-    DRIVES,
-    REFERENCES,
-    RUNS,
-    SCORES,
-    evaluation_of,
-    is_evaluated,
-    names,
-    run_of,
-)
+from drivax.studies import report
+from drivax.studies.definition import Stratum, Study, StudyConfig, StudySets, load_study
+from drivax.studies.study import is_evaluated
 from experiments.learning.tables import table
 from experiments.repository import DOCS, RESULTS, STATE, fetched
 
 KEPT, RESULT = STATE / "longtail", RESULTS / "longtail.json"
 PAGE = DOCS / "results" / "longtail.md"
 BEGIN, END = "<!-- longtail.py: {} -->", "<!-- longtail.py: end -->"
+DEFINITION = load_study("longtail")
 #: What of a folder is kept.
 FILES = ("config.yaml", "run.json", "metrics.jsonl", "episodes.csv")
 
 
-def keep(study: Path) -> None:
-    """Keeps every arm that has episodes and is not kept yet, the study's own files, its scores and its results."""
+def keep(folder: Path) -> None:
+    """Keep every evaluated arm that is not kept yet, the study's own files, its scores and its results."""
+    study = _study(folder)
     KEPT.mkdir(parents=True, exist_ok=True)
-    _pack([study], study, KEPT / "study.tar.xz")
-    for name in REFERENCES:
-        if (study / DRIVES / name).is_dir():
-            _pack([study / DRIVES / name], study, KEPT / f"{name}.tar.xz")
-    for arm, seed in _agents(study):
+    _pack([folder], folder, KEPT / "study.tar.xz")
+    for name in DEFINITION.planners:
+        if study.evaluation(name).is_dir():
+            _pack([study.evaluation(name)], folder, KEPT / f"{name}.tar.xz")
+    for run in sorted((folder / "runs").glob("*/seed-*")):
+        arm, seed = run.parent.name, int(run.name.removeprefix("seed-"))
         file = KEPT / f"{arm}-{seed}.tar.xz"
         if not file.exists() and is_evaluated(study, arm, seed):
-            folders = [run_of(study, arm, seed), *(evaluation_of(study, name, seed) for name in names(arm))]
-            _pack(folders, study, file)
-    (KEPT / SCORES).mkdir(exist_ok=True)
-    for file in (study / SCORES).glob("*.npz"):
+            _pack([run, *(study.evaluation(name, seed) for name in study.evaluations(arm))], folder, file)
+    (KEPT / "scores").mkdir(exist_ok=True)
+    for file in (folder / "scores").glob("*.npz"):
         with np.load(file) as table:
             arrays = {name: table[name] for name in table if not name.startswith("component_")}
-        np.savez_compressed(KEPT / SCORES / file.name, allow_pickle=False, **arrays)
+        np.savez_compressed(KEPT / "scores" / file.name, allow_pickle=False, **arrays)
 
 
-def restore(study: Path) -> None:
+def restore(folder: Path) -> None:
     """Put what was kept, or else the study of the repository's history, where the study looks for it."""
     kept = fetched("benchmarks/results/longtail", KEPT)
-    study.mkdir(parents=True)
+    folder.mkdir(parents=True)
     for file in sorted(kept.glob("*.tar.xz")):
         with tarfile.open(file) as packed:
-            packed.extractall(study, filter="data")
-    shutil.copytree(kept / SCORES, study / SCORES)
+            packed.extractall(folder, filter="data")
+    shutil.copytree(kept / "scores", folder / "scores")
 
 
-def finish(study: Path) -> None:
+def finish(folder: Path) -> None:
     """Store the results, and the number of test episodes with a collision by planner or arm and seed."""
-    results = json.loads((study / "results.json").read_text())
-    collisions = {
-        name: [
-            int(EpisodeTable.read(folder).metrics["collision"].sum()) for folder in _evaluations(study, name)
-        ]
-        for name in results["rates"]
-    }
+    study, results = _study(folder), json.loads((folder / "results.json").read_text())
+    collisions = {}
+    for name in results["rates"]:
+        seeds = [None] if name in DEFINITION.planners else range(results["about"]["seeds"])
+        tables = [EpisodeTable.read(study.evaluation(name, seed)) for seed in seeds]
+        collisions[name] = [int(table.metrics["collision"].sum()) for table in tables]
     RESULT.write_text(json.dumps(results | {"collisions": collisions}, indent=1) + "\n")
 
 
-def _evaluations(study: Path, name: str) -> list[Path]:
-    folder = study / DRIVES / name
-    return [folder] if name in REFERENCES else sorted(folder.glob("seed-*"))
+def _study(folder: Path) -> Study:
+    return Study(DEFINITION, StudyConfig(), StudySets(folder, folder, ()), folder)
 
 
 def filled(page: str, results: dict[str, Any]) -> str:
-    """The page with its tables as the study found them."""
-    parts = {
-        "conditions": longtail_page.conditions(results),
-        "draws": longtail_page.draws(results),
-        "rankings": longtail_page.rankings(results),
-        "mean q": longtail_page.mean_q(results),
-        "mean q curve": longtail_page.mean_q_curve(results),
-        **{f"claims {group}": longtail_page.verdicts(results, group) for group in get_args(ClaimGroup)},
-        **{f"rates {kind}": longtail_page.rates(results, kind) for kind in ("ordinary", "common", "rare")},
-        "detectable": (
-            ("metric", "smallest difference"),
-            [(f"`{name}`", f"{least:.3f}") for name, least in results["detectable"].items()],
-        ),
+    """Return the page with the tables of the results."""
+    rule = DEFINITION.checkpoints_by.rpartition("/")[2]
+    tables = {
+        "conditions": report.conditions_table(results),
+        "detectable": report.detectable_table(results),
+        "draws": report.draws_table(results),
+        "rankings": report.rankings_table(results),
+        "rule cost": report.rule_cost_table(results, rule),
+        "validations": report.validations_table(results, rule),
+        **{f"claims {group}": report.claims_table(results, group) for group in DEFINITION.groups},
+        **{f"rates {stratum}": report.rates_table(results, stratum) for stratum in get_args(Stratum)},
     }
-    for name, cells in parts.items():
+    for name, shown in tables.items():
+        headings = [column.heading for column in shown.columns]
+        lines = table(headings, [[cell.text for cell in row] for row in shown.rows])
         before, rest = page.split(BEGIN.format(name))
-        page = "\n".join([before + BEGIN.format(name), "", *table(*cells), "", END + rest.split(END, 1)[1]])
+        page = "\n".join([before + BEGIN.format(name), "", *lines, "", END + rest.split(END, 1)[1]])
     return page
 
 
-def _agents(study: Path) -> Iterator[tuple[str, int]]:
-    for run in sorted((study / RUNS).glob("*/seed-*")):
-        yield run.parent.name, int(run.name.removeprefix("seed-"))
-
-
 def _pack(folders: list[Path], study: Path, out: Path) -> None:
-    """The files of some folders, without paths of the machine."""
+    """Pack the files of some folders, without paths of this machine."""
     with tarfile.open(out, "w:xz") as packed:
         for file in (folder / name for folder in folders for name in FILES):
             if file.is_file():
                 content = _without_paths(file)
-                about = tarfile.TarInfo(str(file.relative_to(study)))
-                about.size = len(content)
-                packed.addfile(about, io.BytesIO(content))
+                entry = tarfile.TarInfo(str(file.relative_to(study)))
+                entry.size = len(content)
+                packed.addfile(entry, io.BytesIO(content))
 
 
 def _without_paths(file: Path) -> bytes:
-    """What a file says, with data and runs by name: where they lie is the machine's own affair."""
+    """Return the content of a file with data and runs by name instead of the paths of this machine."""
     if file.name == "run.json":
-        planner_name = json.loads(file.read_bytes())
-        planner_name.pop("command", None)  # a restored study tells none
-        for entry in (*planner_name["data"], *planner_name.get("trained_on", ())):
+        info = json.loads(file.read_bytes())
+        info.pop("command", None)  # a restored study has none
+        for entry in (*info["data"], *info.get("trained_on", ())):
             entry["path"] = Path(entry["path"]).name
-        return json.dumps(planner_name).encode()
+        return json.dumps(info).encode()
     if file.name == "config.yaml":
-        return re.sub(rf"(?m)^(planner: ).*/({RUNS}/)", r"\1\2", file.read_text()).encode()
+        return re.sub(r"(?m)^(planner: ).*/(runs/)", r"\1\2", file.read_text()).encode()
     return file.read_bytes()
 
 

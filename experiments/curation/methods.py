@@ -8,7 +8,7 @@
 
 ``events`` scores both test sets with the methods as they are and stores the result; ``table`` writes it into the page.
 ``check`` ranks scenarios of other sets by ``kinematic``: those whose events its weights were chosen by, and others that
-that were new (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare-rate 0.5``).
+that were new (``drivax generate sets/fresh --scenarios 1024 --seed 20261124 --rare_rate 0.5``).
 Scenarios without an event come from ``test``, those with one from ``test`` and ``test-rare``. All measures count them
 as if the natural share of scenarios had an event, so that precision is that of an ordinary set. How usual an action is,
 ``test`` alone says; ensembles are trained on ``train``. With ``--method`` only these are scored, and the rest stays.

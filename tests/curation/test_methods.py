@@ -9,7 +9,6 @@ import pytest
 from drivax.cli import main
 from drivax.cli.curate import Curate
 from drivax.cli.train import Train
-from drivax.curation.arms import ARMS
 from drivax.curation.combining import Combination
 from drivax.curation.controls import event_kinds, event_steps
 from drivax.curation.kinematic import KinematicConfig
@@ -20,6 +19,7 @@ from drivax.errors import DataError, UsageError
 from drivax.scenario.build.assemble import assemble
 from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
+from drivax.studies.definition import load_study
 from scenes import SMALL, car, straight_road
 
 
@@ -76,7 +76,7 @@ def test_methods_return_their_declared_components(tables):
 def test_commands_offer_every_method_and_arm():
     hints = get_type_hints(Curate, include_extras=True)
     assert set(get_args(get_args(hints["method"])[0])) == set(METHODS)
-    assert {*get_args(get_args(get_type_hints(Train)["arm"])[0])} == set(ARMS)
+    assert {*get_args(get_args(get_type_hints(Train)["arm"])[0])} == set(load_study("longtail").arms)
 
 
 def test_scores_of_methods(data, tables):

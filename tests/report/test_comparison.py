@@ -109,7 +109,16 @@ def test_page_is_self_contained(runs, plan, tmp_path, capsys):
 
 def test_save_writes_the_plan_and_config_runs_it(runs, tmp_path, capsys):
     file = tmp_path / "plans" / "plan.yaml"
-    words = ("--primary", "accuracy", "--secondary", "collision", "--minimum-scenarios", "8", "--save", file)
+    words = (
+        "--primary",
+        "accuracy",
+        "--secondary",
+        "[collision]",
+        "--minimum_scenarios",
+        "8",
+        "--save",
+        file,
+    )
     status, out, _ = called(capsys, runs[0], runs[1], *words)
     assert status == 0 and out == f"wrote {file}\n"
     assert settings.load(ComparisonPlan, file) == ComparisonPlan(
@@ -126,7 +135,7 @@ def test_save_writes_the_plan_and_config_runs_it(runs, tmp_path, capsys):
 
 
 def test_random_and_stratified_splits_are_reported(runs, plan, capsys):
-    words = ("--primary", "accuracy", "--secondary", "progress_ratio", "--minimum-scenarios", "2")
+    words = ("--primary", "accuracy", "--secondary", "[progress_ratio]", "--minimum_scenarios", "2")
     status, out, _ = called(capsys, runs[0], runs[1], *words, "--split", "random")
     assert status == 0 and "split at random: 4 scenarios of 2 recordings for A, 4 of 2 for B" in out
     plan.write_text(PLAN + "split: stratified\nstrata: [dataset]\n")

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from numpy._core import _multiarray_umath as umath
 
-from drivax.cli.generate import Generate, run, summary, world
+from drivax.cli.generate import Generate, run, summary
 from drivax.errors import UsageError
 from drivax.scenario.schema import Flag
 from drivax.scenario.store import ScenarioSet
-from drivax.settings import dump
 from drivax.synthetic import generate as generation
 from drivax.synthetic import generate as portable
 from drivax.synthetic.generate import (
@@ -266,16 +265,15 @@ def test_segments_are_maps_and_the_manifest_describes_the_world(one_worker):
 
 
 def test_flags_override_the_configuration_file(tmp_path):
-    file = tmp_path / "world.yaml"
+    file, out = tmp_path / "world.yaml", tmp_path / "set"
     file.write_text("rare_rate: 0.25\nscenarios_per_map: 3\nnoise:\n  level: 0.5\n")
-    plain = world(Generate(tmp_path))
-    assert plain == WorldConfig()
-    loaded = world(Generate(tmp_path, config=file))
-    assert (loaded.rare_rate, loaded.scenarios_per_map, loaded.noise.level) == (0.25, 3, 0.5)
-    both = world(Generate(tmp_path, config=file, rare_rate=0.75, domain="ring"))
-    assert (both.rare_rate, both.scenarios_per_map, both.domain) == (0.75, 3, "ring")
-    file.write_text(dump(both))
-    assert world(Generate(tmp_path, config=file)) == both
+    assert (
+        run(Generate(out, scenarios=1, workers=1, config=file), ["--rare_rate", "0.75", "--domain", "ring"])
+        == 0
+    )
+    config = ScenarioSet.open(out).manifest["source"]["config"]
+    assert (config["rare_rate"], config["domain"]) == (0.75, "ring")
+    assert (config["scenarios_per_map"], config["noise"]["level"]) == (3, 0.5)
     file.write_text("rare_rat: 0.25\n")
     with pytest.raises(UsageError, match="rare_rate"):
-        world(Generate(tmp_path, config=file))
+        run(Generate(tmp_path / "other", config=file))

@@ -1,17 +1,19 @@
-"""The command line: one file per command; parses, calls, prints.
+"""The command line: one file per command.
 
-``drivax.cli.<command>`` defines one frozen dataclass (the command's name in CamelCase) from which tyro builds
-the flags, with an example in its docstring, and ``run(args) -> int``. Nothing of a command is imported before
-it is asked for, so that ``drivax --help`` answers at once. A command that takes free ``--section.key value``
-overrides of its configuration is registered with ``overrides=True`` and its ``run`` takes them as a second
-argument.
+``drivax.cli.<command>`` defines a frozen dataclass (the command's name in CamelCase) from which tyro builds the flags,
+with examples in its docstring, and ``run(args) -> int``. A command's modules are imported only when it runs, so that
+``drivax --help`` answers at once. A command with ``overrides=True`` takes further ``--section.key VALUE`` settings of
+its configuration, which ``run`` gets as a second argument.
 """
 
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -24,7 +26,7 @@ from drivax.errors import DrivaxError, UsageError, did_you_mean, missing_package
 
 @dataclass(frozen=True)
 class Command:
-    """Where a command lives and what the list of commands says about it."""
+    """The module and the class of a command, and its line in the list of commands."""
 
     module: str
     config: str
@@ -32,20 +34,24 @@ class Command:
     overrides: bool = False
 
 
+#: Width of help that is not printed to a terminal.
+_COLUMNS = 100
 COMMANDS = {
     "demo": Command(
-        "drivax.cli.demo", "Demo", "the whole job on the built-in world: make, train, judge, report"
+        "drivax.cli.demo",
+        "Demo",
+        "the whole pipeline on the built-in world: generate, train, evaluate, report",
     ),
-    "doctor": Command(
-        "drivax.cli.doctor", "Doctor", "what is installed, or what a file or folder of data is"
+    "doctor": Command("drivax.cli.doctor", "Doctor", "what is installed, or what a file or folder contains"),
+    "generate": Command(
+        "drivax.cli.generate", "Generate", "generate scenarios of the built-in world", overrides=True
     ),
-    "generate": Command("drivax.cli.generate", "Generate", "scenarios of the built-in world -> scenario set"),
-    "convert": Command("drivax.cli.convert", "Convert", "public data set -> scenario set"),
-    "export": Command("drivax.cli.export", "Export", "part of a scenario set, or another format, from a set"),
-    "inspect": Command("drivax.cli.inspect", "Inspect", "what a scenario set holds, and whether it is sound"),
-    "view": Command("drivax.cli.view", "View", "one HTML page in which a scenario set can be browsed"),
+    "convert": Command("drivax.cli.convert", "Convert", "convert a public data set to a scenario set"),
+    "export": Command("drivax.cli.export", "Export", "write a part of a set, or a set in another format"),
+    "inspect": Command("drivax.cli.inspect", "Inspect", "summarise, audit and verify scenario sets"),
+    "view": Command("drivax.cli.view", "View", "browse and play a scenario set on one HTML page"),
     "curate": Command(
-        "drivax.cli.curate", "Curate", "how critical each scenario is: scores for a set", overrides=True
+        "drivax.cli.curate", "Curate", "score how critical each scenario of a set is", overrides=True
     ),
     "train": Command(
         "drivax.cli.train", "Train", "train a planner from a configuration file", overrides=True
@@ -54,14 +60,14 @@ COMMANDS = {
         "drivax.cli.evaluate", "Evaluate", "evaluate a planner on a scenario set", overrides=True
     ),
     "compare": Command(
-        "drivax.cli.compare", "Compare", "is one planner better than another? a tested answer"
+        "drivax.cli.compare", "Compare", "test whether one planner is better than another", overrides=True
     ),
     "study": Command(
-        "drivax.cli.study", "Study", "a whole experiment with controls and verdicts", overrides=True
+        "drivax.cli.study", "Study", "run an experiment with controls and verdicts", overrides=True
     ),
-    "report": Command("drivax.cli.report", "Report", "one HTML page with tables and pictures from runs"),
+    "report": Command("drivax.cli.report", "Report", "one HTML page from runs; or videos, or tables"),
     "bench": Command(
-        "drivax.cli.bench", "Bench", "simulation speed on this machine, by part", overrides=True
+        "drivax.cli.bench", "Bench", "measure the speed of the simulator on this machine", overrides=True
     ),
 }
 
@@ -105,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def describe(error: BaseException) -> tuple[str, int]:
-    """One line for the user, and the exit status, for an exception that ended a command."""
+    """Return one line for the user, and the exit status, for an exception that ended a command."""
     if isinstance(error, DrivaxError):
         return str(error), error.status
     if isinstance(error, KeyboardInterrupt):
@@ -120,12 +126,12 @@ def describe(error: BaseException) -> tuple[str, int]:
 
 
 def overview() -> str:
-    """The list of commands that ``drivax --help`` prints; at most 100 columns."""
+    """Return the list of commands that ``drivax --help`` prints; at most 100 columns."""
     width = max(map(len, COMMANDS))
     rows = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
     return "\n".join(
         (
-            "drivax trains, curates and judges driving planners on recorded traffic.",
+            "drivax trains, curates and evaluates driving planners on recorded traffic.",
             "",
             "usage: drivax COMMAND [options]      drivax COMMAND --help  explains one, with an example",
             "",
@@ -155,15 +161,27 @@ def _dispatch(arguments: list[str]) -> int:
 def _run(name: str, command: Command, arguments: list[str]) -> int:
     import tyro
 
-    # Compiled programs are kept between commands: most of a short command's time is compilation.
+    # Most of a short command's time is compilation, so compiled programs are kept.
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "drivax" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     module = importlib.import_module(command.module)
     config = getattr(module, command.config)
-    options = (tyro.conf.FlagCreatePairsOff,)
-    if not command.overrides:
-        return int(module.run(tyro.cli(config, prog=f"drivax {name}", args=arguments, config=options)))
     args, overrides = tyro.cli(
-        config, prog=f"drivax {name}", args=arguments, config=options, return_unknown_args=True
-    )
-    return int(module.run(args, overrides))
+        config, prog=f"drivax {name}", args=arguments, description=_wrapped(inspect.getdoc(config) or ""),
+        config=(tyro.conf.FlagCreatePairsOff,), return_unknown_args=True,
+    )  # fmt: skip
+    if command.overrides:
+        return int(module.run(args, overrides))
+    if overrides:
+        # tyro's own error for unknown options, with the closest ones.
+        tyro.cli(config, prog=f"drivax {name}", args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+    return int(module.run(args))
+
+
+def _wrapped(text: str) -> str:
+    """Return the paragraphs of a text in lines as wide as the terminal.
+
+    Tyro joins lines unless they begin with a blank, and doubles empty ones: a zero-width space stands for those.
+    """
+    fill = textwrap.TextWrapper(shutil.get_terminal_size((_COLUMNS, 0)).columns, "  ", "  ").fill
+    return "\n\u200b\n".join(fill(" ".join(part.split())) for part in text.split("\n\n"))

@@ -1,4 +1,4 @@
-"""``drivax bench``: speed on this machine, of simulation by part or of encoders."""
+"""``drivax bench``: speed on this machine, of the simulator by part or of encoders."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from drivax.tracking.progress import Progress
 
 @dataclass(frozen=True)
 class Bench(BenchConfig):
-    """Time environment steps with observation, reward, metrics and resets, and each part alone; IDM drives.
+    """Time environment steps with observation, reward, metrics and resets, and each part alone, driven by IDM.
 
-    Without --data, scenarios of the built-in world are generated. Set the task with --task.KEY VALUE, as
+    Scenarios of the built-in world are generated unless --data is given. Settings of the task follow as
     --task.metrics training.
 
-    With --encoders, time encoders on the observation `optimal` instead; their settings follow, as
+    With --encoders, time encoders on the observation `optimal` instead; their settings follow as
     --only "[lq small]" --batches "[1, 512]".
 
     Example: drivax bench --batch 512 --json
     """
 
     data: Path | None = None
-    """Scenario set to step through."""
+    """Scenario set to simulate."""
     scenarios: int = 1024
     """Number of scenarios to generate without --data."""
     task: tyro.conf.Suppress[tyro.conf.Fixed[Task]] = field(default_factory=Task)
     metrics: bool = False
     """Compare the metric sets none, training and full at batch 32, 128 and the best one, instead of parts."""
     encoders: bool = False
-    """Count the parameters of the encoders and time them, instead of the simulator."""
+    """Time the encoders and count their parameters, instead of the simulator."""
     json: bool = False
     """Print one JSON object instead of text."""
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import tyro
 
@@ -14,41 +15,34 @@ import tyro
 class Compare:
     """Compare two evaluations: intervals, effect sizes, tests, power, and a recommendation.
 
-    A and B are run folders of `drivax evaluate` on the same scenarios, or folders with one such run for each seed of a
-    policy. What counts and how it is decided is a plan, best written before the runs (--save) and given with --config;
-    its other settings (smallest_difference, confidence, power, ...) are in docs/guide/compare.md.
+    A and B are run folders of `drivax evaluate` on the same scenarios, or folders with one such run per seed of a
+    policy. The plan says what is compared and how it is decided; write it before the runs (--save) and pass it as
+    --config. Its settings follow as --primary METRIC, --secondary "[METRIC, ...]", --split paired|random|stratified,
+    --minimum_scenarios N, --smallest_difference X, --confidence 0.95, --power 0.8 (docs/guide/compare.md has all).
 
-    Example: drivax compare --primary success --minimum-scenarios 500 --save plan.yaml
+    Example: drivax compare --primary success --minimum_scenarios 500 --save plan.yaml
 
     Example: drivax compare runs/policy runs/idm --config plan.yaml --html comparison.html
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="A B")] = ()
-    """Two run folders; left out where the plan names them."""
+    """Two run folders; none if the plan names them."""
     config: Path | None = None
-    """The plan (YAML); the default plan without."""
-    split: Literal["paired", "random", "stratified"] | None = None
-    """Compare on every common scenario (paired), or give each planner scenarios of its own."""
-    primary: str | None = None
-    """The metric that decides."""
-    secondary: tuple[str, ...] | None = None
-    """Further metrics to report."""
-    minimum_scenarios: int | None = None
-    """Fewer scenarios give no verdict."""
+    """The plan (YAML); the default plan if left out."""
     data: Path | None = None
-    """Scenario set that was driven, where it has moved since (for a stratified split)."""
+    """Scenario set of the runs, if it has moved since (for a stratified split)."""
     save: Path | None = None
     """Write the plan to this file and stop."""
     json: bool = False
-    """Print everything as JSON, for programs."""
+    """Print everything as JSON."""
     html: Path | None = None
     """Also write a page to this file."""
     overwrite: bool = False
     """Replace the file of --save or --html."""
 
 
-def run(args: Compare) -> int:
-    """Carry the plan out, or write it down."""
+def run(args: Compare, overrides: Sequence[str] = ()) -> int:
+    """Carry out the plan, or write it."""
     from drivax import settings
     from drivax.errors import UsageError
     from drivax.evaluation.comparison import compare
@@ -60,11 +54,9 @@ def run(args: Compare) -> int:
 
     if len(args.runs) not in (0, 2):
         raise UsageError(f"{len(args.runs)} runs are named", cure="write drivax compare A B")
-    plan = ComparisonPlan() if args.config is None else settings.load(ComparisonPlan, args.config)
-    given = _given(args)
-    if "primary" in given and "secondary" not in given:
-        given["secondary"] = tuple(name for name in plan.secondary if name != given["primary"])
-    plan = replace(plan, **given)
+    plan = settings.load(ComparisonPlan, args.config or {}, overrides)
+    if args.runs:
+        plan = replace(plan, a=args.runs[0], b=args.runs[1])
     for out in (args.save, args.html):
         if out is not None:
             check_output(out, args.overwrite)
@@ -88,10 +80,3 @@ def run(args: Compare) -> int:
         if not args.json:
             print(f"wrote {args.html}")
     return 0
-
-
-def _given(args: Compare) -> dict[str, Any]:
-    """What the command line says of the plan."""
-    names = ("split", "primary", "secondary", "minimum_scenarios")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    return given | (dict(zip(("a", "b"), args.runs, strict=True)) if args.runs else {})

@@ -34,11 +34,11 @@ class Curate:
 
     published: the published kinematic heuristic, for comparison.
 
-    ensemble: disagreement of behaviour-cloning policies trained on different recordings; trains them first.
+    ensemble: disagreement of behaviour-cloning policies, which it trains on different recordings.
 
     action_rarity: inverse density of the logged driver's action (action_rarity_published: by the published bins).
 
-    uniform, random_matched, oracle: equal scores; the scores of --like, permuted; the built-in world's labels.
+    uniform: equal scores. random_matched: the scores of --like, permuted. oracle: labels of the built-in world.
 
     Example: drivax curate kinematic --data sets/world --out scores.npz --export sets/critical 500
 
@@ -49,30 +49,26 @@ class Curate:
     Example: drivax curate kinematic --data sets/world --out near.npz --again scores.npz --weights urgency 1 braking 0.5
     """
 
-    method: Annotated[
-        MethodName,
-        tyro.conf.Positional,
-        tyro.conf.arg(metavar="METHOD"),
-    ]
+    method: Annotated[MethodName, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
     """Name of the method."""
     data: Path
     """Scenario set."""
     out: Path
     """Table of scores to write."""
     export: Annotated[tuple[Path, int] | None, tyro.conf.arg(metavar="TOP N")] = None
-    """Write the N most critical scenarios, at most one of each recording, as a set with its scores, TOP/scores.npz."""
+    """Write the N most critical scenarios, at most one per recording, as the set TOP with scores.npz."""
     all_windows: bool = False
-    """Let TOP hold several scenarios of one recording; with --export."""
+    """Allow several scenarios of one recording in TOP; with --export."""
     weights: dict[str, float] | None = None
     """Weights of the components instead of the method's: --weights urgency 0.5 braking 0.5."""
     scenario: Annotated[
         str | dict[str, str] | None, tyro.conf.arg(metavar="HOW | NAME HOW [NAME HOW ...]")
     ] = None
-    """Aggregator of steps: max, mean, std, p99, top10, ...; or one for each component: urgency max braking p95."""
+    """Aggregation over steps: max, mean, std, p99, top10, ...; or one per component: urgency max braking p95."""
     again: Path | None = None
-    """Table of METHOD for the same set; its components are combined again instead of scored again."""
+    """Scores of the same set and METHOD; only the combination of their components is computed again."""
     like: Path | None = None
-    """Table of the same set whose scores random_matched permutes."""
+    """Scores of the same set that random_matched permutes."""
     seed: int | None = None
     """Seed of random_matched and of an ensemble (default: 0)."""
     config: Path | None = None
@@ -171,8 +167,8 @@ def _export(
         write_top(table, data, count, top, overwrite, lambda done, _: bar.update(done), all_windows)
     file = top / OWN_SCORES
     own = read_scores(file, ScenarioSet.open(top))
-    each = "" if all_windows else ", one of each recording at most"
-    print(f"{top}: the {count:,} most critical{each}")
+    each = "" if all_windows else ", at most one per recording"
+    print(f"{top}: the {count:,} most critical scenarios{each}")
     print(f"{file}: their scores")
     print("  rank  score  scenario")
     for rank, row in enumerate(own.order[:_PRINTED], start=1):

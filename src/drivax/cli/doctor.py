@@ -1,4 +1,4 @@
-"""``drivax doctor``: what is installed on this machine, or what a path holds and what is wrong with it."""
+"""``drivax doctor``: what is installed on this machine, or what a path contains and its problems."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ _EXTRAS = {
     "track": (("tensorboardX",), "TensorBoard"),
     "gym": (("gymnasium",), "Gymnasium"),
 }
-#: JAX is asked in a process of its own: a broken accelerator may hang or end it.
+#: JAX runs in a process of its own, which a broken accelerator may hang or end.
 _ASK_JAX = "import jax, json; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
 
 
 @dataclass(frozen=True)
 class Doctor:
-    """Tell what is installed here, or what a file or folder is and what is wrong with it.
+    """Show what is installed, or identify a file or folder of data and its problems.
 
-    With PATH: the data set, its flavour and version, how many recordings and scenarios, what is missing, and what to
-    use instead of what drivax does not read. Exit status 1 where nothing of it can be converted.
+    With PATH: the data set, its flavour and version, the number of recordings and scenarios, missing files, and a
+    substitute for formats that drivax does not read. The exit status is 1 if nothing can be converted.
 
     Example: drivax doctor womd/training
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]")] = None
-    """File or folder to look at; without it, this machine and what is installed."""
+    """File or folder to identify; this machine by default."""
 
 
 def run(args: Doctor) -> int:
@@ -64,7 +64,7 @@ def run(args: Doctor) -> int:
 
 
 def machine() -> Iterator[tuple[str, str]]:
-    """What is installed and what the machine has, as (name, value)."""
+    """Yield what is installed and the resources of the machine, as (name, value)."""
     yield "drivax", metadata.version("drivax")
     yield "python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     yield "jax", metadata.version("jax")
@@ -87,7 +87,7 @@ def _installed(module: str) -> bool:
 
 
 def devices(timeout_s: float = 60.0) -> str:
-    """What JAX computes on, or why it cannot say."""
+    """Return the devices of JAX, or its error."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _ASK_JAX], capture_output=True, text=True, timeout=timeout_s, check=False
@@ -102,7 +102,7 @@ def devices(timeout_s: float = 60.0) -> str:
 
 
 def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
-    """A diagnosis as (name, value)."""
+    """Yield a diagnosis as (name, value)."""
     yield "path", str(diagnosis.path)
     for part in diagnosis.parts:
         yield from _described(part, diagnosis.files[part.format])
@@ -110,14 +110,14 @@ def findings(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     if diagnosis.parts:
         others = []
         if diagnosis.companions:
-            others.append(f"{diagnosis.companions:,} read along (maps, poses, tables)")
+            others.append(f"{diagnosis.companions:,} that belong to them (maps, poses, tables)")
         if diagnosis.ignored:
             others.append(f"{diagnosis.ignored:,} of no known format, ignored")
         if others:
             yield "other files", ", ".join(others)
         yield "input", gigabytes(diagnosis.input_bytes)
     for problem in diagnosis.problems:
-        # The path stands above; a file inside it is named.
+        # The path is printed above; only a file inside it is named.
         file = None if problem.file == diagnosis.path else problem.file
         place = f"{file}: " if file is not None else ""
         yield "problem", f"{place}{problem.problem}"

@@ -33,9 +33,10 @@ class Evaluate(EvaluationConfig):  # noqa: D101
     __doc__ = f"""Evaluate a planner on every scenario of a set, to the end of each log.
 
     A planner is {", ".join(PLANNERS)}, module:name of your own, the run folder of `drivax train`, or
-    a policy of the package: {", ".join(zoo())}. Set the task of all but trained policies with --task.KEY VALUE.
+    a policy of the package: {", ".join(zoo())}. Settings of the task follow as --task.KEY VALUE; a trained policy
+    has its own.
 
-    Writes episodes.csv, summary.json, trajectories.npz, and crashes.json where the planner crashed.
+    Writes episodes.csv, summary.json, trajectories.npz, and crashes.json if the planner crashed.
 
     Example: drivax evaluate --planner idm --data sets/test --out runs/idm
 

@@ -1,4 +1,4 @@
-"""``drivax export``: a scenario set, or a part of it, for others."""
+"""``drivax export``: write a scenario set, or a part of it, as a set or in another format."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Export:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder to write."""
     format: Literal["set", "tfexample", "gpudrive"] = "set"
-    """What to write."""
+    """Format to write."""
     filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Only scenarios for which this holds (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
+    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
     ids: Path | None = None
-    """Only scenarios that this file names: one id per line, or data set, tabulator and id (a split file)."""
+    """Only scenarios named in this file: one id per line, or data set, tab and id (a split file)."""
     limit: int | None = None
     """At most N scenarios."""
     paths: Literal["vmax", "published"] = "vmax"
@@ -43,7 +43,7 @@ class Export:
 
 
 def run(args: Export) -> int:
-    """Export, and say what the format had no room for."""
+    """Export, and print what the format could not hold."""
     from drivax.datasets.export import writer as export
     from drivax.tracking.progress import Progress
 

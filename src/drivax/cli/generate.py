@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -27,13 +27,19 @@ _SCENARIOS = 256
 
 
 @dataclass(frozen=True)
-class Generate:
-    """Generate scenarios of the built-in traffic world; no data set is needed.
+class Generate:  # noqa: D101
+    __doc__ = f"""Generate scenarios of the built-in traffic world; no data set is needed.
 
-    Roads of many kinds, other road users that follow, yield and stop, labelled rare events, and an expert log that
-    neither collides nor leaves the road. The same seed gives the same set, byte for byte.
+    Many kinds of roads, other road users that follow, yield and stop, labelled rare events, and an expert log without
+    collisions that stays on the road. The same seed gives the same set, byte for byte.
+
+    Settings of the world follow as --domain {"|".join(DOMAINS)} (wide lanes, lights and higher speeds, or narrow,
+    dense and roundabouts), --rare_rate 0.05 (share of scenarios with a labelled rare event), --critical_share,
+    --lane_change_share, --scenarios_per_map and --noise.KEY, --sensor.KEY (docs/guide/world.md has all).
 
     Example: drivax generate sets/world --scenarios 256 --seed 0
+
+    Example: drivax generate sets/ring --domain ring --rare_rate 0.2
     """
 
     out: tyro.conf.Positional[Path]
@@ -41,13 +47,9 @@ class Generate:
     scenarios: int | None = None
     """How many scenarios, 256 by default; with --benchmark those of train, the other splits in proportion."""
     seed: int | None = None
-    """Seed of the set, 0 by default; scenario i of a seed is the same whatever the number of scenarios."""
-    domain: Annotated[str | None, tyro.conf.arg(metavar="|".join(DOMAINS))] = None
-    """Statistics of roads and drivers: wide lanes, lights and higher speeds, or narrow, dense and roundabouts."""
-    rare_rate: float | None = None
-    """Share of scenarios with a labelled rare event."""
+    """Seed of the set, 0 by default; scenario i of a seed does not depend on the number of scenarios."""
     config: Path | None = None
-    """YAML file with the settings of the world; --domain and --rare-rate override it."""
+    """YAML file with settings of the world."""
     benchmark: bool = False
     """Write the fixed, versioned splits OUT/train, validation, test and test-rare."""
     workers: int | None = None
@@ -60,18 +62,19 @@ class Generate:
     """Replace OUT if it is a scenario set."""
 
 
-def run(args: Generate) -> int:
-    """Generate, then print the rate, what was rejected per family, and how often which event came up."""
+def run(args: Generate, overrides: Sequence[str] = ()) -> int:
+    """Generate, then print the rate, the rejections of each family, and the number of each event."""
+    world = load(WorldConfig, args.config or {}, overrides)
     if args.benchmark and (args.seed is not None or args.split is not None):
         raise UsageError("the benchmark has seeds and splits of its own", cure="leave out --seed and --split")
-    if args.benchmark and (args.rare_rate is not None or args.config is not None):
-        raise UsageError("the benchmark has a fixed world", cure="leave out --rare-rate and --config")
+    if args.benchmark and world != WorldConfig(domain=world.domain):
+        raise UsageError("the benchmark has a fixed world", cure="leave out all of its settings but --domain")
     shares = None if args.split is None else parse_shares(args.split)
     options = Generation(
         workers=args.workers if args.workers is not None else os.cpu_count() or 1,
         capacity=args.capacity,
         overwrite=args.overwrite,
-        world=world(args),
+        world=world,
     )
     scenarios = _SCENARIOS if args.scenarios is None else args.scenarios
     with Progress("generating", "scenarios") as bar:
@@ -91,18 +94,8 @@ def run(args: Generate) -> int:
     return 0
 
 
-def world(args: Generate) -> WorldConfig:
-    """The settings of the world that the flags and the file ask for."""
-    config = WorldConfig() if args.config is None else load(WorldConfig, args.config)
-    if args.domain is not None:
-        config = replace(config, domain=args.domain)
-    if args.rare_rate is not None:
-        config = replace(config, rare_rate=args.rare_rate)
-    return config
-
-
 def summary(result: GeneratedSet) -> str:
-    """One line about the set, one per family of roads, and a table of families and events where there are any."""
+    """Return one line about the set, one per family of roads, and a table of families and events, if there are any."""
     rate = result.scenarios / max(result.seconds, 1e-9)
     lines = [f"{result.path}: {result.scenarios:,} scenarios in {result.seconds:.1f} s ({rate:.1f}/s)"]
     width = max(map(len, result.families))
@@ -115,7 +108,7 @@ def summary(result: GeneratedSet) -> str:
 
 
 def coverage(families: Mapping[str, FamilyCount]) -> list[str]:
-    """How often each event came up in each family: lines of a table, events as rows; empty without events."""
+    """Return the lines of a table of events (rows) and the families in which they happened."""
     totals: Counter[str] = Counter()
     for count in families.values():
         totals.update(count.events)

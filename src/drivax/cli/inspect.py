@@ -1,4 +1,4 @@
-"""``drivax inspect``: what scenario sets hold, and whether they are sound."""
+"""``drivax inspect``: contents, audit and integrity of scenario sets."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from drivax.report.inspection import Inspection
 
 _COLUMNS = 100
-#: Scenarios that --observations drives, evenly spread over those that are selected.
+#: Number of scenarios of --observations, evenly spread over those selected.
 _OBSERVED = 256
 
 
 @dataclass(frozen=True)
 class Inspect:
-    """Show what a scenario set holds: source counts, sizes, tags, flags, audit, integrity.
+    """Summarise a scenario set: sources, sizes, tags, flags, audit, integrity.
 
-    Of several sets, one table that compares them.
+    Several sets are compared in one table.
 
     Example: drivax inspect sets/womd sets/nuplan --filter agents>=20 --html sets.html
 
@@ -35,29 +35,29 @@ class Inspect:
     sets: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SET")]
     """Scenario sets (folders), one or more."""
     filter: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")] = ()
-    """Only scenarios for which this holds (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
+    """Only scenarios with this property (NAME=A|B, NAME!=A, NAME>=N); may be given several times."""
     json: bool = False
-    """Print the counts of every scenario as JSON, for programs."""
+    """Print the counts of every scenario as JSON."""
     html: Path | None = None
     """Write a page with histograms to this file instead of printing tables."""
     no_check: bool = False
-    """Leave the checksums untested (testing them reads the whole set)."""
+    """Skip the checksums, which take reading the whole set."""
     observations: bool = False
-    """Describe what a policy observes: every feature's spread, what it has to do with collisions and actions."""
+    """Describe the observations of a planner: distributions, correlation with collisions and actions."""
     planner: str | None = None
-    """Who drives for --observations: a planner, the run folder of a training run or zoo:NAME; the log by default."""
+    """Planner of --observations: a name, the run folder of a training run or zoo:NAME; the log by default."""
     traffic: str | None = None
-    """How the others move for --observations: log (the default), idm, zoo:NAME, ... as of drivax evaluate."""
+    """Traffic of --observations: log (the default), idm, zoo:NAME, ... as for drivax evaluate."""
     task: str | None = None
-    """Whose observations: a training configuration (file or preset); a run brings its own."""
+    """Training configuration (file or preset) of the observations; a run has its own."""
     draw: Path | None = None
-    """Also draw what is seen of the first scenario at its current step, into this PNG file."""
+    """Also draw the observation of the first scenario at its current step into this PNG file."""
     overwrite: bool = False
     """Replace the file of --html or --draw."""
 
 
 def run(args: Inspect) -> int:
-    """Test the sets, then print them as tables or as JSON, or write a page."""
+    """Verify the sets, then print tables or JSON, or write a page."""
     from drivax.errors import UsageError
     from drivax.report.inspection import Inspection, described
     from drivax.scenario.select.selection import Selection
@@ -86,7 +86,7 @@ def run(args: Inspect) -> int:
 
 
 def _print(opened: list[Inspection]) -> None:
-    """One set in full, or several side by side."""
+    """Print one set in full, or several side by side."""
     from drivax.report import inspection_tables as tables
 
     console = _console()
@@ -99,7 +99,7 @@ def _print(opened: list[Inspection]) -> None:
     console.print(tables.overview(inspection).rich())
     console.print()
     audit = tables.audit_table(inspection)
-    console.print("audit: not done" if audit is None else audit.rich())
+    console.print("audit: none" if audit is None else audit.rich())
     console.print()
     console.print(tables.listing(inspection).rich())
     if len(inspection) > tables.LISTED:
@@ -131,7 +131,7 @@ def _check_flags(args: Inspect) -> None:
 
 
 def _observe(args: Inspect, inspection: Inspection) -> None:
-    """Drive, then print what was observed, and draw it."""
+    """Run the planner, then print statistics of its observations, and draw one."""
     from drivax import settings
     from drivax.api import find_planner
     from drivax.evaluation.observation_statistics import observation_statistics

@@ -1,4 +1,4 @@
-"""``drivax report``: one HTML page from run folders; or their drives as videos, or their tables as files."""
+"""``drivax report``: one HTML page from run folders; or videos, or tables."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tyro.conf import Positional
 class Report:
     """Write one self-contained HTML page from evaluation and training runs; or videos, or tables.
 
-    The page holds tables with intervals, paired differences, kinds of collision, distributions, all episodes, drives
-    side by side and learning curves; it needs no network. The last evaluation named is the policy that the others are
-    compared with. With --video, --side-by-side or --tables, files are written into the folder --out instead.
+    The page holds tables with intervals, paired differences, kinds of collision, distributions, all episodes, episodes
+    side by side and learning curves; it needs no network. The other planners are compared with the last evaluation.
+    With --video, --side-by-side or --tables, files are written into the folder --out instead.
 
     Example: drivax report runs/constant runs/idm runs/policy runs/training --out report.html
 
@@ -29,28 +29,27 @@ class Report:
     runs: Positional[tuple[Path, ...]]
     """Run folders written by drivax evaluate and drivax train."""
     out: Path | None = None
-    """HTML file to write; report.html in the last run folder where it is left out. Of videos and tables the folder;
-    videos or tables in the last run folder."""
+    """HTML file, or folder of videos or tables; report.html, videos or tables in the last run folder by default."""
     data: Path | None = None
-    """Scenario set that was driven, where it has moved since."""
+    """Scenario set of the runs, if it has moved since."""
     episodes: int = 12
-    """How many drives the page plays; 0 leaves out drives and tags."""
+    """Number of episodes that the page plays; 0 leaves out episodes and tags."""
     video: str | None = None
-    """Write mp4 files of the policy's drives: worst:N, all, or the id of a scenario."""
+    """Write mp4 files of the last run's episodes: worst:N, all, or the id of a scenario."""
     side_by_side: str | None = None
     """Write mp4 files with all runs in one picture: worst:N, all, or the id of a scenario."""
     theme: Literal["light", "dark"] = "light"
-    """Colours of videos; the page follows the reader's system."""
+    """Colours of videos; the page follows the browser's setting."""
     tables: bool = False
     """Write the tables as CSV (all digits), Markdown and LaTeX."""
     metrics: tuple[str, ...] = ()
-    """Put these too into the files of --tables: metrics by name, or a set (training, full)."""
+    """Further metrics of --tables, by name or as a set (training, full)."""
     overwrite: bool = False
     """Replace existing files."""
 
 
 def run(args: Report) -> int:
-    """Write what was asked for and say where it is."""
+    """Write the page, the videos or the tables, and print their path."""
     from drivax.errors import UsageError
     from drivax.report.pages.report import write_report
     from drivax.report.pictures.video import write_videos
@@ -58,11 +57,11 @@ def run(args: Report) -> int:
     from drivax.tracking.progress import Progress
 
     if not args.runs:
-        raise UsageError("no run was given", cure="drivax report RUN [RUN ...]")
+        raise UsageError("no run is named", cure="drivax report RUN [RUN ...]")
     if sum((args.video is not None, args.side_by_side is not None, args.tables)) > 1:
         raise UsageError("--video, --side-by-side and --tables are one at a time", cure="run it twice")
     if args.metrics and not args.tables:
-        raise UsageError("--metrics says what --tables holds", cure="pass --tables, or leave it out")
+        raise UsageError("--metrics chooses columns of --tables", cure="pass --tables, or leave it out")
     which = args.video if args.video is not None else args.side_by_side
     if which is not None:
         out = args.out or args.runs[-1] / "videos"

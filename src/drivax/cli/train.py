@@ -13,7 +13,6 @@ import tyro
 
 from drivax import settings
 from drivax.cli.curate import scored
-from drivax.curation.arms import ARMS, Arm, weighted
 from drivax.curation.methods import Request, check_current
 from drivax.curation.scores import ScoreTable, read_scores
 from drivax.curation.weights import WeightConfig, sampling_weights
@@ -23,20 +22,21 @@ from drivax.learning.experience import WeightedSet
 from drivax.learning.loop import train, usable_steps
 from drivax.learning.program import widen_pool
 from drivax.scenario.store import ScenarioSet
+from drivax.studies.definition import Arm, load_study
 
 if TYPE_CHECKING:
     ArmName = str
 else:
-    ArmName = tyro.extras.literal_type_from_choices(ARMS)
+    ArmName = tyro.extras.literal_type_from_choices(load_study("longtail").arms)
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a policy: online, by imitation, or offline from recorded steps.
+    """Train a policy: online, by imitation, or offline from logged steps.
 
-    SIGTERM writes a checkpoint and ends the run; --resume goes on from there.
+    SIGTERM writes a checkpoint and ends the run; --resume continues it.
 
-    CONFIG is a YAML file or the name of a preset; each of its settings can be overridden as --section.key VALUE.
+    CONFIG is a YAML file or the name of a preset; its settings follow as --section.key VALUE.
 
     Example: drivax train demo --data sets/train --validation sets/test --out runs/ppo --algorithm.learning_rate 1e-3
 
@@ -54,17 +54,17 @@ class Train:
     validation: Path | None = None
     """Scenario set that chooses the best checkpoint."""
     scores: Path | None = None
-    """Scores of DATA by drivax curate: bc and offline algorithms draw each recorded step by its weight."""
+    """Scores of DATA by drivax curate: bc and offline algorithms draw each logged step by its weight."""
     scale: Literal["step", "scenario"] | None = None
     """Whether weights are of steps (the default) or of scenarios; with --scores."""
     arm: Annotated[ArmName | None, tyro.conf.arg(aliases=["--agent"])] = None
-    """Curation of that arm of the long-tail study: scores DATA first, or takes --scores."""
+    """Arm of the long-tail study whose curation is used: scores DATA first, or takes --scores."""
     weighting: WeightConfig = field(default_factory=WeightConfig)
     """How scores become weights; with --scores or --arm."""
     seeds: int = 1
-    """Agents to train in one program, with the configured seed and the following ones; each has a folder in OUT."""
+    """Number of agents trained in one program, with consecutive seeds; each has a folder in OUT."""
     begin_from: Annotated[str | None, tyro.conf.arg(name="from", metavar="RUN[@STEP]")] = None
-    """Begin with the networks of another run; replay, optimisers and environments are fresh, settings free."""
+    """Start from the networks of another run, with a new replay buffer, optimisers and environments."""
     resume: bool = False
     """Continue the run in OUT from its newest checkpoint."""
     overwrite: bool = False
@@ -72,7 +72,7 @@ class Train:
 
 
 def run(args: Train, overrides: Sequence[str] = ()) -> int:
-    """Train, then say where the run is."""
+    """Train, then print the run folder."""
     given = [*overrides, *([] if args.begin_from is None else ["--from", args.begin_from])]
     if args.resume and given:
         raise UsageError("a resumed run keeps its configuration", cure="leave out " + " ".join(given))
@@ -110,11 +110,10 @@ def _data(args: Train, config: TrainConfig) -> ScenarioSet | WeightedSet:
         return WeightedSet(
             data, sampling_weights(table, weighting, args.scale or "step", usable_steps(config, data))
         )
-    arm = ARMS[args.arm]
+    arm = load_study("longtail").arms[args.arm]
     _check_arm(args, arm, config)
-    return weighted(
-        arm, data, partial(_table, args, data), weighting, usable_steps(config, data), config.seed
-    )
+    tables = partial(_table, args, data)
+    return arm.weighted(data, tables, weighting, usable_steps(config, data), config.seed)
 
 
 def _check_arm(args: Train, arm: Arm, config: TrainConfig) -> None:
@@ -146,7 +145,7 @@ def _table(args: Train, data: ScenarioSet, method: str) -> ScoreTable:
     if args.scores is None:
         return scored(method, Request(data))
     table = read_scores(args.scores, data)
-    # `weighted` refuses scores of another method.
+    # `Arm.weighted` refuses scores of another method.
     if table.method == method:
         check_current(table, file=args.scores)
     return table

@@ -1,4 +1,4 @@
-"""``drivax view``: a page in which a scenario set can be browsed."""
+"""``drivax view``: browse a scenario set on one HTML page."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import tyro
 
 @dataclass(frozen=True)
 class View:
-    """Write one self-contained HTML page in which the logs of a set are browsed and played.
+    """Write one self-contained HTML page that plays the logs of a set.
 
-    In addition to the player it shows each scenario's tags, flags and audit. Each scenario adds some tens of kilobytes.
+    It also shows the tags, flags and audit of each scenario, which adds some tens of kilobytes.
 
     Example: drivax view sets/world --limit 20 --out world.html
 
@@ -35,7 +35,7 @@ class View:
 
 
 def run(args: View) -> int:
-    """Write the page and say where it is and what it leaves out."""
+    """Write the page; print its path and the number of scenarios."""
     from drivax.curation.scores import read_scores
     from drivax.curation.subset import top_rows
     from drivax.report.pages.viewer import criticality_html, select, write_player

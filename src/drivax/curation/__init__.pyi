@@ -1,6 +1,3 @@
-from .arms import ARMS as ARMS
-from .arms import Arm as Arm
-from .arms import weighted as weighted
 from .combining import Combination as Combination
 from .controls import permute_scores as permute_scores
 from .ensemble import EnsembleConfig as EnsembleConfig

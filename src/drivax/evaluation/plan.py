@@ -17,7 +17,7 @@ class ComparisonPlan:
         name: For the heading of the page.
         a, b: Run folders of ``drivax evaluate``; the command line may name them instead.
         primary: The metric that decides.
-        secondary: Further metrics to report.
+        secondary: Further metrics to report; the primary one is left out of them.
         split: ``paired`` compares on every common scenario; ``random`` and ``stratified`` give each planner its own
             scenarios.
         ratio: Share of the recordings that A gets in a split.
@@ -58,8 +58,11 @@ class ComparisonPlan:
             raise UsageError("too few to say anything", cure="use 2 scenarios and 100 resamples or more")
         if self.smallest_difference is not None and not self.smallest_difference > 0:
             raise UsageError("the smallest difference that matters is above 0", cure="give its size, or null")
-        if len({self.primary, *self.secondary}) <= len(self.secondary):
+        if len(set(self.secondary)) < len(self.secondary):
             raise UsageError("a metric is named twice", cure="name each metric once")
+        # So that another primary metric can be chosen without a second list.
+        others = tuple(name for name in self.secondary if name != self.primary)
+        object.__setattr__(self, "secondary", others)
         if self.split != "paired" and self.test == "bootstrap":
             raise UsageError(
                 "the bootstrap test is for pairs", cure="use test: permutation, or split: paired"

@@ -1,8 +1,13 @@
 from .bench import BenchConfig as BenchConfig
 from .bench import bench_metrics as bench_metrics
 from .bench_encoders import EncoderBench as EncoderBench
+from .definition import Arm as Arm
+from .definition import Claim as Claim
+from .definition import Study as Study
+from .definition import StudyConfig as StudyConfig
+from .definition import StudyDefinition as StudyDefinition
+from .definition import StudySets as StudySets
+from .definition import load_study as load_study
 from .demo import DemoConfig as DemoConfig
 from .demo import run_demo as run_demo
-from .longtail import study as study
-from .longtail_drives import LongtailConfig as LongtailConfig
-from .longtail_drives import Sets as Sets
+from .study import run_study as run_study

@@ -7,11 +7,13 @@ import pytest
 
 from browser import acted, browse, needs_browser
 from drivax.curation.scores import ScoreTable
-from drivax.studies.longtail_page import mean_q_curve, write_page
-from drivax.studies.longtail_results import METRICS
+from drivax.studies.definition import load_study
+from drivax.studies.report import validations_table, write_report
 
+LONGTAIL = load_study("longtail")
+METRICS = LONGTAIL.metrics
 RATE = {metric: {"mean": 0.1234, "low": 0.1, "high": 0.15} for metric in METRICS}
-CLAIM = {"words": "a < b & c", "one": "heuristic", "other": "baseline", "group": "control", "metric": "collision",
+CLAIM = {"words": "a < b & c", "arm": "heuristic", "reference": "baseline", "group": "control", "metric": "collision",
     "rows": "ordinary"}  # fmt: skip
 RESULTS = {
     "about": {"seeds": 5, "train": 4096, "test": 1126, "rare": 563, "labelled": True, "share": 0.05},
@@ -34,14 +36,14 @@ RESULTS = {
     "draws": {"baseline": dict.fromkeys(("effective", "effective_scenarios", "tilt", "largest", "concentration"), 1.0)},
     "rankings": [
         {
-            "one": "kinematic", "other": "ensemble", "rho": 0.41, "interval": [0.35, 0.47], "overlap": 0.2,
+            "methods": ["kinematic", "ensemble"], "rho": 0.41, "interval": [0.35, 0.47], "overlap": 0.2,
             "orthogonal": "contradicted",
         }
     ],
-    "mean_q": {"collision": {"difference": 0.2, "interval": [0.1, 0.3]}},
+    "rule_cost": {"collision": {"difference": 0.2, "interval": [0.1, 0.3]}},
     "validations": [
-        {"mean_q": [1.0, 0.5], "score": [0.25, 0.5], "progress": [0.5, 0.75]},
-        {"mean_q": [0.0, 2.0], "score": [0.5, 0.75], "progress": [0.5, 0.75]},
+        {"rule": [1.0, 0.5], "score": [0.25, 0.5], "progress": [0.5, 0.75]},
+        {"rule": [0.0, 2.0], "score": [0.5, 0.75], "progress": [0.5, 0.75]},
     ],
 }  # fmt: skip
 
@@ -63,7 +65,7 @@ def page(tmp_path):
     kept = replace(table, method="ensemble", components={})  # of a study that was continued elsewhere
     tables = {"kinematic": table, "ensemble": kept}
     tables |= {name: replace(kept, method=name) for name in ("uniform", "oracle")}
-    write_page(RESULTS, tables, rng.normal(0, 0.3, (500, 2)), tmp_path / "report.html")
+    write_report(LONGTAIL, RESULTS, tables, rng.normal(0, 0.3, (500, 2)), tmp_path / "report.html")
     return tmp_path / "report.html", table
 
 
@@ -78,12 +80,12 @@ def test_report_shows_the_results(page):
     assert (
         "kinematic and ensemble" in text
         and "+0.41 [+0.35, +0.47]" in text
-        and "the same checkpoint of 1 of the 2 seeds" in text
+        and "the same checkpoint for 1 of the 2 seeds" in text
     )
-    rows = [("mean Q, over seeds", "0.50", "1.25"), ("score, over seeds", "0.375", "0.625")]
-    rows += [("seeds whose highest mean Q it is", "1", "1"), ("seeds whose best score it is", "0", "2")]
-    assert mean_q_curve(RESULTS) == (("validation", "1", "2"), rows)
-    assert "seeds whose highest mean Q it is" in text
+    rows = [["mean_q, mean over seeds", "0.500", "1.250"], ["score, mean over seeds", "0.375", "0.625"]]
+    rows += [["seeds with their highest mean_q", "1", "1"], ["seeds with their highest score", "0", "2"]]
+    assert [[cell.text for cell in row] for row in validations_table(RESULTS, "mean_q").rows] == rows
+    assert "seeds with their highest mean_q" in text
     assert table.scenario_ids[int(table.scenarios.argmax())] in text
     assert "oracle: scores" in text and "<th scope=row>oracle" not in text
     assert "ensemble: scores of scenarios" in text and "uniform: scores" not in text

@@ -1,15 +1,13 @@
 """The long-tail study: verdicts on results that are known, and the whole study on a few scenarios."""
 
 import json
-from dataclasses import asdict, replace
-from typing import get_args
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drivax import settings
 from drivax.cli import main
-from drivax.curation.arms import ARMS, ClaimGroup, weighted
 from drivax.curation.methods import Request, curate
 from drivax.curation.scores import ScoreTable
 from drivax.curation.weights import WeightConfig, draw_statistics
@@ -19,22 +17,23 @@ from drivax.scenario.recording import Event
 from drivax.scenario.store import ScenarioSet, ScenarioWriter
 from drivax.stats.seeds import Crossed
 from drivax.stats.significance import holm
-from drivax.studies import longtail
-from drivax.studies.longtail_drives import LongtailConfig, Sets
-from drivax.studies.longtail_results import (
-    METRICS,
+from drivax.studies import study as runner
+from drivax.studies.definition import Study, StudyConfig, StudyDefinition, StudySets, load_study
+from drivax.studies.verdicts import (
     Condition,
-    claims,
-    cost_of_rule,
+    Strata,
+    decide_claims,
     detectable,
-    judge,
     needed,
     rankings,
     rates,
+    rule_cost,
 )
 from experiment_scripts import load_script
 from scenes import SMALL, car, straight_road
 
+LONGTAIL = load_study("longtail")
+ARMS, METRICS = LONGTAIL.arms, LONGTAIL.metrics
 SEEDS, SCENARIOS = 5, 400
 TINY = [
     "--total_steps", "64", "--validations", "4", "--seeds", "2",
@@ -54,7 +53,7 @@ def drives(rates_of, rng):
 
 
 def verdicts(rates_of, seed=0, rare_rates=None, share=None):
-    """JudgedClaim claims by their words; every second scenario is rare."""
+    """Results of the claims by their words; every second scenario is rare."""
     rng = np.random.default_rng(seed)
     labels = [f"recording-{number}" for number in range(SCENARIOS)]
     rare = np.arange(SCENARIOS) % 2 == 0
@@ -65,8 +64,8 @@ def verdicts(rates_of, seed=0, rare_rates=None, share=None):
             name: {metric: np.where(rare, other[name][metric], values) for metric, values in one.items()}
             for name, one in tested.items()
         }
-    found = judge(tested, labels, rare, list(rates_of), share)
-    return {one.claim.words: one for one in found}
+    results = decide_claims(LONGTAIL.claims, tested, Strata(labels, rare, share))
+    return {result.claim.words: result for result in results}
 
 
 EVEN = dict.fromkeys(ARMS, 0.16)
@@ -118,16 +117,16 @@ def test_rare_scenarios_count_as_in_ordinary_traffic():
 def test_an_effect_of_the_other_sign_contradicts():
     found = verdicts(EVEN | {"action_rarity": 0.3})
     one = found["action_rarity collides less than the baseline"]
-    assert one.verdict == "contradicted" and one.found.difference > 0.1
-    assert one.adjusted >= one.found.p
+    assert one.verdict == "contradicted" and one.tested.difference > 0.1
+    assert one.adjusted >= one.tested.p
 
 
 def test_p_values_are_adjusted_within_their_group():
     found = list(verdicts(EVEN | {"heuristic": 0.14}).values())
     for group in {one.claim.group for one in found}:
-        ps = [one.found.p for one in found if one.claim.group == group]
+        ps = [one.tested.p for one in found if one.claim.group == group]
         assert [one.adjusted for one in found if one.claim.group == group] == holm(ps)
-    claimed = [(c.one, c.other, c.metric, c.rows, c.change) for c in claims(list(ARMS))]
+    claimed = [(c.arm, c.reference, c.metric, c.rows, c.change) for c in LONGTAIL.claims]
     assert len(claimed) == len(set(claimed)) == 54
 
 
@@ -143,22 +142,22 @@ def test_what_is_undecided_says_what_would_decide():
 def test_what_can_be_found_is_known_before_the_others_learn():
     """By the variation of the baseline's seeds, and at a stricter level where more claims are tested."""
     rng = np.random.default_rng(1)
-    tested, labels = drives({"baseline": 0.16, "bc": 0.3}, rng), list(map(str, range(SCENARIOS)))
-    rare = np.arange(SCENARIOS) < 40
-    one, nine = (detectable(tested["baseline"], tested["bc"], labels, rare, 0.05, m) for m in (1, 9))
+    tested = drives({"baseline": 0.16, "bc": 0.3}, rng)
+    strata = Strata(list(map(str, range(SCENARIOS))), np.arange(SCENARIOS) < 40, 0.05)
+    one, nine = (detectable(tested["baseline"], tested["bc"], strata, METRICS, m) for m in (1, 9))
     assert sorted(one) == sorted(METRICS) and 0.02 < one["collision"] < nine["collision"] < 0.2
     undefined = tested["baseline"] | {"vmax_score": np.full((SEEDS, SCENARIOS), np.nan)}
-    assert "vmax_score" not in detectable(undefined, tested["bc"], labels, rare, 0.05, 1)
+    assert "vmax_score" not in detectable(undefined, tested["bc"], strata, METRICS, 1)
 
 
 def test_mean_q_is_judged_in_pairs():
     rng = np.random.default_rng(2)
     best = drives({"baseline": 0.16}, rng)["baseline"]
-    labels, rare = list(map(str, range(SCENARIOS))), np.zeros(SCENARIOS, bool)
-    same = cost_of_rule(best, best, labels, rare, None)
+    strata = Strata(list(map(str, range(SCENARIOS))), np.zeros(SCENARIOS, bool))
+    same = rule_cost(best, best, strata, METRICS)
     assert same["collision"] == {"difference": 0.0, "interval": [0.0, 0.0]}
     hit = best["collision"] + (rng.random((SEEDS, SCENARIOS)) < 0.03) * (1 - best["collision"])
-    found = cost_of_rule(best | {"collision": hit}, best, labels, rare, None)
+    found = rule_cost(best | {"collision": hit}, best, strata, METRICS)
     assert 0.0 < found["collision"]["interval"][0] < found["collision"]["difference"] < 0.05
 
 
@@ -177,13 +176,13 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
         found[method] = ScoreTable(method, {}, "x", ids, np.ones(shape, bool), steps, steps.max(axis=1))
     usable = np.zeros(shape, bool)
     usable[:, 10:89] = rng.random((shape[0], 79)) < 0.95
-    pairs = {(c.one, c.other) for c in claims(list(ARMS)) if ARMS[c.other].permuted}
+    pairs = {(c.arm, c.reference) for c in LONGTAIL.claims if ARMS[c.reference].permuted}
     curated = [name for name in ARMS if name.startswith(("heuristic", "ensemble", "action_rarity"))]
     assert {one for one, _ in pairs} == {*curated, "oracle"}
     for pair in pairs:
         own, control = (
             draw_statistics(
-                weighted(ARMS[name], data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
+                ARMS[name].weighted(data, found.__getitem__, WeightConfig(), usable, seed=3).weights,
                 usable,
             )
             for name in pair
@@ -191,7 +190,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
         assert control.effective == pytest.approx(own.effective, rel=0.02), pair
         assert control.effective_scenarios == pytest.approx(own.effective_scenarios, rel=0.06), pair
     for name, share in (("oracle", 0.115), ("oracle_strong", 0.3)):
-        weights = weighted(ARMS[name], data, found.__getitem__, WeightConfig(), usable).weights
+        weights = ARMS[name].weighted(data, found.__getitem__, WeightConfig(), usable).weights
         during = weights[found["oracle"].steps > 0].sum() / weights.sum()
         # And those that uniform draws find.
         assert during == pytest.approx(share + (1 - share) * (found["oracle"].steps > 0)[usable].mean())
@@ -201,7 +200,7 @@ def test_controls_have_the_effective_sizes_of_their_arms(data):
 def test_scores_of_another_method_are_refused(data):
     table = curate("uniform", Request(data))
     with pytest.raises(UsageError, match="scores of 'uniform' for an arm that is curated by 'action_rarity'"):
-        weighted(ARMS["action_rarity"], data, lambda _: table, WeightConfig())
+        ARMS["action_rarity"].weighted(data, lambda _: table, WeightConfig())
 
 
 def test_conditions_look_at_the_chosen_checkpoint_and_at_the_end():
@@ -227,7 +226,7 @@ def test_seeds_do_not_make_up_for_each_other():
 def test_rankings_and_rates(data):
     kinematic, labels = curate("kinematic", Request(data)), [f"r{row}" for row in range(len(data))]
     (same,) = rankings({"kinematic": kinematic, "published": kinematic, "uniform": kinematic}, labels)
-    assert (same["one"], same["other"], same["orthogonal"]) == ("kinematic", "published", "contradicted")
+    assert (same["methods"], same["orthogonal"]) == (["kinematic", "published"], "contradicted")
     np.testing.assert_allclose([same["rho"], *same["interval"], same["overlap"]], 1.0)
     rng = np.random.default_rng(5)
     shape = (2_000, 91)
@@ -238,14 +237,18 @@ def test_rankings_and_rates(data):
         name: ScoreTable(name, {}, "x", ids, np.ones(shape, bool), one, one[:, 0])
         for name, one in scores.items()
     }
-    verdict = {(r["one"], r["other"]): r["orthogonal"] for r in rankings(tables, ids)}
+    verdict = {tuple(r["methods"]): r["orthogonal"] for r in rankings(tables, ids)}
     # Correlations of 0 and, within one standard error of the limit, of about 0.3.
     assert verdict == {("a", "b"): "supported", ("a", "c"): "undecided", ("b", "c"): "supported"}
     rng = np.random.default_rng(0)
-    found = rates(drives({"bc": 0.2}, rng)["bc"], list(map(str, range(SCENARIOS))), np.zeros(SCENARIOS, bool))
+    found = rates(
+        drives({"bc": 0.2}, rng)["bc"],
+        Strata(list(map(str, range(SCENARIOS))), np.zeros(SCENARIOS, bool)),
+        METRICS,
+    )
     assert sorted(found) == ["common", "ordinary"] and found["ordinary"]["collision"]["low"] < 0.2
     none = dict.fromkeys(METRICS, np.zeros((SEEDS, 100))) | {"vmax_score": np.full((SEEDS, 100), np.nan)}
-    found = rates(none, list(map(str, range(100))), np.arange(100) < 50, 0.05)
+    found = rates(none, Strata(list(map(str, range(100))), np.arange(100) < 50, 0.05), METRICS)
     # Wilson: 3.84 / (n + 3.84), where n = 1 / (0.95^2 / 50 + 0.05^2 / 50) = 55.2.
     assert found["ordinary"]["collision"] == {
         "mean": 0.0, "low": 0.0, "high": pytest.approx(0.065, abs=1e-4), "scenarios": 100
@@ -279,7 +282,7 @@ def here(monkeypatch):
     def one_by_one(call, tasks, cores):
         return [(task, call(task)) for task in tasks]
 
-    monkeypatch.setattr(longtail, "one_core_each", one_by_one)
+    monkeypatch.setattr(runner, "one_core_each", one_by_one)
 
 
 @pytest.mark.slow
@@ -305,7 +308,7 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     # Everything is there: nothing is trained or episodes again.
     assert main([*arguments, "--anyway"]) == 0
     again = capsys.readouterr().err
-    assert "trained" not in again and "driving" not in again
+    assert "trained" not in again and "evaluating" not in again
     # And so where only what was kept of it is.
     script = load_script("longtail")
     monkeypatch.setattr(script, "KEPT", tmp_path / "kept")
@@ -322,13 +325,13 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     arguments[arguments.index(str(out))] = str(tmp_path / "restored")
     assert main([*arguments, "--anyway"]) == 0
     again = capsys.readouterr().err
-    assert "trained" not in again and "driving" not in again
+    assert "trained" not in again and "evaluating" not in again
     script.keep(tmp_path / "restored")  # a study that was restored tells no command
     again = json.loads((tmp_path / "restored" / "results.json").read_text())
     assert again == results
     arguments[arguments.index(str(tmp_path / "restored"))] = str(out)
-    blocks = [f"claims {group}" for group in get_args(ClaimGroup)]
-    blocks += ["conditions", "detectable", "draws", "rankings", "mean q", "mean q curve"]
+    blocks = [f"claims {group}" for group in LONGTAIL.groups]
+    blocks += ["conditions", "detectable", "draws", "rankings", "rule cost", "validations"]
     blocks += [f"rates {kind}" for kind in ("ordinary", "common", "rare")]
     page = script.filled("".join(f"{script.BEGIN.format(b)}\n{script.END}\n" for b in blocks), results)
     assert script.filled(page, results) == page and page.count("|---") >= len(blocks)
@@ -347,21 +350,31 @@ def test_the_whole_study(data, tmp_path, here, capsys, monkeypatch):
     assert "holds a study with other settings" in capsys.readouterr().err
 
 
-def test_what_cannot_be_studied_is_refused(data, tmp_path):
+def test_invalid_studies_are_refused(data, tmp_path):
+    given = StudySets(data.path, data.path, (data.path,))
     with pytest.raises(UsageError, match="a study without bc"):
-        settings.load(LongtailConfig, {"arms": ["baseline"]})
+        Study(LONGTAIL, StudyConfig(arms=("baseline",)), given, tmp_path)
     with pytest.raises(UsageError, match="there is no arm 'heuristics'"):
-        settings.load(LongtailConfig, {"arms": ["baseline", "bc", "heuristics"]})
+        Study(LONGTAIL, StudyConfig(arms=("baseline", "bc", "heuristics")), given, tmp_path)
+    with pytest.raises(UsageError, match=r"no preset or file 'studies/longtial'.*longtail"):
+        load_study("longtial")
+    own = tmp_path / "own.yaml"
+    own.write_text(settings.dump(LONGTAIL))
+    assert load_study(own) == LONGTAIL
+    declared = settings.plain(LONGTAIL)
+    declared["claims"][0]["arm"] = "heuristics"
+    own.write_text(settings.dump(declared))
+    with pytest.raises(UsageError, match=r"own\.yaml: .*names 'heuristics', which the study lacks"):
+        settings.load(StudyDefinition, own)
     with pytest.raises(UsageError, match="needs scenarios to train, to validate and to test on"):
-        Sets.of(data.path, None, ())
+        StudySets.of(data.path, None, ())
     with pytest.raises(UsageError, match="none: does not exist"):
-        Sets.of(tmp_path / "none", None, ())
-    assert asdict(LongtailConfig())["seeds"] == 5
+        StudySets.of(tmp_path / "none", None, ())
     # Before anything is scored or trained, and with the arms that need no labels.
     with ScenarioWriter(tmp_path / "recorded", SMALL) as writer:
         writer.add(assemble(straight_road([car(speed=8.0)]), SMALL))
     recorded = tmp_path / "recorded"
-    sets = Sets.of(recorded, recorded, (recorded,))
+    sets = StudySets.of(recorded, recorded, (recorded,))
     with pytest.raises(UsageError, match=r"recorded: has no labelled events.*--arms \[bc,baseline,.*o\]"):
-        longtail.study(LongtailConfig(), sets, tmp_path / "study")
+        runner.run_study(Study(LONGTAIL, StudyConfig(), sets, tmp_path / "study"))
     assert not (tmp_path / "study").exists()

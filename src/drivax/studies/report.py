@@ -1,0 +1,301 @@
+"""The report of a study: one HTML page from ``results.json`` and the score tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from drivax.curation.scores import ScoreTable
+from drivax.files import write_text
+from drivax.metrics.catalogue import METRICS
+from drivax.report.charts.distributions import histogram
+from drivax.report.pages.page import page
+from drivax.studies.definition import Stratum, StudyDefinition
+from drivax.studies.verdicts import RELATED, UNRELATED
+from drivax.table import Cell, Column, Table
+
+_STRATA: Mapping[Stratum, str] = {
+    "ordinary": "Ordinary traffic", "common": "Common scenarios", "rare": "Rare scenarios",
+}  # fmt: skip
+_SIGNS = {"supported": "▲ supported", "contradicted": "▼ contradicted", "undecided": "undecided"}
+#: Cells of the map of actions along either dimension, and its size in pixels.
+_CELLS, _SIZE = 48, 336
+_STYLE = """
+.claims td, .claims th { text-align: left; }
+.claims th[scope=row] { min-width: 19em; }
+.claims td:last-child { min-width: 11em; }
+.claims td:nth-child(n+3):nth-child(-n+6) { white-space: nowrap; }
+.dense td, .dense th[scope=row] { white-space: nowrap; max-width: none; font-size: 0.85rem; }
+h3 { margin-top: 1.5em; }
+.map rect { stroke: none; }
+.map text { font-size: 11px; fill: var(--soft); }
+"""
+Results = Mapping[str, Any]
+
+
+def write_report(
+    definition: StudyDefinition,
+    results: Results,
+    tables: Mapping[str, ScoreTable],
+    actions: Float[np.ndarray, "n 2"],
+    out: Path,
+) -> None:
+    """Write the report of a study.
+
+    Args:
+        definition: The study.
+        results: Contents of ``results.json``.
+        tables: Scores of the training set by method.
+        actions: Actions of the experts in the training set, in units of the action space.
+        out: The HTML file.
+    """
+    scored = {name: table for name, table in tables.items() if name != "uniform"}
+    rule = definition.checkpoints_by.rpartition("/")[2]
+    sections = {
+        "Before the comparison": _conditions(definition, results),
+        "Verdicts": _verdicts(definition, results),
+        "Evaluation of the arms": "".join(_rates(definition, results, stratum) for stratum in _STRATA),
+        "Distribution of the sampling weights": draws_table(results).html(),
+        "Are the methods different?": _rankings(results),
+        f"Choosing checkpoints by the highest {rule}": _rule_cost(results, rule),
+        "Scores": _scores(scored),
+        "Actions of the experts": _action_map(actions),
+    }
+    body = [f"<section><h2>{escape(title)}</h2>{html}</section>" for title, html in sections.items()]
+    write_text(out, page(definition.title, _lead(definition, results), body, _STYLE))
+
+
+def _lead(definition: StudyDefinition, results: Results) -> str:
+    verdicts = [claim["verdict"] for claim in results["claims"]]
+    counts = ", ".join(f"{verdicts.count(name)} {name}" for name in _SIGNS)
+    about, caution = results["about"], ""
+    if not all(arm["met"] for arm in results["conditions"] if arm["arm"] in definition.baselines):
+        caution = (
+            "<p><b>The conditions of the comparison are not met</b>: read its verdicts as those of arms that do not "
+            "drive well.</p>"
+        )
+    return (
+        f"<p class=lead>{len(verdicts)} claims: {counts}. {len(results['draws'])} arms, {about['seeds']} seeds, "
+        f"{about['train']:,} training and {about['test']:,} test scenarios ({about['rare']:,} of them rare, "
+        f"{'labelled' if about['labelled'] else 'by the kinematic heuristic'}).</p>{caution}"
+    )
+
+
+def _table(name: str, headings: Iterable[str], rows: Iterable[Sequence[str]]) -> Table:
+    columns = tuple(Column(heading, label=not index) for index, heading in enumerate(headings))
+    return Table(name, columns, tuple(tuple(map(Cell, row)) for row in rows))
+
+
+def _label(metric: str) -> str:
+    return METRICS[metric].label or metric.replace("_", " ")
+
+
+def _interval(value: float, bounds: Sequence[float], spec: str) -> str:
+    low, high = bounds
+    return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
+
+
+def conditions_table(results: Results) -> Table:
+    """Return how well every arm drives before the test, and whether its score has settled."""
+    rows = [
+        (
+            arm["arm"],
+            *(
+                f"{arm['progress']:.1%}",
+                f"{arm['least']:.1%}",
+                f"{arm['change']:+.3f}",
+                f"{arm['moved']:.3f}",
+            ),
+            "yes" if arm["met"] else "no",
+        )
+        for arm in results["conditions"]
+    ]
+    return _table(
+        "dense",
+        ("arm", "progress ratio", "worst seed", "change of the score", "absolute change", "good enough"),
+        rows,
+    )
+
+
+def detectable_table(results: Results) -> Table:
+    """Return the smallest detectable differences."""
+    rows = [(_label(name), f"{value:.3f}") for name, value in results["detectable"].items()]
+    return _table("dense", ("metric", "smallest detectable difference"), rows)
+
+
+def claims_table(results: Results, group: str) -> Table:
+    """Return the verdicts on the claims of a group."""
+    rows = [_claim(claim) for claim in results["claims"] if claim["claim"]["group"] == group]
+    headings = ("claim", "metric", "difference", "relative", "adjusted p", "verdict", "what would decide")
+    return _table("claims", headings, rows)
+
+
+def _claim(result: Mapping[str, Any]) -> tuple[str, ...]:
+    claim, interval, change, p = (result[name] for name in ("claim", "interval", "change", "adjusted"))
+    return (
+        claim["words"],
+        _label(claim["metric"]),
+        "" if interval is None else _interval(result["difference"], interval, "+.3f"),
+        "" if change is None else _interval(change[0], change[1:], "+.0%"),
+        "" if p is None else f"{p:.3f}".replace("0.000", "<0.001"),
+        _SIGNS[result["verdict"]],
+        result["needed"],
+    )
+
+
+def rates_table(results: Results, stratum: Stratum) -> Table:
+    """Return the means of every arm in a stratum of scenarios."""
+    arms = {name: rates[stratum] for name, rates in results["rates"].items() if stratum in rates}
+    metrics = list(dict.fromkeys(metric for rates in arms.values() for metric in rates))
+    rows = [
+        (name, *(_rate(rates[metric]) if metric in rates else "" for metric in metrics))
+        for name, rates in arms.items()
+    ]
+    return _table("dense", ("arm", *map(_label, metrics)), rows)
+
+
+def _rate(rate: Mapping[str, float]) -> str:
+    return _interval(rate["mean"], (rate["low"], rate["high"]), ".3f")
+
+
+def draws_table(results: Results) -> Table:
+    """Return the distribution of the sampling weights of every arm."""
+    names = ("effective", "effective_scenarios", "tilt", "largest", "concentration")
+    headings = ("arm", "effective sample", "of scenarios", "tilt", "largest", "draws from 5 %")
+    rows = [(arm, *(f"{draws[name]:.2f}" for name in names)) for arm, draws in results["draws"].items()]
+    return _table("dense", headings, rows)
+
+
+def rankings_table(results: Results) -> Table:
+    """Return how similar the methods rank scenarios."""
+    rows = [
+        (
+            " and ".join(pair["methods"]),
+            _interval(pair["rho"], pair["interval"], "+.2f"),
+            f"{pair['overlap']:.0%}",
+            _SIGNS[pair["orthogonal"]],
+        )
+        for pair in results["rankings"]
+    ]
+    headings = ("methods", "rank correlation", "same among the top 5 %", "“they are orthogonal”")
+    return _table("rankings", headings, rows)
+
+
+def rule_cost_table(results: Results, rule: str) -> Table:
+    """Return what choosing checkpoints by the highest ``rule`` costs."""
+    rows = [
+        (_label(name), _interval(cost["difference"], cost["interval"], "+.3f"))
+        for name, cost in results["rule_cost"].items()
+    ]
+    return _table("costs", ("metric", f"by {rule} minus by validation score"), rows)
+
+
+def validations_table(results: Results, rule: str) -> Table:
+    """Return the first baseline's ``rule`` and score at each validation, and how many seeds peak there."""
+    curves = {
+        name: np.array([seed[key] for seed in results["validations"]])
+        for name, key in ((rule, "rule"), ("score", "score"))
+    }
+    numbers = range(curves["score"].shape[1])
+    rows = [
+        (f"{name}, mean over seeds", *(f"{value:.3f}" for value in values.mean(axis=0)))
+        for name, values in curves.items()
+    ]
+    rows += [
+        (f"seeds with their highest {name}", *(str((values.argmax(axis=1) == k).sum()) for k in numbers))
+        for name, values in curves.items()
+    ]
+    return _table("dense", ("validation", *(str(k + 1) for k in numbers)), rows)
+
+
+def _conditions(definition: StudyDefinition, results: Results) -> str:
+    smallest = ", ".join(f"{_label(name)} {value:.3f}" for name, value in results["detectable"].items())
+    return conditions_table(results).html() + (
+        "<p>Progress is a share of the expert's, at the best checkpoint; scores change from the third to the last "
+        "quarter of the validations. The smallest difference in ordinary traffic that this study detects with a "
+        "probability of 80 %, at the strictest level of the first group of claims, if seeds vary as the baseline's: "
+        f"{escape(smallest)}. {' and '.join(definition.baselines)} had to be good enough before the others were "
+        "trained; the others are shown next to them.</p>"
+    )
+
+
+def _verdicts(definition: StudyDefinition, results: Results) -> str:
+    groups = {heading: claims_table(results, group) for group, heading in definition.groups.items()}
+    return "".join(f"<h3>{heading}</h3>{table.html()}" for heading, table in groups.items() if table.rows) + (
+        "<p><small>Differences are means over seeds and scenarios with 95 % intervals; both seeds and recordings are "
+        "random (Welch-Satterthwaite). P-values are adjusted for the number of claims in their group (Holm). A claim "
+        "is supported or contradicted below 0.05, otherwise undecided; the number of seeds or recordings that would "
+        "decide supposes that the difference is the estimated one, at the strictest level of its group. A claim about "
+        "a size is tested against that size. Compare the weights of a method and of its control in the table of "
+        "weights. Scores are computed once: claims are about these scores, at this strength of weighting.</small></p>"
+    )
+
+
+def _rates(definition: StudyDefinition, results: Results, stratum: Stratum) -> str:
+    table, share = rates_table(results, stratum), results["about"]["share"]
+    if not table.rows:
+        return ""
+    note = "" if stratum != "ordinary" or share is None else (
+        f"<p><small>Scenarios with an event count as in ordinary traffic, of which they are {share:.1%}.</small></p>"
+    )  # fmt: skip
+    return f"<h3>{_STRATA[stratum]}</h3>{table.html()}{note}"
+
+
+def _rankings(results: Results) -> str:
+    return rankings_table(results).html() + (
+        "<p><small>Of the scores of the training scenarios, with 95 % intervals over recordings. Rankings are called "
+        f"unrelated if the interval is within ±{UNRELATED}, related if it is beyond ±{RELATED}. "
+        "Two random rankings have 5 % of their top 5 % in common.</small></p>"
+    )
+
+
+def _rule_cost(results: Results, rule: str) -> str:
+    seeds = results["validations"]
+    same = sum(int(np.argmax(seed["rule"]) == np.argmax(seed["score"])) for seed in seeds)
+    return (
+        f"{rule_cost_table(results, rule).html()}<p><small>The baseline's checkpoints with the highest {escape(rule)} "
+        "on held-out steps against those with the best validation score, on the test set: the same runs, seed by seed. "
+        f"Both rules choose the same checkpoint for {same} of the {len(seeds)} seeds.</small></p>"
+        f"{validations_table(results, rule).html()}"
+    )
+
+
+def _scores(tables: Mapping[str, ScoreTable]) -> str:
+    charts = "".join(
+        histogram(f"{name}: scores of scenarios", {name: table.scenarios}, "score")
+        for name, table in tables.items()
+    )
+    tops = [
+        (name, *(table.scenario_ids[row] for row in table.order[:3]))
+        for name, table in tables.items()
+        if name != "oracle"  # labels do not rank what they mark
+    ]
+    return (
+        f"<div class=charts>{charts}</div>"
+        + _table("dense", ("method", "most critical", "second", "third"), tops).html()
+        + "<p>These drives can be watched in <a href=critical.html>critical.html</a>.</p>"
+    )
+
+
+def _action_map(actions: Float[np.ndarray, "n 2"]) -> str:
+    counts, _, _ = np.histogram2d(actions[:, 0], actions[:, 1], bins=_CELLS, range=((-1, 1), (-1, 1)))
+    opacity = np.log1p(counts) / np.log1p(counts.max())
+    side = _SIZE / _CELLS
+    cells = "".join(
+        f'<rect x="{30 + column * side:.1f}" y="{(_CELLS - 1 - row) * side:.1f}" width="{side:.1f}" '
+        f'height="{side:.1f}" fill="var(--ink)" fill-opacity="{opacity[row, column]:.2f}"/>'
+        for row, column in np.argwhere(counts > 0)
+    )
+    return (
+        f'<figure class="chart map"><figcaption>Frequency of the experts\' actions<small>logarithmic; '
+        f"{len(actions):,} steps</small></figcaption>"
+        f'<svg viewBox="0 0 {_SIZE + 40} {_SIZE + 30}" role="img" aria-label="map of actions">{cells}'
+        f'<text x="{30 + _SIZE / 2:.0f}" y="{_SIZE + 20}" text-anchor="middle">steering, left is positive</text>'
+        f'<text transform="translate(18 {_SIZE / 2:.0f}) rotate(-90)" text-anchor="middle">acceleration</text>'
+        "</svg></figure>"
+    )
